@@ -5,11 +5,11 @@
 >>> ms.run(case).knockdown  # doctest: +SKIP
 0.32624
 
-Without a case file, `Problem` is made of a `Shell`, on a dolfinx mesh for instance, and of what holds and loads it.
-A scene is stepped through by `follow` (the history of its case) and `trace` (a path in any amplitude); `gradient`
-differentiates what was found by amplitudes, numbers of the case and fields; `columns`,
-`surface`, `polydata`, `curve` and `picture` show what was found; an `OwnTerm` is one's own energy,
-whose `Free` parameters are amplitudes too.
+Without a case file, `Problem` is made of a `Shell`, on a dolfinx mesh for instance, and of what
+holds and loads it. A scene is stepped through by `follow` (the history of its case) and `trace` (a
+path in any amplitude); `gradient` differentiates what was found by amplitudes, numbers of the case
+and fields; `columns`, `surface`, `polydata`, `curve` and `picture` show what was found; an
+`OwnTerm` is one's own energy, whose `Free` parameters are amplitudes too.
 """
 
 from importlib import import_module

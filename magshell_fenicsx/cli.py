@@ -38,13 +38,21 @@ PETSC = ("-snes_", "-ksp_", "-mat_", "-magshell_", "-log_", "-options_")  # how 
 
 
 def _hand_over_to_petsc(words: list[str]) -> None:
-    """Take PETSc's options, which come last, off the words of a command; PETSc reads them when it is imported."""
+    """Take PETSc's options, which come last, off the words of a command; PETSc reads them when it
+    is imported.
+    """
     first = next((i for i, word in enumerate(words) if word.startswith(PETSC)), len(words))
     for word in words[first:]:
         if word.startswith("--") or word.endswith((".yaml", ".yml")):
-            sys.exit(failure(f"{word} comes after {words[first]}: options of PETSc come last", INVALID).exit_code)
+            sys.exit(
+                failure(
+                    f"{word} comes after {words[first]}: options of PETSc come last", INVALID
+                ).exit_code
+            )
     if words[first:]:
-        os.environ["PETSC_OPTIONS"] = " ".join([os.environ.get("PETSC_OPTIONS", ""), *words[first:]])
+        os.environ["PETSC_OPTIONS"] = " ".join(
+            [os.environ.get("PETSC_OPTIONS", ""), *words[first:]]
+        )
     del words[first:]
 
 
@@ -65,9 +73,13 @@ def _shared(source: Any) -> Any:
 def main() -> None:
     """Run the program."""
     open_standard_streams()
-    os.environ["PETSC_OPTIONS"] = f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"  # it would report a crash
+    os.environ["PETSC_OPTIONS"] = (
+        f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"  # it would report a crash
+    )
     _hand_over_to_petsc(sys.argv)
-    gc.set_threshold(300_000, 5, 5)  # a small run looks for no garbage; Python's own would do so two hundred times
+    gc.set_threshold(
+        300_000, 5, 5
+    )  # a small run looks for no garbage; Python's own would do so two hundred times
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
@@ -93,7 +105,10 @@ def _print_version(requested: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and exit")
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="print the version and exit"
+        ),
     ] = False,
 ) -> None:
     """Options before the command."""
@@ -104,21 +119,38 @@ def run(
     case: CaseFile,
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted run in that folder")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="replace the run in that folder even if it is another's, or unfinished")
+    resume: Annotated[
+        bool, typer.Option("--resume", help="continue the interrupted run in that folder")
     ] = False,
-    time_limit: Annotated[float | None, typer.Option(min=0, metavar="SECONDS", help="stop then; resumable")] = None,
-    pictures: Annotated[bool, typer.Option(" /--no-pictures", show_default=False, help="plot draws them later")] = True,
+    overwrite: Annotated[
+        bool,
+        typer.Option(
+            "--overwrite",
+            help="replace the run in that folder even if it is another's, or unfinished",
+        ),
+    ] = False,
+    time_limit: Annotated[
+        float | None, typer.Option(min=0, metavar="SECONDS", help="stop then; resumable")
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option(" /--no-pictures", show_default=False, help="plot draws them later")
+    ] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.opened import opened
 
     folder = chosen_folder(out, case.stem)
-    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
+    how: dict[str, Any] = {
+        "resume": resume,
+        "overwrite": overwrite,
+        "time_limit": time_limit,
+        "pictures": pictures,
+    }
     with exit_codes():
         read = opened(case, world(), set_ or [])
-    from magshell_fenicsx.output.report.verdict import sentence_of  # what solves: a refused case does without
+    from magshell_fenicsx.output.report.verdict import (
+        sentence_of,
+    )  # what solves: a refused case does without
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
     from magshell_fenicsx.public import run as run_case
@@ -132,7 +164,8 @@ def run(
         print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         print_line(sentence_of(folder))
         return
-    gc.freeze()  # the process ends soon: another garbage collection takes longer than importing dolfinx
+    # the process ends soon: another garbage collection takes longer than importing dolfinx
+    gc.freeze()
     if result.knockdown is not None:
         print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
     if result.barrier is not None:
@@ -152,10 +185,14 @@ def sweep(
     out: Annotated[str | None, folder_option("results/<case name>_sweep/")] = None,
     result: Annotated[str | None, result_option("beside k_d, barrier and limit points: ")] = None,
     full_paths: Annotated[
-        bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
+        bool,
+        typer.Option("--full-paths", help="compute the full path at every point; follow no fold"),
     ] = False,
     part: Annotated[
-        str | None, typer.Option(metavar="I/N", help="compute only the I-th of N shares of the points: one of N jobs")
+        str | None,
+        typer.Option(
+            metavar="I/N", help="compute only the I-th of N shares of the points: one of N jobs"
+        ),
     ] = None,
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
@@ -164,12 +201,26 @@ def sweep(
 
     folder = chosen_folder(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(case, over, set_ or [], folder, made=_made, result=result, full_paths=full_paths, part=part)
+        done = run_sweep(
+            case,
+            over,
+            set_ or [],
+            folder,
+            made=_made,
+            result=result,
+            full_paths=full_paths,
+            part=part,
+        )
     print_line(f"results in {folder}/")
     if done.stopped:
-        raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
+        raise failure(
+            f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why",
+            STOPPED,
+        )
     if without := done.results.count(None):
-        raise failure(f"{without} of {len(done.points)} points gave no {result}; sweep.csv says why", STOPPED)
+        raise failure(
+            f"{without} of {len(done.points)} points gave no {result}; sweep.csv says why", STOPPED
+        )
 
 
 @app.command()
@@ -185,13 +236,17 @@ def boundary(
     from_: Annotated[
         str | None,
         typer.Option(
-            "--from", metavar="DIR:POINT", help="start at another fold or bifurcation: a point of the path.csv of a run"
+            "--from",
+            metavar="DIR:POINT",
+            help="start at another fold or bifurcation: a point of the path.csv of a run",
         ),
     ] = None,
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_boundary/")] = None,
 ) -> None:
-    """Follow the fold or bifurcation at the end of a case in a second key, through cusps; keep points in the folder."""
+    """Follow the fold or bifurcation at the end of a case in a second key, through cusps; keep
+    points in the folder.
+    """
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
     from magshell_fenicsx.studies.boundary_map import boundary_map
@@ -210,12 +265,20 @@ def study(
     over: Over,
     result: Result,
     set_: Settings = None,
-    reference: Annotated[float | None, typer.Option(help="exact value for the errors; default the finest run")] = None,
-    ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")] = "1",
-    repeat: Annotated[int, typer.Option(min=1, help="runs of each point; medians are reported")] = 3,
+    reference: Annotated[
+        float | None, typer.Option(help="exact value for the errors; default the finest run")
+    ] = None,
+    ranks: Annotated[
+        str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")
+    ] = "1",
+    repeat: Annotated[
+        int, typer.Option(min=1, help="runs of each point; medians are reported")
+    ] = 3,
     out: Annotated[str | None, folder_option("results/<case name>_study/")] = None,
 ) -> None:
-    """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the folder."""
+    """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the
+    folder.
+    """
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.study import parse_ranks
     from magshell_fenicsx.studies.study import study as run_study
@@ -235,30 +298,48 @@ def study(
         )
     print_line(f"results in {folder}/")
     if done.without_result:
-        raise failure(f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why", STOPPED)
+        raise failure(
+            f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why",
+            STOPPED,
+        )
 
 
 @app.command()
 def ensemble(
     case: CaseFile,
     samples: Annotated[int, typer.Option(min=1, metavar="N", help="number of samples")],
-    seed: Annotated[int, typer.Option(min=0, metavar="S", help="of the random numbers; sample k depends on S and k")],
+    seed: Annotated[
+        int,
+        typer.Option(min=0, metavar="S", help="of the random numbers; sample k depends on S and k"),
+    ],
     set_: Settings = None,
     result: Result = "knockdown",
     delete_weakest: Annotated[
-        int, typer.Option(min=0, metavar="N", help="also compute each sample without its N weakest defects")
+        int,
+        typer.Option(
+            min=0, metavar="N", help="also compute each sample without its N weakest defects"
+        ),
     ] = 0,
     part: Annotated[
-        str | None, typer.Option(metavar="I/N", help="compute only every N-th sample, from the I-th: one of N jobs")
+        str | None,
+        typer.Option(
+            metavar="I/N", help="compute only every N-th sample, from the I-th: one of N jobs"
+        ),
     ] = None,
     merge: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"),
+        typer.Option(
+            metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"
+        ),
     ] = None,
     out: Annotated[str | None, folder_option("results/<case name>_ensemble/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="refuse a folder without samples of this ensemble")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="refuse a folder without samples of this ensemble")
+    ] = False,
 ) -> None:
-    """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
+    """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished
+    samples.
+    """
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.ensemble import ensemble as run_ensemble
 
@@ -282,7 +363,8 @@ def ensemble(
     print_line(f"results in {folder}/")
     if done.without_result:
         raise failure(
-            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says why", STOPPED
+            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says why",
+            STOPPED,
         )
 
 
@@ -291,9 +373,13 @@ def design(
     case: CaseFile,
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_design/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="refuse a folder without evaluations of a design")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="refuse a folder without evaluations of a design")
+    ] = False,
 ) -> None:
-    """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
+    """Vary a case for a result (its section `design`); write the best case, its table and picture,
+    and verify it.
+    """
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.design import Missed
     from magshell_fenicsx.studies.design import design as run_design
@@ -307,11 +393,15 @@ def design(
 @app.command()
 def identify(
     case: CaseFile,
-    data: Annotated[Path, typer.Option(metavar="FILE.csv", help="what was measured: columns with units")],
+    data: Annotated[
+        Path, typer.Option(metavar="FILE.csv", help="what was measured: columns with units")
+    ],
     set_: Settings = None,
     out: Annotated[str | None, folder_option("results/<case name>_identify/")] = None,
 ) -> None:
-    """Find numbers of a case from measured data (its section `identify`), and how sure they are; keep evaluations."""
+    """Find numbers of a case from measured data (its section `identify`), and how sure they are;
+    keep evaluations.
+    """
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
     from magshell_fenicsx.studies.identify import identify as identify_parameters
@@ -329,12 +419,18 @@ def compare(
     case: CaseFile,
     set_: Settings = None,
     shell: Annotated[
-        str, typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest is compared")
+        str,
+        typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest is compared"),
     ] = "1",
     solid: Annotated[
-        str, typer.Option(metavar="R,R", help="refinements of the solid's mesh; three give error against run time")
+        str,
+        typer.Option(
+            metavar="R,R", help="refinements of the solid's mesh; three give error against run time"
+        ),
     ] = "1",
-    result: Annotated[str | None, result_option("what is compared; default k_d, or the load: ")] = None,
+    result: Annotated[
+        str | None, result_option("what is compared; default k_d, or the load: ")
+    ] = None,
     out: Annotated[str | None, folder_option("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
@@ -346,11 +442,19 @@ def compare(
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
         done = run_comparison(
-            case, set_ or [], refinements=refinements, out=folder, made=_made, result=result, say=print_line
+            case,
+            set_ or [],
+            refinements=refinements,
+            out=folder,
+            made=_made,
+            result=result,
+            say=print_line,
         )
     difference = done.content["difference"]
     if difference is not None:
-        print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")
+        print_line(
+            f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %"
+        )
     print_line(f"results in {folder}/")
 
 

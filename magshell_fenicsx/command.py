@@ -1,6 +1,7 @@
 """What all commands share: options, completion in the shell, messages of rank 0, exit codes.
 
-Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every command.
+Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every
+command.
 """
 
 import sys
@@ -20,7 +21,8 @@ from magshell_fenicsx.platform.processes import world
 
 _absent = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
 if _absent:
-    sys.modules["rich"] = None  # type: ignore[assignment]  # an import of it fails, as where it is not installed
+    # an import of it fails, as where it is not installed
+    sys.modules["rich"] = None  # type: ignore[assignment]
 try:
     import typer as typer
 finally:
@@ -53,43 +55,63 @@ class Commands(typer.Typer):
 
 
 def case_files(incomplete: str) -> list[str]:
-    """Case files with this beginning, here or one folder deeper; without any, the shell offers its own files."""
+    """Case files with this beginning, here or one folder deeper; without any, the shell offers its
+    own files.
+    """
     begin = escape(incomplete)
     files = glob(f"{begin}*.yaml") + glob(f"{begin}*/*.yaml")  # noqa: PTH207 - a Path would lose the ./ that was typed
     return sorted(files)
 
 
 def left_to_the_shell() -> list[str]:
-    """No completions of ours, so that the shell completes files; by default it would only add a blank."""
+    """No completions of ours, so that the shell completes files; by default it would only add a
+    blank.
+    """
     return []
 
 
-CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file", autocompletion=case_files)]
+CaseFile = Annotated[
+    Path, typer.Argument(metavar="CASE.yaml", help="the case file", autocompletion=case_files)
+]
 Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case"),
 ]
 Over = Annotated[
     list[str],
-    typer.Option(metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"),
+    typer.Option(
+        metavar="KEY.PATH=START:STOP:COUNT",
+        help="or =VALUE,VALUE; repeat for a product, tie keys with +",
+    ),
 ]
 
 
 def result_option(before: str = "") -> Any:
     return typer.Option(
-        "--result", metavar="NAME", help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ..."
+        "--result",
+        metavar="NAME",
+        help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ...",
     )
 
 
 Result = Annotated[str, result_option()]
 Run = Annotated[
     Path,
-    typer.Argument(metavar="DIR", help="folder of a finished or interrupted run", autocompletion=left_to_the_shell),
+    typer.Argument(
+        metavar="DIR",
+        help="folder of a finished or interrupted run",
+        autocompletion=left_to_the_shell,
+    ),
 ]
 
 
 Runs = Annotated[
     list[Path],
-    typer.Argument(metavar="DIR...", help="folders of finished or interrupted runs", autocompletion=left_to_the_shell),
+    typer.Argument(
+        metavar="DIR...",
+        help="folders of finished or interrupted runs",
+        autocompletion=left_to_the_shell,
+    ),
 ]
 
 
@@ -104,7 +126,9 @@ def points_of(text: str | None) -> list[int]:
     try:
         return [int(number) for number in text.split(",")] if text else []
     except ValueError:
-        raise CaseError(f"--shapes {text}: write it as numbers of points, for example 0,12,40") from None
+        raise CaseError(
+            f"--shapes {text}: write it as numbers of points, for example 0,12,40"
+        ) from None
 
 
 def folder_option(default: str) -> Any:
@@ -137,7 +161,11 @@ def picture_options(
     given: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
     given["formats"] = formats.split(",") if formats else None
     if camera:
-        angles = _numbers(camera, ",", f"--camera {camera}: write it as POLAR,AZIMUTH in degrees, for example 55,-60")
+        angles = _numbers(
+            camera,
+            ",",
+            f"--camera {camera}: write it as POLAR,AZIMUTH in degrees, for example 55,-60",
+        )
         given["camera"] = dict(zip(("polar", "azimuth"), angles, strict=True))
     if ranges:
         given["ranges"] = {}
@@ -162,27 +190,38 @@ def print_line(line: str) -> None:
 
 
 def failure(message: str, code: int) -> typer.Exit:
-    """Print the message of an error once, and return the end of this rank; ends all if the others have no error."""
+    """Print the message of an error once, and return the end of this rank; ends all if the others
+    have no error.
+    """
     comm = world()
     if comm.size > 1 and not _all_fail(comm):
         print(f"rank {comm.rank}: {message}", file=sys.stderr, flush=True)
         time.sleep(DELIVERED)
         comm.Abort(code)  # the other ranks would wait for this one for ever
     if comm.rank:
-        return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
+        return (
+            typer.Exit()
+        )  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
     with suppress(OSError):  # a full disk: the exit code says it
         print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
 
 
 def _all_fail(comm: Any) -> bool:
-    """Whether all ranks come here, as they do with an error of all, before those that have come lose patience."""
+    """Whether all ranks come here, as they do with an error of all, before those that have come
+    lose patience.
+    """
     from mpi4py import MPI
 
-    others, end = [rank for rank in range(comm.size) if rank != comm.rank], time.monotonic() + PATIENCE
+    others, end = (
+        [rank for rank in range(comm.size) if rank != comm.rank],
+        time.monotonic() + PATIENCE,
+    )
     for rank in others:
         comm.Isend(bytearray(1), rank, FAILED)
-    came = [comm.Irecv(bytearray(1), rank, FAILED) for rank in others]  # no collective: others may be in one
+    came = [
+        comm.Irecv(bytearray(1), rank, FAILED) for rank in others
+    ]  # no collective: others may be in one
     while not MPI.Request.Testall(came):
         if time.monotonic() > end:
             return False

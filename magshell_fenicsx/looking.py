@@ -1,4 +1,6 @@
-"""Commands that solve nothing: pictures and the report of a run, what a case means, examples, the schema, versions."""
+"""Commands that solve nothing: pictures and the report of a run, what a case means, examples, the
+schema, versions.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,27 +33,44 @@ app = Commands()
 @app.command()
 def plot(
     folders: Runs,
-    point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
-    animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
-    shapes: Annotated[str | None, typer.Option(metavar="N,N", help="put these points' shells on the curve")] = None,
-    whole: Annotated[bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")] = False,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")] = Path(
-        "curves.png"
-    ),
+    point: Annotated[
+        int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")
+    ] = None,
+    animation: Annotated[
+        bool, typer.Option("--animation", help="also draw the path: animation.gif")
+    ] = False,
+    shapes: Annotated[
+        str | None, typer.Option(metavar="N,N", help="put these points' shells on the curve")
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="also the whole shell of a half: fields/whole.pvd")
+    ] = False,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="of several runs: where their curves go")
+    ] = Path("curves.png"),
     formats: Annotated[
-        str | None, typer.Option(metavar="KIND,KIND", help="besides png: svg, pdf, with text as text")
+        str | None,
+        typer.Option(metavar="KIND,KIND", help="besides png: svg, pdf, with text as text"),
     ] = None,
     width: Annotated[float | None, typer.Option(metavar="MM", help="of a picture")] = None,
     dpi: Annotated[int | None, typer.Option(help="pixels per inch")] = None,
     font_size: Annotated[float | None, typer.Option(metavar="POINTS", help="of all text")] = None,
     camera: Annotated[
-        str | None, typer.Option(metavar="POLAR,AZIMUTH", help="from the shell to the eye, degrees from e3 and e1")
+        str | None,
+        typer.Option(
+            metavar="POLAR,AZIMUTH", help="from the shell to the eye, degrees from e3 and e1"
+        ),
     ] = None,
     range_: Annotated[
-        list[str] | None, typer.Option("--range", metavar="FIELD=LOW:HIGH", help="of colours, as w_over_h=-2:2; repeat")
+        list[str] | None,
+        typer.Option(
+            "--range", metavar="FIELD=LOW:HIGH", help="of colours, as w_over_h=-2:2; repeat"
+        ),
     ] = None,
 ) -> None:
-    """Draw the pictures and write the report of a run again, from its folder; of several runs their curves in one."""
+    """Draw the pictures and write the report of a run again, from its folder; of several runs their
+    curves in one.
+    """
     from magshell_fenicsx.output.pictures.plot import plotted
 
     if world().rank:
@@ -65,7 +84,9 @@ def plot(
 
 @app.command()
 def view(folder: Run) -> None:
-    """Open the report of a run in the web browser: the shell to turn, the path to walk along; else print its path."""
+    """Open the report of a run in the web browser: the shell to turn, the path to walk along; else
+    print its path.
+    """
     from magshell_fenicsx.output.report.report import opened, report_of
 
     if world().rank:
@@ -84,7 +105,9 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     with exit_codes():
         source = read_together(case, world(), set_ or [])
         read = with_same_files(Case.from_source(source), world())
-        from magshell_fenicsx.case.check import describe  # only now: the solver takes long to import
+        from magshell_fenicsx.case.check import (
+            describe,
+        )  # only now: the solver takes long to import
         from magshell_fenicsx.public import problem_of
         from magshell_fenicsx.simulate.perfect import with_modes
 
@@ -132,11 +155,16 @@ def _names() -> list[str]:
 @app.command()
 def example(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="name of the example", autocompletion=_names)
+        str | None,
+        typer.Argument(metavar="NAME", help="name of the example", autocompletion=_names),
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="FILE.yaml", help="file to write; default NAME.yaml", autocompletion=left_to_the_shell),
+        typer.Argument(
+            metavar="FILE.yaml",
+            help="file to write; default NAME.yaml",
+            autocompletion=left_to_the_shell,
+        ),
     ] = None,
 ) -> None:
     """Write an example case to a file; without NAME, list all examples."""
@@ -156,7 +184,9 @@ def example(
 
 @app.command()
 def schema(
-    markdown: Annotated[bool, typer.Option("--markdown", help="print the page docs/case.md instead")] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="print the page docs/case.md instead")
+    ] = False,
 ) -> None:
     """Print the JSON Schema of the case file, for editors."""
     from magshell_fenicsx.case.reference import reference, schema_text
@@ -167,7 +197,9 @@ def schema(
 
 @app.command()
 def info(
-    compile_: Annotated[bool, typer.Option("--compile", help="compile the kernels of degrees 3 and 4 now")] = False,
+    compile_: Annotated[
+        bool, typer.Option("--compile", help="compile the kernels of degrees 3 and 4 now")
+    ] = False,
 ) -> None:
     """Print versions, the BLAS in use and the folder of the kernel cache."""
     from magshell_fenicsx.platform.environment import fast_blas, versions

@@ -1,4 +1,6 @@
-"""What programs call: a run and a scene of a problem, or of what makes one, as a case or the path of its file."""
+"""What programs call: a run and a scene of a problem, or of what makes one, as a case or the path
+of its file.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -29,8 +31,11 @@ Given: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
 
 
-def problem_of(given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()) -> Problem:
-    """The problem itself, or that of a case, of a mapping like a case file, or of the file at a path; collective.
+def problem_of(
+    given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()
+) -> Problem:
+    """The problem itself, or that of a case, of a mapping like a case file, or of the file at a
+    path; collective.
 
     Parameters
     ----------
@@ -44,7 +49,9 @@ def problem_of(given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[Ow
     """
     if isinstance(given, Problem):
         if terms:
-            raise CaseError("terms: a problem has its energies already: give them to what makes the problem")
+            raise CaseError(
+                "terms: a problem has its energies already: give them to what makes the problem"
+            )
         return given
     case = opened(given, comm)
     try:
@@ -83,7 +90,9 @@ class Scene(SceneOfProblem):
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         if plan is not None:
-            warn("Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2)
+            warn(
+                "Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2
+            )
         comm = processes(plan or case, comm)
         super().__init__(plan or problem_of(case, comm, terms), comm)
         self._given = case
@@ -91,7 +100,11 @@ class Scene(SceneOfProblem):
     @property
     def case(self) -> Case:
         """The case that was given, as in earlier versions."""
-        warn("Scene.case is now Scene.problem, which has all that is computed", DeprecationWarning, stacklevel=2)
+        warn(
+            "Scene.case is now Scene.problem, which has all that is computed",
+            DeprecationWarning,
+            stacklevel=2,
+        )
         assert not isinstance(self._given, Problem), "a scene of a problem has no case"
         return opened(self._given, self.comm)
 
@@ -99,7 +112,8 @@ class Scene(SceneOfProblem):
 def follow(
     given: SceneOfProblem | Given, *, search: bool = True, remark: Callable[[str], None] = warned
 ) -> Iterator[Record]:
-    """Compute the history of a scene, or of a problem or what makes one; yields every accepted point.
+    """Compute the history of a scene, or of a problem or what makes one; yields every accepted
+    point.
 
     A problem on a mesh of a program is solved by the processes of that mesh. For all else see
     `simulate.follow.follow`.
@@ -118,10 +132,12 @@ def boundary(
     *,
     start: str | None = None,
 ) -> "StabilityBoundary":
-    """Follow the instability at the end of a case file in a second key; see `studies.boundary.boundary`.
+    """Follow the instability at the end of a case file in a second key; see
+    `studies.boundary.boundary`.
 
-    `start` is another one: "DIR:POINT", a fold or bifurcation of the run in a folder. With two keys, it is followed in
-    the first for each value of the second: `studies.boundary_map.boundary_map`.
+    `start` is another one: "DIR:POINT", a fold or bifurcation of the run in a folder. With two
+    keys, it is followed in the first for each value of the second:
+    `studies.boundary_map.boundary_map`.
     """
     from magshell_fenicsx.studies.boundary_map import boundary_map
 
@@ -141,7 +157,13 @@ def identify(
     from magshell_fenicsx.studies.identify import identify as identify_parameters
 
     return identify_parameters(
-        file, data, settings, out, comm, say, made=lambda source: with_same_files(Case.from_source(source), comm)
+        file,
+        data,
+        settings,
+        out,
+        comm,
+        say,
+        made=lambda source: with_same_files(Case.from_source(source), comm),
     )
 
 
@@ -160,7 +182,8 @@ def run(
 ) -> Result:
     """Run a problem.
 
-    With `out`, SIGTERM, SIGINT, SIGUSR1 and SIGHUP stop the run after the current point, and it can be resumed.
+    With `out`, SIGTERM, SIGINT, SIGUSR1 and SIGHUP stop the run after the current point, and it can
+    be resumed.
 
     Parameters
     ----------
@@ -183,15 +206,16 @@ def run(
     pictures
         Whether they are drawn; `magshell plot` draws them later.
     terms
-        User-defined energies, with their amplitudes at `OwnTerm.value`; to resume the run give the same.
+        User-defined energies, with their amplitudes at `OwnTerm.value`; to resume the run give the
+        same.
 
     Raises
     ------
     CaseError, MeshError
-        If no problem or no model can be built: a MeshError, where the surface has no such edge or patch, or its
-        triangulation carries no shell. A CaseError too, if `out` cannot be written, has files that no run has written,
-        a run of another case file or an interrupted one, or no run of this case to resume; what is in `out` stays as
-        it is.
+        If no problem or no model can be built: a MeshError, where the surface has no such edge or
+        patch, or its triangulation carries no shell. A CaseError too, if `out` cannot be written,
+        has files that no run has written, a run of another case file or an interrupted one, or no
+        run of this case to resume; what is in `out` stays as it is.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError

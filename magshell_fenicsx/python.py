@@ -1,7 +1,7 @@
 """A problem in Python, without a case file: a shell, what holds it and what loads it, as objects.
 
-They say what the sections of a case file say, in the same words and with the same messages; values may be NumPy's, and
-where a formula may stand, a dolfinx function on the shell's mesh may stand too.
+They say what the sections of a case file say, in the same words and with the same messages; values
+may be NumPy's, and where a formula may stand, a dolfinx function on the shell's mesh may stand too.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,21 +46,24 @@ class Shell:
     Parameters
     ----------
     surface
-        A dolfinx mesh of triangles in space, of order 1 to 3; or a geometry of a case file, such as "hemisphere".
+        A dolfinx mesh of triangles in space, of order 1 to 3; or a geometry of a case file, such as
+        "hemisphere".
     edges, patches
-        Of a mesh: name -> a value of the tags, or local numbers of facets or of cells. Every edge where the surface
-        ends needs a name.
+        Of a mesh: name -> a value of the tags, or local numbers of facets or of cells. Every edge
+        where the surface ends needs a name.
     facet_tags, cell_tags
         Of a mesh, as dolfinx reads them.
     radius
-        The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
+        The length R that formulas and dimensionless results are over; by default of a mesh half its
+        largest extent.
     unit
         Of a mesh: the unit of its coordinates where the thickness has one, such as "mm"; by default
         the metre, which is refused where bounds, radius and thickness say otherwise: give "m" where
         it is right.
     name, place, points, mesh, remanent
-        Of one of several shells: the name before its edges and points, `upper.rim`; and where it is, its named points,
-        its elements (`{"size": "2 mm"}`) and its remanence, as a case has them under `shells`.
+        Of one of several shells: the name before its edges and points, `upper.rim`; and where it
+        is, its named points, its elements (`{"size": "2 mm"}`) and its remanence, as a case has
+        them under `shells`.
     keys
         What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The
         thickness times `thickness_factor`, a formula of the place x, y, z over R or a function, is
@@ -93,7 +96,10 @@ class Shell:
         **keys: Any,
     ) -> None:
         self.home: Home | None = None
-        self.name, self._own = name, {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
+        self.name, self._own = (
+            name,
+            {"place": place, "points": points, "mesh": mesh, "remanent": remanent},
+        )
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
         geometry = surface if isinstance(surface, str) else "mesh"
@@ -102,9 +108,17 @@ class Shell:
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
         refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._own, *of_mesh))
         if isinstance(surface, str):
-            given = {"edges": edges, "patches": patches, "facet_tags": facet_tags, "cell_tags": cell_tags, "unit": unit}
+            given = {
+                "edges": edges,
+                "patches": patches,
+                "facet_tags": facet_tags,
+                "cell_tags": cell_tags,
+                "unit": unit,
+            }
             if strange := next((name for name, value in given.items() if value is not None), None):
-                raise CaseError(f"{NAME}: shell.{strange}: is of a mesh; a {surface} has its own edges")
+                raise CaseError(
+                    f"{NAME}: shell.{strange}: is of a mesh; a {surface} has its own edges"
+                )
             self._keys |= {"geometry": surface}
             return
         if strange := next((key for key in ("geometry", "file") if key in keys), None):
@@ -182,7 +196,8 @@ class Piece:
 
 
 def Section(key: str, **keys: Any) -> Piece:
-    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, `Section("natural", ...)`.
+    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`,
+    `Section("natural", ...)`.
 
     One that is a list is a keyword of `Problem`: `joints=[...]`, `contact=[...]`.
 
@@ -202,7 +217,8 @@ def Section(key: str, **keys: Any) -> Piece:
 
 
 def Step(kind: str, **keys: Any) -> Piece:
-    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural", "contact", ...
+    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural",
+    "contact", ...
 
     Raises
     ------
@@ -249,8 +265,11 @@ def _supports(condition: Any, names: Sequence[str]) -> Piece:
     return Piece("boundary", lambda shell: dict.fromkeys(names, condition))
 
 
-def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, **keys: Any) -> Piece:
-    """What is magnetised, and the applied field; in tesla, or with `lambda_m` over their magnitudes.
+def Field(
+    remanent: Vector, applied: Vector, *, lambda_m: float | None = None, **keys: Any
+) -> Piece:
+    """What is magnetised, and the applied field; in tesla, or with `lambda_m` over their
+    magnitudes.
 
     Parameters
     ----------
@@ -272,12 +291,18 @@ def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, *
             "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
         }
         others: Keys = shell.plain(keys, "magnetic")
-        return both | others | ({"lambda_m": shell.plain(lambda_m, "magnetic.lambda_m")} if dimensionless else {})
+        return (
+            both
+            | others
+            | ({"lambda_m": shell.plain(lambda_m, "magnetic.lambda_m")} if dimensionless else {})
+        )
 
     return Piece("magnetic", made)
 
 
-def _refuse_metres(extents: NDArray[np.float64], radius: float | str | None, thickness: str) -> None:
+def _refuse_metres(
+    extents: NDArray[np.float64], radius: float | str | None, thickness: str
+) -> None:
     """See that the bounds of a mesh without a unit are those of a shell in metres.
 
     Parameters
@@ -340,7 +365,9 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
     try:
         x, y, z = map(float, components)
     except (TypeError, ValueError):
-        raise CaseError(f"{NAME}: {key}: {components}: its components are numbers or formulas") from None
+        raise CaseError(
+            f"{NAME}: {key}: {components}: its components are numbers or formulas"
+        ) from None
     direction = {"polar": degrees(atan2(hypot(x, y), z)), "azimuth": degrees(atan2(y, x))}
     return {**direction, **of_size(hypot(x, y, z))}
 
@@ -358,16 +385,19 @@ def Problem(
     Parameters
     ----------
     shell
-        What is computed; or several, each with a name: `Clamped("upper.rim")` then holds the rim of `upper`.
+        What is computed; or several, each with a name: `Clamped("upper.rim")` then holds the rim of
+        `upper`.
     parts
-        Supports, fields, steps and other sections, and one's own energies. The steps are a programme in this order;
-        before a single one the natural shape grows and the field is applied.
+        Supports, fields, steps and other sections, and one's own energies. The steps are a
+        programme in this order; before a single one the natural shape grows and the field is
+        applied.
     points
         Name -> place, in the lengths of the shell; of a mesh a vertex, in its coordinates.
     degree
         Of the displacement.
     symmetry
-        As in a case; by default all of a mesh, and of other shapes the smallest part that all allow.
+        As in a case; by default all of a mesh, and of other shapes the smallest part that all
+        allow.
     sections
         Others of a case, by key.
 
@@ -382,14 +412,20 @@ def Problem(
         _refuse_unfit_shells(several)
     if not isinstance(shell, Shell):
         raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    own = {"shells": {each.name: each.one_of_several() for each in several}} if several else {"shell": shell.section()}
+    own = (
+        {"shells": {each.name: each.one_of_several() for each in several}}
+        if several
+        else {"shell": shell.section()}
+    )
     data: Keys = {**own, "boundary": {}, **shell.plain(sections, "case")}
     steps, terms = list[Keys](), list[OwnTerm]()
     for part in parts:
         if isinstance(part, OwnTerm):
             terms.append(_on_mesh(part, shell))
         elif not isinstance(part, Piece):
-            raise CaseError(f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and OwnTerm")
+            raise CaseError(
+                f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and OwnTerm"
+            )
         elif part.key == "loading":
             steps.append(part.keys(shell))
         else:
@@ -412,9 +448,13 @@ def _refuse_unfit_shells(several: Sequence[Any]) -> None:
     for each in several:
         if not isinstance(each, Shell) or not each.name:
             told = "a shell without a name" if isinstance(each, Shell) else repr(each)
-            raise CaseError(f"{NAME}: {told}: of several shells each is what ms.Shell gives, with a name")
+            raise CaseError(
+                f"{NAME}: {told}: of several shells each is what ms.Shell gives, with a name"
+            )
         if each.home:
-            raise CaseError(f"{NAME}: {each.name}: of several shells each has a geometry: write its mesh to a file")
+            raise CaseError(
+                f"{NAME}: {each.name}: of several shells each has a geometry: write its mesh to a file"
+            )
     names = [each.name for each in several]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise CaseError(f"{NAME}: {twice}: two shells have this name")
@@ -451,13 +491,16 @@ def _join(data: Keys, key: str, more: Keys) -> None:
         raise CaseError(f"{NAME}: {key}: {section!r}: must be a section, with keys below it")
     for name, value in more.items():
         if name in section and section[name] != value:
-            raise CaseError(f"{NAME}: {key}.{name}: is given twice, as {section[name]} and as {value}")
+            raise CaseError(
+                f"{NAME}: {key}.{name}: is given twice, as {section[name]} and as {value}"
+            )
     data[key] = {**section, **more}
 
 
 def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
     """One's own energy with functions of parameters known in all triangles."""
     parameters = tuple(
-        shell.given(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p for p in term.parameters
+        shell.given(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
+        for p in term.parameters
     )
     return replace(term, parameters=parameters) if term.varying else term

@@ -35,14 +35,21 @@ def _compiled(term: FormTerm | HessianTerm) -> Direction:
     if "along" not in vars(term):
         of = term._u if isinstance(term, FormTerm) else term._v
         test = ufl.TestFunction(of.function_space)
-        gradient = term._gradient if isinstance(term, FormTerm) else ufl.derivative(term._energy, of, test)
+        gradient = (
+            term._gradient if isinstance(term, FormTerm) else ufl.derivative(term._energy, of, test)
+        )
         direction = fem.Function(of.function_space)
-        vars(term)["along"] = direction, term._log.compile("along", ufl.derivative(gradient, of, direction))
+        vars(term)["along"] = (
+            direction,
+            term._log.compile("along", ufl.derivative(gradient, of, direction)),
+        )
     found: Direction = vars(term)["along"]
     return found
 
 
-def along(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float], v: np.ndarray) -> np.ndarray:
+def along(
+    system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float], v: np.ndarray
+) -> np.ndarray:
     """d2Pi/du2 . v without supports."""
 
     def total() -> np.ndarray:
@@ -63,7 +70,9 @@ def along(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float], v
 
 
 def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:
-    """Largest relative difference of the tangent from the forms, along three directions; supports have unit rows."""
+    """Largest relative difference of the tangent from the forms, along three directions; supports
+    have unit rows.
+    """
     K, worst = csr(system.tangent(u, dict(mu))), 0.0
     for seed in range(3):
         v = np.random.default_rng(seed).standard_normal(system.size)
@@ -81,10 +90,16 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -
     v[system._fixed] = 0
 
     def energy(x: np.ndarray) -> float:
-        return sum((mu[t.amplitude] if t.amplitude else 1) * system.energies(x, mu)[t.name] for t in system.terms)
+        return sum(
+            (mu[t.amplitude] if t.amplitude else 1) * system.energies(x, mu)[t.name]
+            for t in system.terms
+        )
 
     e = 1e-5
-    slope = (8 * (energy(u + e * v) - energy(u - e * v)) - (energy(u + 2 * e * v) - energy(u - 2 * e * v))) / (12 * e)
+    slope = (
+        8 * (energy(u + e * v) - energy(u - e * v))
+        - (energy(u + 2 * e * v) - energy(u - 2 * e * v))
+    ) / (12 * e)
     R = system.residual(u, mu)
     assert R @ v == pytest.approx(slope, rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v))
     K = csr(system.tangent(u, mu))
@@ -99,15 +114,22 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -
 
 
 def check_derivatives(
-    scene: Scene, flat: NDArray[np.float64], deep: tuple[float, float], h: float, seed: int = 0, far: float = 100.0
+    scene: Scene,
+    flat: NDArray[np.float64],
+    deep: tuple[float, float],
+    h: float,
+    seed: int = 0,
+    far: float = 100.0,
 ) -> None:
-    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences; `deep` are bounds.
+    """Those of the only contact at a displacement (nodes, 3) that is made rough, by differences;
+    `deep` are bounds.
 
     `far` is the step of the energy's difference over that of the forces'.
     """
     system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
     rough, moved, other = (
-        system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]) for k in range(3)
+        system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size])
+        for k in range(3)
     )
     u, v = system.held(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
     at = system.at(State(u, mu))
@@ -117,5 +139,7 @@ def check_derivatives(
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
     energies = [system.energies(u + side * far * v, mu)[term.name] for side in (-0.5, 0.5)]
-    assert energies[1] - energies[0] == pytest.approx(far * system.forces(u, mu, term.name) @ v, rel=1e-6)
+    assert energies[1] - energies[0] == pytest.approx(
+        far * system.forces(u, mu, term.name) @ v, rel=1e-6
+    )
     assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)

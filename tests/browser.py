@@ -1,4 +1,6 @@
-"""Headless Chromium: opens pages and answers questions about them, by the DevTools protocol over two pipes."""
+"""Headless Chromium: opens pages and answers questions about them, by the DevTools protocol over
+two pipes.
+"""
 
 import base64
 import json
@@ -51,7 +53,13 @@ class Page:
 
     def resize(self, width: int, height: int = 900) -> None:
         """Give the window another size, as a phone that is turned."""
-        self._ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self._ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
         self.wait(f"innerWidth === {width}")
 
     def wait(self, condition: str) -> None:
@@ -76,7 +84,9 @@ class Page:
         ValueError
             If the expression throws.
         """
-        found = self._ask("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        found = self._ask(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in found:
             raise ValueError(f"{expression}: {found['exceptionDetails']}")
         return found["result"].get("value")
@@ -88,7 +98,9 @@ class Page:
 
     def pdf(self, file: Path) -> None:
         """Write the page as it is printed."""
-        file.write_bytes(base64.b64decode(self._ask("Page.printToPDF", preferCSSPageSize=True)["data"]))
+        file.write_bytes(
+            base64.b64decode(self._ask("Page.printToPDF", preferCSSPageSize=True)["data"])
+        )
 
     def hear(self, event: dict[str, Any]) -> None:
         """Keep what went wrong."""
@@ -109,9 +121,13 @@ class Browser:
 
     def page(self) -> Page:
         target = self.ask("Target.createTarget", url="about:blank")["targetId"]
-        return Page(self, self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"])
+        return Page(
+            self, self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        )
 
-    def ask(self, method: str, page: Page | None = None, session: str = "", **parameters: Any) -> dict[str, Any]:
+    def ask(
+        self, method: str, page: Page | None = None, session: str = "", **parameters: Any
+    ) -> dict[str, Any]:
         """The answer to a message; events that come before it are told to the page.
 
         Raises
@@ -121,7 +137,10 @@ class Browser:
         """
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
-        os.write(self._to, json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0")
+        os.write(
+            self._to,
+            json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0",
+        )
         for found in self._messages():
             if found.get("id") == self._number:
                 if "error" in found:
@@ -146,8 +165,18 @@ def browser(home: Path) -> Iterator[Browser]:
     """A browser with its own new folder."""
     assert PROGRAM
     (theirs, to), (back, answers) = os.pipe(), os.pipe()
-    said = ["bash", "-c", f'exec "$@" 3<&{theirs} 4>&{answers}', "bash", PROGRAM, f"--user-data-dir={home}", *OPTIONS]
-    running = subprocess.Popen(said, pass_fds=(theirs, answers), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    said = [
+        "bash",
+        "-c",
+        f'exec "$@" 3<&{theirs} 4>&{answers}',
+        "bash",
+        PROGRAM,
+        f"--user-data-dir={home}",
+        *OPTIONS,
+    ]
+    running = subprocess.Popen(
+        said, pass_fds=(theirs, answers), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     os.close(theirs)
     os.close(answers)
     try:

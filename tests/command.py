@@ -16,12 +16,18 @@ from magshell_fenicsx.platform import processes
 
 NICE = ["nice", "-n", "-10"]
 # click before 8.2 mixes both streams by default
-APART: dict[str, Any] = {"mix_stderr": False} if "mix_stderr" in inspect.signature(CliRunner).parameters else {}
-FIRST = [] if subprocess.run([*NICE, "true"], capture_output=True, check=False).stderr else NICE  # root may
+APART: dict[str, Any] = (
+    {"mix_stderr": False} if "mix_stderr" in inspect.signature(CliRunner).parameters else {}
+)
+FIRST = (
+    [] if subprocess.run([*NICE, "true"], capture_output=True, check=False).stderr else NICE
+)  # root may
 
 
 def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run `magshell ...`: in this process, which saves two seconds, or undrawn under mpirun if it has more ranks."""
+    """Run `magshell ...`: in this process, which saves two seconds, or undrawn under mpirun if it
+    has more ranks.
+    """
     words = [str(word) for word in arguments]
     if ranks > 1:
         return started(*words, ranks=ranks, pictures=False)
@@ -36,16 +42,27 @@ def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.Compl
 def mpirun(ranks: int) -> list[str]:
     """The launcher of so many ranks.
 
-    Ranks poll while they wait for each other: beside another test they take several times as long if not first.
+    Ranks poll while they wait for each other: beside another test they take several times as long
+    if not first.
     """
     return [*FIRST, *processes.mpirun(ranks)]
 
 
-def started(*arguments: str | Path | float, ranks: int = 0, pictures: bool = True) -> subprocess.CompletedProcess[str]:
+def started(
+    *arguments: str | Path | float, ranks: int = 0, pictures: bool = True
+) -> subprocess.CompletedProcess[str]:
     """Run `magshell ...` in processes of its own, under mpirun if `ranks` is given."""
     launcher, words = mpirun(ranks) if ranks else [], [str(word) for word in arguments]
     undrawn = ["--no-pictures"] if words[:1] == ["run"] and not pictures else []
-    command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *words[:1], *undrawn, *words[1:]]
+    command = [
+        *launcher,
+        sys.executable,
+        "-m",
+        "magshell_fenicsx",
+        *words[:1],
+        *undrawn,
+        *words[1:],
+    ]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -70,6 +87,8 @@ for words in json.loads(sys.argv[1]):
 
 
 def all_started(commands: list[list[str]], ranks: int) -> subprocess.CompletedProcess[str]:
-    """Run `magshell ...` several times in the same processes under mpirun, which start once; all must succeed."""
+    """Run `magshell ...` several times in the same processes under mpirun, which start once; all
+    must succeed.
+    """
     command = [*mpirun(ranks), sys.executable, "-c", SEVERAL, json.dumps(commands)]
     return subprocess.run(command, capture_output=True, text=True, check=False)

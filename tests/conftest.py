@@ -24,7 +24,8 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel
 
-# ranks that wait for each other let others go on: beside another test they take a fifth of the time, and of the CPU
+# ranks that wait for each other let others go on: beside another test they take a fifth of the
+# time, and of the CPU
 os.environ.setdefault("OMPI_MCA_mpi_yield_when_idle", "1")
 TESTS = Path(__file__).parent
 CASES = TESTS.parent / "cases"
@@ -55,7 +56,9 @@ loading: {kind: field, points: 4}
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 
 
-deselected_of_folder = Counter[str]()  # number of slow tests that are left out, by the folder of tests/
+deselected_of_folder = Counter[
+    str
+]()  # number of slow tests that are left out, by the folder of tests/
 
 
 def pytest_deselected(items: Sequence[pytest.Item]) -> None:
@@ -80,23 +83,30 @@ def pytest_testnodedown(node: Any) -> None:
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Say what `make test-all` has beyond the tests that were run."""
     if deselected_of_folder:
-        counts = ", ".join(f"{count} of {folder}" for folder, count in deselected_of_folder.most_common())
-        terminalreporter.write_line(f"make test-all has {deselected_of_folder.total()} slow tests more: {counts}")
+        counts = ", ".join(
+            f"{count} of {folder}" for folder, count in deselected_of_folder.most_common()
+        )
+        terminalreporter.write_line(
+            f"make test-all has {deselected_of_folder.total()} slow tests more: {counts}"
+        )
 
 
 @pytest.hookimpl(trylast=True)  # after tests that are not asked for have been left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Each of several workers begins with files that have slow tests: what it takes from others at the end is short.
+    """Each of several workers begins with files that have slow tests: what it takes from others at
+    the end is short.
 
-    pytest-xdist gives each an equal part of the list, one after the other; an idle one takes the last half of what
-    another has left.
+    pytest-xdist gives each an equal part of the list, one after the other; an idle one takes the
+    last half of what another has left.
     """
     if (workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) == 1:
         return
     files = [list(tests) for _, tests in groupby(items, lambda item: item.path)]
     slow = [tests for tests in files if any(item.get_closest_marker("slow") for item in tests)]
     quick = [item for tests in files if tests not in slow for item in tests]
-    parts = [[item for tests in slow[worker::workers] for item in tests] for worker in range(workers)]
+    parts = [
+        [item for tests in slow[worker::workers] for item in tests] for worker in range(workers)
+    ]
     left = len(items)
     for worker, part in enumerate(parts):
         size = left // (workers - worker)
@@ -114,7 +124,9 @@ def _no_reminders(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr("magshell_fenicsx.studies.runner.EACH", 3600.0)
 
 
-def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None) -> Midsurface:
+def hemisphere(
+    size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None
+) -> Midsurface:
     """A coarse hemisphere; the size holds everywhere."""
     points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}
     shape = DiscShape(np.pi / 2, half, (dimple.width,) if dimple else ())
@@ -129,7 +141,9 @@ def spherical(dimple: Dimple | None) -> Embedding:
 def disc(size: float, *, half: bool = False) -> Midsurface:
     """A flat disc of radius 1."""
     points = {"pole": np.zeros(2)}
-    return distribute(triangulate(DiscShape(1.0, half), lambda x: size, points, flat), MPI.COMM_SELF)
+    return distribute(
+        triangulate(DiscShape(1.0, half), lambda x: size, points, flat), MPI.COMM_SELF
+    )
 
 
 @pytest.fixture(scope="session")
@@ -137,13 +151,19 @@ def shell() -> Callable[..., ShellModel]:
     """Makes (once each) a coarse dimpled hemisphere with every load."""
 
     @cache
-    def make(degree: int, half: bool = False, held: bool = True, energy: MagneticEnergy = "full") -> ShellModel:
+    def make(
+        degree: int, half: bool = False, held: bool = True, energy: MagneticEnergy = "full"
+    ) -> ShellModel:
         edges: Mapping[str, Condition] = {"rim": "clamped"} if held else {}
         if half:
             edges = {**edges, "symmetry": "symmetry"}
         surface = hemisphere(half=half, dimple=Dimple(0.05, 0.5))
         return ShellModel(
-            surface, Material(0.3, 0.05), degree, edges, Loads(pressure=True, magnetic=replace(TILTED, energy=energy))
+            surface,
+            Material(0.3, 0.05),
+            degree,
+            edges,
+            Loads(pressure=True, magnetic=replace(TILTED, energy=energy)),
         )
 
     return make
@@ -156,7 +176,9 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_module("magshell_fenicsx.runs.running"), "_draw", lambda folder: None)
+    monkeypatch.setattr(
+        import_module("magshell_fenicsx.runs.running"), "_draw", lambda folder: None
+    )
 
 
 def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:

@@ -1,7 +1,9 @@
-"""A plugin of pytest that writes which lines of the package each test executes in its process, and its CPU time.
+"""A plugin of pytest that writes which lines of the package each test executes in its process, and
+its CPU time.
 
-`python3 -m pytest -p executed_lines --executed-lines FILE` appends one line of JSON for each test: its `test`, whether
-it is `slow`, its `seconds` of CPU with those of its children, whether it `passed`, and its `lines` by module.
+`python3 -m pytest -p executed_lines --executed-lines FILE` appends one line of JSON for each test:
+its `test`, whether it is `slow`, its `seconds` of CPU with those of its children, whether it
+`passed`, and its `lines` by module.
 """
 
 import json
@@ -22,7 +24,11 @@ lines_of_module = defaultdict[str, set[int]](set)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--executed-lines", type=Path, help="file that the executed lines of each test are appended to")
+    parser.addoption(
+        "--executed-lines",
+        type=Path,
+        help="file that the executed lines of each test are appended to",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

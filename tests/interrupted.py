@@ -23,7 +23,10 @@ def start(*arguments: str | Path, ranks: int = 0, size_limit: int = 0) -> subpro
     program = ["-m", "magshell_fenicsx"]
     if size_limit:  # MPI itself needs larger files as it begins
         limit = f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size_limit}, {size_limit}))"
-        program = ["-c", f"import resource\nfrom mpi4py import MPI\n{limit}\nimport magshell_fenicsx.__main__"]
+        program = [
+            "-c",
+            f"import resource\nfrom mpi4py import MPI\n{limit}\nimport magshell_fenicsx.__main__",
+        ]
     command = [*launcher, sys.executable, *program, *map(str, arguments)]
     # mpirun loses lines of stderr where stdout is /dev/null
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -55,7 +58,9 @@ def processes(run: subprocess.Popen[str], ranks: int) -> list[int]:
     if not ranks:
         return [run.pid]
     parents = {
-        int(file.parent.name): int(re.sub(r".*\) . (\d+) .*", r"\1", file.read_text(), flags=re.DOTALL))
+        int(file.parent.name): int(
+            re.sub(r".*\) . (\d+) .*", r"\1", file.read_text(), flags=re.DOTALL)
+        )
         for file in Path("/proc").glob("[0-9]*/stat")
         if file.exists()
     }
@@ -86,8 +91,13 @@ def check_fields(out: Path) -> None:
     rows = len(read_path(out))
     names = {f"point_{i:04d}.vtu" for i in range(rows)}
     found = {file.name for file in (out / "fields").iterdir() if not file.name.startswith("mode_")}
-    if drawn := {name for name in found if name.startswith("outlines_")}:  # a source or a body moves
+    if drawn := {
+        name for name in found if name.startswith("outlines_")
+    }:  # a source or a body moves
         assert drawn == {f"outlines_{i:04d}.vtp" for i in range(rows)}
         names |= drawn
     assert found == names | {"path.pvd"}
-    assert set(re.findall(r'file="(.*?)"', (out / "fields" / "path.pvd").read_text(encoding="utf-8"))) == names
+    assert (
+        set(re.findall(r'file="(.*?)"', (out / "fields" / "path.pvd").read_text(encoding="utf-8")))
+        == names
+    )

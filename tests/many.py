@@ -22,6 +22,8 @@ make_samples = partial(samples.make_samples, made=Case.from_source)
 with_earlier = partial(sweeps.with_earlier, made=Case.from_source)
 
 
-def make_points(file: Path, axes: Sequence[points.Axis], settings: Sequence[str] = ()) -> list[points.SweepPoint]:
+def make_points(
+    file: Path, axes: Sequence[points.Axis], settings: Sequence[str] = ()
+) -> list[points.SweepPoint]:
     """All points of a sweep of a case's file."""
     return points.make_points(points.swept_source(file, axes, settings), axes, Case.from_source)

@@ -4,10 +4,11 @@ First record what each test executes, in whole or in several runs:
 
     python3 -m pytest -p executed_lines --executed-lines FILE tests
 
-Then `python3 tests/mutants.py FILE --out TABLE.md` draws mutants at random: a sign, a factor 1.01, a dropped term, an
-index, a comparison or two swapped arguments, in lines that a test executes. Each is written into a copy of the
-repository, with kernels of its own. There the tests that execute its line run, the shortest first, until one fails:
-first those that are not marked slow, then the slow ones.
+Then `python3 tests/mutants.py FILE --out TABLE.md` draws mutants at random: a sign, a factor 1.01,
+a dropped term, an index, a comparison or two swapped arguments, in lines that a test executes. Each
+is written into a copy of the repository, with kernels of its own. There the tests that execute its
+line run, the shortest first, until one fails: first those that are not marked slow, then the slow
+ones.
 """
 
 import argparse
@@ -29,7 +30,14 @@ from typing import Any, ClassVar
 TOP = Path(__file__).parents[1]
 PACKAGE = "magshell_fenicsx"
 GROUPS = {
-    "mechanics": ("models", "shells", "parts/rubber.py", "parts/laminate.py", "parts/natural", "parts/joints.py"),
+    "mechanics": (
+        "models",
+        "shells",
+        "parts/rubber.py",
+        "parts/laminate.py",
+        "parts/natural",
+        "parts/joints.py",
+    ),
     "assembly": ("assembly",),
     "continuation": ("continuation",),
     "loads": (
@@ -47,7 +55,10 @@ GROUPS = {
     "output": ("output", "quantities"),
 }  # the package's files, by what is asked of them
 BATCH = 12  # tests that one process runs: it starts in two seconds
-FAST_SECONDS, SLOW_SECONDS = 240.0, 600.0  # of CPU that the tests of one mutant may have taken without it
+FAST_SECONDS, SLOW_SECONDS = (
+    240.0,
+    600.0,
+)  # of CPU that the tests of one mutant may have taken without it
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,14 @@ class Executed:
 class Sites(ast.NodeVisitor):
     """All mutants of a module, in functions alone, apart from annotations and messages."""
 
-    OPPOSITE: ClassVar = {ast.Lt: ">=", ast.Gt: "<=", ast.LtE: ">", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="}
+    OPPOSITE: ClassVar = {
+        ast.Lt: ">=",
+        ast.Gt: "<=",
+        ast.LtE: ">",
+        ast.GtE: "<",
+        ast.Eq: "!=",
+        ast.NotEq: "==",
+    }
 
     def __init__(self, module: str, source: bytes):
         self.module, self.source = module, source
@@ -118,7 +136,9 @@ class Sites(ast.NodeVisitor):
 
     def _add(self, kind: str, node: ast.expr, after: str) -> None:
         if self._depth:
-            self.mutants.append(Mutant(self.module, node.lineno, kind, *self._place(node), self._text(node), after))
+            self.mutants.append(
+                Mutant(self.module, node.lineno, kind, *self._place(node), self._text(node), after)
+            )
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         self._depth += 1
@@ -142,12 +162,17 @@ class Sites(ast.NodeVisitor):
     def visit_BinOp(self, node: ast.BinOp) -> None:
         left, right = self._text(node.left), self._text(node.right)
         texts = any(
-            isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
+            isinstance(n, ast.JoinedStr)
+            or (isinstance(n, ast.Constant) and isinstance(n.value, str))
             for n in ast.walk(node)
         )
         if not texts:
             if isinstance(node.op, ast.Add | ast.Sub):
-                self._add("sign", node, f"({left} {'-' if isinstance(node.op, ast.Add) else '+'} ({right}))")
+                self._add(
+                    "sign",
+                    node,
+                    f"({left} {'-' if isinstance(node.op, ast.Add) else '+'} ({right}))",
+                )
                 self._add("dropped term", node, f"({left})")
             if isinstance(node.op, ast.Mult | ast.Div):
                 self._add("factor 1.01", node, f"(1.01 * ({self._text(node)}))")
@@ -174,14 +199,24 @@ class Sites(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:
-        plain = len(node.args) >= 2 and not any(isinstance(each, ast.Starred) for each in node.args[:2])
+        plain = len(node.args) >= 2 and not any(
+            isinstance(each, ast.Starred) for each in node.args[:2]
+        )
         if plain and not (
-            isinstance(node.func, ast.Name) and node.func.id in ("isinstance", "getattr", "hasattr", "min", "max")
+            isinstance(node.func, ast.Name)
+            and node.func.id in ("isinstance", "getattr", "hasattr", "min", "max")
         ):
             texts = [self._text(each) for each in node.args]
-            swapped = [texts[1], texts[0], *texts[2:], *(self._text_of_keyword(each) for each in node.keywords)]
+            swapped = [
+                texts[1],
+                texts[0],
+                *texts[2:],
+                *(self._text_of_keyword(each) for each in node.keywords),
+            ]
             if texts[0] != texts[1]:
-                self._add("swapped arguments", node, f"{self._text(node.func)}({', '.join(swapped)})")
+                self._add(
+                    "swapped arguments", node, f"{self._text(node.func)}({', '.join(swapped)})"
+                )
         self.generic_visit(node)
 
     def _text_of_keyword(self, keyword: ast.keyword) -> str:
@@ -191,8 +226,12 @@ class Sites(ast.NodeVisitor):
 
 def executed_tests(file: Path) -> list[Executed]:
     """Return the tests of a record that passed, the shortest first."""
-    records: list[dict[str, Any]] = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    tests = [Executed(r["test"], r["slow"], r["seconds"], r["lines"]) for r in records if r["passed"]]
+    records: list[dict[str, Any]] = [
+        json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()
+    ]
+    tests = [
+        Executed(r["test"], r["slow"], r["seconds"], r["lines"]) for r in records if r["passed"]
+    ]
     return sorted(tests, key=lambda test: test.seconds)
 
 
@@ -224,7 +263,9 @@ def drawn_mutants(count: int, seed: int, tests: Sequence[Executed]) -> Iterator[
 
 
 def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -> tuple[str, bool]:
-    """Return the first test that fails in a copy, or "", and whether all of the tests have been run."""
+    """Return the first test that fails in a copy, or "", and whether all of the tests have been
+    run.
+    """
     spent = 0.0
     for first in range(0, len(tests), BATCH):
         batch = tests[first : first + BATCH]
@@ -232,7 +273,17 @@ def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -
             return "", False
         spent += sum(test.seconds for test in batch)
         limit = 120 + 10 * sum(test.seconds for test in batch)
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--timeout", f"{limit:.0f}"]
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-x",
+            "-p",
+            "no:cacheprovider",
+            "--timeout",
+            f"{limit:.0f}",
+        ]
         environment = {**os.environ, "PYTHONPATH": str(copy), "XDG_CACHE_HOME": str(cache)}
         names = [test.test for test in batch]
         try:
@@ -248,8 +299,14 @@ def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -
         except subprocess.TimeoutExpired:
             return f"{names[0]} (no end)", True
         failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-        if failed or done.returncode not in (0, 1, 5):  # tests that fail, a crash; 5: no test has this name
-            return failed[0].split(" - ")[0].split(" ", 1)[1] if failed else f"{names[0]} (crash)", True
+        if failed or done.returncode not in (
+            0,
+            1,
+            5,
+        ):  # tests that fail, a crash; 5: no test has this name
+            return failed[0].split(" - ")[0].split(" ", 1)[
+                1
+            ] if failed else f"{names[0]} (crash)", True
     return "", True
 
 
@@ -257,11 +314,18 @@ def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str
     """Return which test kills a mutant, or "none", and of which suite it is."""
     with tempfile.TemporaryDirectory(prefix="mutant", dir=kernels.parent) as scratch:
         copy, cache = Path(scratch) / "copy", Path(scratch) / "cache"
-        names = subprocess.run(["git", "ls-files", "-z"], cwd=TOP, capture_output=True, text=True, check=True).stdout
+        names = subprocess.run(
+            ["git", "ls-files", "-z"], cwd=TOP, capture_output=True, text=True, check=True
+        ).stdout
         for name in filter(None, names.split("\0")):
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(TOP / name, copy / name, follow_symlinks=False)
-        shutil.copytree(kernels, cache, copy_function=os.link, ignore=shutil.ignore_patterns("*.lock", "*.so????????"))
+        shutil.copytree(
+            kernels,
+            cache,
+            copy_function=os.link,
+            ignore=shutil.ignore_patterns("*.lock", "*.so????????"),
+        )
         file = copy / PACKAGE / mutant.module
         text = file.read_bytes()
         file.write_bytes(text[: mutant.begin] + mutant.after.encode() + text[mutant.end :])
@@ -274,15 +338,24 @@ def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str
                 file.write_bytes(text)
                 killing_tests = [test for test in of_suite if test.test == found]
                 false_alarm, _ = killer(copy, cache, killing_tests, seconds)
-                return (found, suite) if not false_alarm else ("none", f"{found} fails without it too")
+                return (
+                    (found, suite) if not false_alarm else ("none", f"{found} fails without it too")
+                )
             every &= complete
-    return "none", f"all {len(reaching)} tests" if every else f"of {len(reaching)} tests those within the time"
+    return (
+        "none",
+        f"all {len(reaching)} tests"
+        if every
+        else f"of {len(reaching)} tests those within the time",
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("record", type=Path, help="what each test executes")
-    parser.add_argument("--out", type=Path, required=True, help="table in Markdown, a row as soon as it is known")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="table in Markdown, a row as soon as it is known"
+    )
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=50)
     parser.add_argument("--part", default="1/1", help="i/n: the i-th of n parts")
@@ -291,13 +364,28 @@ def main() -> None:
     tests = executed_tests(arguments.record)
     kernels = Path(os.environ["XDG_CACHE_HOME"])
     with arguments.out.open("w", encoding="utf-8") as stream:
-        stream.write("| of | line | mutant | before | after | killed by | suite |\n" + "| --- " * 7 + "|\n")
-        for number, (group, mutant) in enumerate(drawn_mutants(arguments.count, arguments.seed, tests)):
+        stream.write(
+            "| of | line | mutant | before | after | killed by | suite |\n" + "| --- " * 7 + "|\n"
+        )
+        for number, (group, mutant) in enumerate(
+            drawn_mutants(arguments.count, arguments.seed, tests)
+        ):
             if number % parts == part - 1:
                 found, suite = tried(mutant, tests, kernels)
-                texts = (" ".join(text.split()).replace("|", "\\|") for text in (mutant.before, mutant.after))
+                texts = (
+                    " ".join(text.split()).replace("|", "\\|")
+                    for text in (mutant.before, mutant.after)
+                )
                 before, after = (f"`{text}`" for text in texts)
-                row = (group, f"{mutant.module}:{mutant.line}", mutant.kind, before, after, found, suite)
+                row = (
+                    group,
+                    f"{mutant.module}:{mutant.line}",
+                    mutant.kind,
+                    before,
+                    after,
+                    found,
+                    suite,
+                )
                 stream.write(f"| {' | '.join(row)} |\n")
                 stream.flush()
 

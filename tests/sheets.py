@@ -12,7 +12,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sheet:
-    """A rectangle in triangles, whose corner is at `origin` and whose sides are the vectors; edges NAME_1 to NAME_4."""
+    """A rectangle in triangles, whose corner is at `origin` and whose sides are the vectors; edges
+    NAME_1 to NAME_4.
+    """
 
     name: str
     origin: tuple[float, float, float]
@@ -22,7 +24,9 @@ class Sheet:
 
 
 def write(file: Path, sheets: Sequence[Sheet], *, joined: bool = False) -> Path:
-    """A mesh file of gmsh's version 2 with a patch and four edges for each sheet; `joined`: nodes that meet are one."""
+    """A mesh file of gmsh's version 2 with a patch and four edges for each sheet; `joined`: nodes
+    that meet are one.
+    """
     nodes, elements, names, kept = list[Array](), list[str](), list[str](), dict[int, int]()
     for k, sheet in enumerate(sheets):
         first, (m, n), start = len(nodes) + 1, sheet.parts, np.array(sheet.origin)
@@ -51,8 +55,26 @@ def write(file: Path, sheets: Sequence[Sheet], *, joined: bool = False) -> Path:
         for side, lines in enumerate(sides, 1):
             names.append(f'1 {surface + side} "{sheet.name}_{side}"')
             elements += [f"1 2 {surface + side} {surface + side} {x} {y}" for x, y in lines]
-    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names)), *names, "$EndPhysicalNames"]
-    text += ["$Nodes", str(len(nodes)), *(f"{i} {x} {y} {z}" for i, (x, y, z) in enumerate(nodes, 1)), "$EndNodes"]
-    text += ["$Elements", str(len(elements)), *(f"{i} {e}" for i, e in enumerate(elements, 1)), "$EndElements"]
+    text = [
+        "$MeshFormat",
+        "2.2 0 8",
+        "$EndMeshFormat",
+        "$PhysicalNames",
+        str(len(names)),
+        *names,
+        "$EndPhysicalNames",
+    ]
+    text += [
+        "$Nodes",
+        str(len(nodes)),
+        *(f"{i} {x} {y} {z}" for i, (x, y, z) in enumerate(nodes, 1)),
+        "$EndNodes",
+    ]
+    text += [
+        "$Elements",
+        str(len(elements)),
+        *(f"{i} {e}" for i, e in enumerate(elements, 1)),
+        "$EndElements",
+    ]
     file.write_text("\n".join(text) + "\n", encoding="utf-8")
     return file

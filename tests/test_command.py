@@ -23,7 +23,14 @@ def offered(monkeypatch: pytest.MonkeyPatch, line: str) -> list[str]:
 def test_case_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that begin so, a folder deeper too; brackets in a name are no pattern; nothing else."""
     monkeypatch.chdir(tmp_path)
-    for name in ("one.yaml", "other[1].yaml", "notes.txt", "cases/plate.yaml", "cases/deep/far.yaml", ".hidden.yaml"):
+    for name in (
+        "one.yaml",
+        "other[1].yaml",
+        "notes.txt",
+        "cases/plate.yaml",
+        "cases/deep/far.yaml",
+        ".hidden.yaml",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     assert case_files("o") == ["one.yaml", "other[1].yaml"]

@@ -39,7 +39,14 @@ def test_run_writes_everything(plate: Path) -> None:
     assert summary["knockdown"] is None
     assert summary["limit_points"] == []
     assert summary["mesh"].keys() == {"cells", "dofs", "degree"}
-    assert summary["timing"].keys() >= {"jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "total_s"}
+    assert summary["timing"].keys() >= {
+        "jit_s",
+        "setup_s",
+        "assembly_s",
+        "factor_s",
+        "solve_s",
+        "total_s",
+    }
     assert summary["blas"] != "reference"
     kernels = summary["model"]["kernels"]
     assert not any("magnetic" in name for name in kernels)
@@ -104,7 +111,9 @@ cli.main()
 @pytest.mark.parametrize("words", [["-m", "magshell_fenicsx", "schema"], ["-c", AFTER_PETSC]])
 def test_nobody_reads_what_is_said(words: list[str]) -> None:
     """As of `| head`: the end of any program, without a report by PETSc of a crash."""
-    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as said:
+    with subprocess.Popen(
+        [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as said:
         assert said.stdout
         assert said.stderr
         said.stdout.close()
@@ -125,7 +134,15 @@ cli.app = app
 cli.main()
 """
     (tmp_path / "program.py").write_text(program)
-    command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", "2", sys.executable, str(tmp_path / "program.py")]
+    command = [
+        "mpirun",
+        "--map-by",
+        ":OVERSUBSCRIBE",
+        "-n",
+        "2",
+        sys.executable,
+        str(tmp_path / "program.py"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode
     assert "AssertionError: a bug" in done.stderr
@@ -133,7 +150,10 @@ cli.main()
 
 def test_missing_file_and_no_case() -> None:
     done = magshell("run", "nowhere.yaml")
-    assert (done.returncode, done.stderr) == (2, "nowhere.yaml: cannot be read: No such file or directory\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "nowhere.yaml: cannot be read: No such file or directory\n",
+    )
     assert magshell("run").returncode == 2
 
 
@@ -142,12 +162,21 @@ def test_stopping_early_is_told_and_keeps_the_points(tmp_path: Path) -> None:
     """Load control cannot pass the limit point of the dimpled shell."""
     settings = ["loading={kind: pressure, control: load, until: target, pressure: 0.5, points: 2}"]
     settings += ["symmetry=half", "mesh.degree=3", "mesh.refinement=0.6"]
-    done = magshell("run", CASES / "dimple_buckling.yaml", *(f"--set={s}" for s in settings), "--out", tmp_path / "out")
+    done = magshell(
+        "run",
+        CASES / "dimple_buckling.yaml",
+        *(f"--set={s}" for s in settings),
+        "--out",
+        tmp_path / "out",
+    )
     assert done.returncode == 3
     assert "load control stopped" in done.stderr
     rows = read_path(tmp_path / "out")
     assert 0.32 < float(rows[-1]["p_over_pc"]) < 0.34
-    assert "load control" in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    assert (
+        "load control"
+        in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    )
 
 
 def test_check_tells_what_is_left_out() -> None:
@@ -156,22 +185,30 @@ def test_check_tells_what_is_left_out() -> None:
     assert "magnetic energy: lambda_m is zero" in done.stdout
     assert "R/h = 90" in done.stdout
     assert "p_c/E = " in done.stdout
-    assert "p_c" not in magshell("check", CASES / "magnetic_strip.yaml").stdout  # of a flat shell without a pressure
+    assert (
+        "p_c" not in magshell("check", CASES / "magnetic_strip.yaml").stdout
+    )  # of a flat shell without a pressure
 
 
 def test_version() -> None:
     done = started("--version")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"magshell_fenicsx {__version__}\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (
+        0,
+        f"magshell_fenicsx {__version__}\n",
+        "",
+    )
 
 
 REFUSED = f"run {CASES / 'dimple_buckling.yaml'} --set shell.poisson_ratio=9"
 
 
 @pytest.mark.parametrize(
-    "asked", [["--version", "example", REFUSED, REFUSED.replace("run", "check", 1), "schema"], ["--help"]]
+    "asked",
+    [["--version", "example", REFUSED, REFUSED.replace("run", "check", 1), "schema"], ["--help"]],
 )
 def test_words_load_no_solver(asked: list[str]) -> None:
-    """They would take seconds. Schema and cases have the keys of parts, whose energies are written in UFL.
+    """They would take seconds. Schema and cases have the keys of parts, whose energies are written
+    in UFL.
 
     One after the other in a process, whose modules are seen after each.
     """
@@ -184,17 +221,23 @@ for words in sys.argv[1:]:
     except SystemExit as e:
         print("after", e.code or 0, *sys.modules)
 """
-    done = subprocess.run([sys.executable, "-c", code, *asked], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *asked], capture_output=True, text=True, check=True
+    )
     after = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("after ")]
     for words, (code, *modules) in zip(asked, after, strict=True):
         assert int(code) == (2 if "=9" in words else 0)
-        solvers = {"dolfinx", "petsc4py", "scipy"} | ({"ufl"} if words in ("--version", "example", "--help") else set())
+        solvers = {"dolfinx", "petsc4py", "scipy"} | (
+            {"ufl"} if words in ("--version", "example", "--help") else set()
+        )
         solvers |= {"rich"} if words != "--help" else set()  # a seventh of a second
         assert not solvers & {*modules}, words
 
 
 def test_the_package_is_imported_as_it_is_used() -> None:
-    """Every public name is there, and `run` is the function even after an import of the folder runs/."""
+    """Every public name is there, and `run` is the function even after an import of the folder
+    runs/.
+    """
     code = """
 import sys
 import magshell_fenicsx as ms
@@ -242,11 +285,16 @@ CLOSED = "exec {python} -m magshell_fenicsx run {case} --out {out} <&- >&- 2>&-"
 
 
 def test_standard_output_on_a_full_disk(tmp_path: Path) -> None:
-    """A run goes on: its results are in its folder. What only prints says that nothing was printed."""
+    """A run goes on: its results are in its folder.
+
+    What only prints says that nothing was printed.
+    """
     for words, code in (("run", *SMALL, "--out", tmp_path / "out"), 0), (("schema",), 3):
         command = [sys.executable, "-m", "magshell_fenicsx", *map(str, words)]
         with Path("/dev/full").open("w") as full:
-            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+            done = subprocess.run(
+                command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            )
         said = "standard output cannot be written: No space left on device"
         assert done.returncode == code
         assert done.stderr.splitlines() == [
@@ -259,7 +307,9 @@ def test_standard_output_on_a_full_disk(tmp_path: Path) -> None:
 def test_closed_descriptors(tmp_path: Path) -> None:
     """No file of the run takes their numbers."""
     words = CLOSED.format(
-        python=sys.executable, case=shlex.join(map(str, SMALL)), out=shlex.quote(str(tmp_path / "out"))
+        python=sys.executable,
+        case=shlex.join(map(str, SMALL)),
+        out=shlex.quote(str(tmp_path / "out")),
     )
     assert subprocess.run(["sh", "-c", words], check=False).returncode == 0
     assert len(read_path(tmp_path / "out")) == 5
@@ -271,7 +321,11 @@ def test_a_kernel_cache_that_cannot_be_written(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "magshell_fenicsx", "run", *map(str, SMALL), "--no-pictures"]
     environment = {**os.environ, "XDG_CACHE_HOME": "/dev/null/cache", "HOME": str(tmp_path)}
     done = subprocess.run(
-        [*command, "--out", tmp_path / "out"], env=environment, capture_output=True, text=True, check=False
+        [*command, "--out", tmp_path / "out"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert list(tmp_path.glob(".cache/magshell/**/*.so"))
@@ -296,7 +350,16 @@ def test_no_numbers(tmp_path: Path, words: tuple[str | Path, ...]) -> None:
 
 
 def test_options_of_petsc(tmp_path: Path) -> None:
-    done = started("run", *SMALL, "--out", tmp_path / "out", "-snes_monitor", "-snes_max_it", 30, pictures=False)
+    done = started(
+        "run",
+        *SMALL,
+        "--out",
+        tmp_path / "out",
+        "-snes_monitor",
+        "-snes_max_it",
+        30,
+        pictures=False,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert "0 SNES Function norm" in done.stdout
 

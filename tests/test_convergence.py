@@ -1,4 +1,5 @@
-"""k_d against an independent axisymmetric solver (nine digits) as the mesh is refined and the degree raised.
+"""k_d against an independent axisymmetric solver (nine digits) as the mesh is refined and the
+degree raised.
 
 Run as a script for the whole table: python3 tests/test_convergence.py
 """
@@ -25,7 +26,11 @@ def error(lambda_m: float, degree: int, refinement: float) -> tuple[int, int, fl
     ]
     found = run(Case.load(CASE, settings))
     assert found.knockdown is not None
-    return found.scene.cells, found.scene.model.system.dofs, found.knockdown / REFERENCE[lambda_m] - 1
+    return (
+        found.scene.cells,
+        found.scene.model.system.dofs,
+        found.knockdown / REFERENCE[lambda_m] - 1,
+    )
 
 
 @pytest.mark.slow
@@ -42,6 +47,13 @@ if __name__ == "__main__":
             last = None
             for refinement in refinements:
                 cells, dofs, e = error(lambda_m, degree, refinement)
-                order = f"{np.log(abs(last[1] / e)) / np.log(np.sqrt(cells / last[0])):.1f}" if last else ""
-                print(f"{lambda_m:+.5f} {degree:6} {refinement:9} {cells:9} {dofs:9} {e:+12.1e} {order:>9}", flush=True)
+                order = (
+                    f"{np.log(abs(last[1] / e)) / np.log(np.sqrt(cells / last[0])):.1f}"
+                    if last
+                    else ""
+                )
+                print(
+                    f"{lambda_m:+.5f} {degree:6} {refinement:9} {cells:9} {dofs:9} {e:+12.1e} {order:>9}",
+                    flush=True,
+                )
                 last = cells, e

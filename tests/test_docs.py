@@ -19,10 +19,21 @@ from magshell_fenicsx.cli import app
 from magshell_fenicsx.public import run
 
 TOP = CASES.parent
-PAGES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted((TOP / "docs").rglob("*.md")), TOP / "meshes/README.md"]
+PAGES = [
+    TOP / "README.md",
+    TOP / "CONTRIBUTING.md",
+    *sorted((TOP / "docs").rglob("*.md")),
+    TOP / "meshes/README.md",
+]
 GUIDES = [
     TOP / name
-    for name in ("README.md", "docs/install.md", "docs/tutorial.md", "docs/howto.md", "docs/troubleshooting.md")
+    for name in (
+        "README.md",
+        "docs/install.md",
+        "docs/tutorial.md",
+        "docs/howto.md",
+        "docs/troubleshooting.md",
+    )
 ]
 
 
@@ -49,12 +60,16 @@ def test_links_lead_somewhere(page: Path) -> None:
         there = (page.parent / file).resolve() if file else page
         assert there.exists(), target
         if part:
-            assert part in [anchor(title) for title in re.findall(r"^#+ (.*)$", text(there), re.MULTILINE)], target
+            assert part in [
+                anchor(title) for title in re.findall(r"^#+ (.*)$", text(there), re.MULTILINE)
+            ], target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(TOP)))
 def test_files_that_are_named_exist(page: Path) -> None:
-    for name in re.findall(r"\b(?:cases|meshes|docs|tests|magshell_fenicsx)/[\w./-]*\w\.\w+\b", text(page)):
+    for name in re.findall(
+        r"\b(?:cases|meshes|docs|tests|magshell_fenicsx)/[\w./-]*\w\.\w+\b", text(page)
+    ):
         assert (TOP / name).exists(), name
 
 
@@ -64,7 +79,9 @@ def test_places_in_the_code() -> None:
     assert len(places) > 60
     for file, name in places:
         code = text(TOP / "magshell_fenicsx" / file)
-        assert re.search(rf"^\s*(def|class) {name}\b|^{name} = ", code, re.MULTILINE), f"{file}: {name}"
+        assert re.search(rf"^\s*(def|class) {name}\b|^{name} = ", code, re.MULTILINE), (
+            f"{file}: {name}"
+        )
 
 
 def test_places_that_docstrings_name() -> None:
@@ -79,7 +96,9 @@ def test_places_that_docstrings_name() -> None:
             while rest and not place.is_file():
                 place = place / rest[0] if (place / rest[0]).is_dir() else place / f"{rest[0]}.py"
                 rest.pop(0)
-            if not place.exists() or any(not re.search(rf"\b{each}\b", text(place)) for each in rest):
+            if not place.exists() or any(
+                not re.search(rf"\b{each}\b", text(place)) for each in rest
+            ):
                 gone.append(f"{file.name}: {name}")
     assert not gone
 
@@ -88,7 +107,9 @@ CASE_BLOCKS = [(page, block) for page in PAGES for block in blocks(page, "yaml")
 
 
 @pytest.mark.parametrize(
-    ("page", "block"), CASE_BLOCKS, ids=[f"{page.stem}{i}" for i, (page, _) in enumerate(CASE_BLOCKS)]
+    ("page", "block"),
+    CASE_BLOCKS,
+    ids=[f"{page.stem}{i}" for i, (page, _) in enumerate(CASE_BLOCKS)],
 )
 def test_yaml_is_a_case_that_can_be_built(page: Path, block: str, tmp_path: Path) -> None:
     """And so is what stands behind a key as another value of it, `# key: {...}`, alone on its line."""
@@ -100,13 +121,19 @@ def test_yaml_is_a_case_that_can_be_built(page: Path, block: str, tmp_path: Path
 
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: str(page.relative_to(TOP)))
 def test_commands_are_understood(page: Path, tmp_path: Path) -> None:
-    """Options are known to the command line, none is missing, cases are there and take their settings."""
+    """Options are known to the command line, none is missing, cases are there and take their
+    settings.
+    """
     for number, block in enumerate(blocks(page, "yaml")):
-        (tmp_path / ("cap.yaml" if page.stem == "tutorial" else f"{number}.yaml")).write_text(block, encoding="utf-8")
+        (tmp_path / ("cap.yaml" if page.stem == "tutorial" else f"{number}.yaml")).write_text(
+            block, encoding="utf-8"
+        )
     known = get_command(app).commands  # type: ignore[attr-defined]
     for words in commands(page):
         if words[0] == "make":
-            assert re.search(rf"^[\w ]*\b{words[1]}\b.*:", text(TOP / "Makefile"), re.MULTILINE), words
+            assert re.search(rf"^[\w ]*\b{words[1]}\b.*:", text(TOP / "Makefile"), re.MULTILINE), (
+                words
+            )
             continue
         name, *rest = words[words.index("magshell") + 1 :]
         if name.startswith("--"):  # of magshell itself
@@ -128,7 +155,9 @@ def test_numbers_of_the_tutorial(tmp_path: Path) -> None:
     (tmp_path / "cap.yaml").write_text(*blocks(TOP / "docs/tutorial.md", "yaml"), encoding="utf-8")
     (field,) = re.findall(r'--set "(magnetic=.*)" --out', page)
     for settings, number in zip(([], [field]), re.findall(r"k_d = (0\.\d+)", page), strict=True):
-        assert run(Case.load(tmp_path / "cap.yaml", settings)).knockdown == pytest.approx(float(number), abs=1e-6)
+        assert run(Case.load(tmp_path / "cap.yaml", settings)).knockdown == pytest.approx(
+            float(number), abs=1e-6
+        )
 
 
 def test_the_editor_line_leads_to_the_schema() -> None:
@@ -163,18 +192,28 @@ def words(message: str) -> str:
     return " ".join(re.sub(r"…|\n", " ", message).split())
 
 
-ON_THE_PAGE = {words(message) for message in re.findall(r"`([^`]+)`", text(TOP / "docs/troubleshooting.md"))}
+ON_THE_PAGE = {
+    words(message) for message in re.findall(r"`([^`]+)`", text(TOP / "docs/troubleshooting.md"))
+}
 
 
 def test_messages_of_the_page_are_in_the_code() -> None:
     """Every code span of the first column of its tables."""
-    spoken = {words(said(node)) for node in nodes() if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)}
+    spoken = {
+        words(said(node))
+        for node in nodes()
+        if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)
+    }
     spoken |= {line.strip() for line in text(TOP / ".ci/in-env").splitlines()}
     everything = "\n".join(spoken)
     rows = re.findall(r"^\| (`.*?) \| ", text(TOP / "docs/troubleshooting.md"), re.MULTILINE)
     messages = [message for row in rows for message in re.findall(r"`([^`]+)`", row)]
     assert len(messages) > 100
-    assert [m for m in messages if not all(part in everything for part in map(words, m.split("…")) if part)] == []
+    assert [
+        m
+        for m in messages
+        if not all(part in everything for part in map(words, m.split("…")) if part)
+    ] == []
 
 
 def test_messages_of_the_code_are_on_the_page() -> None:
@@ -185,6 +224,12 @@ def test_messages_of_the_code_are_on_the_page() -> None:
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args
         if ast.unparse(node.exc.func) != "AttributeError"  # a mistake in a program
     }
-    warned = {words(said(node)) for node in nodes() if isinstance(node, ast.JoinedStr) and "warning: " in said(node)}
+    warned = {
+        words(said(node))
+        for node in nodes()
+        if isinstance(node, ast.JoinedStr) and "warning: " in said(node)
+    }
     there = "\n".join(ON_THE_PAGE)
-    assert [message for message in raised | warned if len(message) > 12 and message not in there] == []
+    assert [
+        message for message in raised | warned if len(message) > 12 and message not in there
+    ] == []

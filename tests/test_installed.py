@@ -1,4 +1,6 @@
-"""What is published, and that it does its work where only pip put it: another folder, without the repository."""
+"""What is published, and that it does its work where only pip put it: another folder, without the
+repository.
+"""
 
 import csv
 import email
@@ -28,7 +30,9 @@ CASE = "dimple_buckling.yaml"
 def outside(command: list[str | Path], folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder, without the path to the repository that tests have."""
     told = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    return subprocess.run([str(word) for word in command], capture_output=True, text=True, cwd=folder, env=told)
+    return subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, cwd=folder, env=told
+    )
 
 
 class Installed:
@@ -71,9 +75,13 @@ def built(kind: str, source: Path, to: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory: pytest.TempPathFactory) -> Built:
-    """The sdist of a copy of the repository, for setuptools leaves its build in there, and the wheel of the sdist."""
+    """The sdist of a copy of the repository, for setuptools leaves its build in there, and the
+    wheel of the sdist.
+    """
     place = tmp_path_factory.mktemp("built")
-    left_out = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*", "build", "results", "docs", "tests")
+    left_out = shutil.ignore_patterns(
+        "__pycache__", "*.egg-info", ".*", "build", "results", "docs", "tests"
+    )
     shutil.copytree(TOP, place / "copy", ignore=left_out)
     sdist = built("sdist", place / "copy", place)
     shutil.unpack_archive(sdist, place / "unpacked", filter="data")
@@ -102,7 +110,9 @@ def installed(archives: Built, tmp_path_factory: pytest.TempPathFactory) -> Inst
 
 @pytest.mark.slow
 def test_what_is_published(archives: Built) -> None:
-    """A wheel for every machine with Python 3, its metadata complete, and the sources with their licence."""
+    """A wheel for every machine with Python 3, its metadata complete, and the sources with their
+    licence.
+    """
     assert archives.wheel.name == f"magshell_fenicsx-{__version__}-py3-none-any.whl"
     with zipfile.ZipFile(archives.wheel) as wheel:
         names = wheel.namelist()
@@ -111,8 +121,13 @@ def test_what_is_published(archives: Built) -> None:
     assert told["Name"] == "magshell-fenicsx"
     assert told["License-Expression"] == "MIT"
     assert told.get_payload().startswith("# magshell_fenicsx\n")
-    assert all(told[key] for key in ("Summary", "Author", "Keywords", "Requires-Python", "Classifier", "Project-URL"))
-    assert {name.partition("/")[0].partition("-")[0] for name in names} == {"magshell_fenicsx"}, "no tests, no cases"
+    assert all(
+        told[key]
+        for key in ("Summary", "Author", "Keywords", "Requires-Python", "Classifier", "Project-URL")
+    )
+    assert {name.partition("/")[0].partition("-")[0] for name in names} == {"magshell_fenicsx"}, (
+        "no tests, no cases"
+    )
     with tarfile.open(archives.sdist) as sdist:
         sources = {name.partition("/")[2] for name in sdist.getnames()}
     assert sources >= {"LICENSE", "README.md", "pyproject.toml", "setup.py", "meshes/gripper.msh"}
@@ -125,18 +140,27 @@ def test_what_is_installed(installed: Installed) -> None:
     assert package.is_relative_to(installed.bin.parent)
     for file in ("py.typed", "assembly/scatter.c", "output/report/report_template.html"):
         assert (package / file).is_file()
-    there = {file.relative_to(package / "examples").as_posix() for file in (package / "examples").rglob("*.*")}
+    there = {
+        file.relative_to(package / "examples").as_posix()
+        for file in (package / "examples").rglob("*.*")
+    }
     cases = {file.relative_to(TOP).as_posix() for file in examples().values()}
     beside = {"cases/arch_triangle.csv", *(f"cases/identify_{of}.csv" for of in ("arch", "field"))}
-    beside |= {f"meshes/{of}.msh" for of in ("bracket", "gripper", "gripper_closed", "stack", "strips")}
+    beside |= {
+        f"meshes/{of}.msh" for of in ("bracket", "gripper", "gripper_closed", "stack", "strips")
+    }
     assert there == cases | beside
 
 
 @pytest.mark.slow
 def test_results_are_of_the_same_sources(installed: Installed) -> None:
-    """What the repository's program keeps on disk, the installed one goes on with, and the other way round."""
+    """What the repository's program keeps on disk, the installed one goes on with, and the other
+    way round.
+    """
     assert (
-        installed.python("from magshell_fenicsx.platform.environment import code_version; print(code_version())")
+        installed.python(
+            "from magshell_fenicsx.platform.environment import code_version; print(code_version())"
+        )
         == environment.code_version()
     )
 
@@ -170,16 +194,32 @@ def test_the_way_of_an_example(installed: Installed) -> None:
     assert summary["knockdown"] == pytest.approx(0.326233, abs=5e-4)
     (folder / "dimple_buckling/report.html").unlink()
     assert "report.html" in installed.magshell("plot", "results/dimple_buckling")
-    assert (folder / "dimple_buckling/report.html").read_text(encoding="utf-8").count("data:image/png;base64,") >= 4
+    assert (folder / "dimple_buckling/report.html").read_text(encoding="utf-8").count(
+        "data:image/png;base64,"
+    ) >= 4
 
     sweep = ("sweep", CASE, *QUICK, "--over", "magnetic.lambda_m=0,1e-4")
     installed.magshell(*sweep)
-    before = {file: file.stat().st_mtime_ns for file in (folder / "dimple_buckling_sweep/points").iterdir()}
+    before = {
+        file: file.stat().st_mtime_ns
+        for file in (folder / "dimple_buckling_sweep/points").iterdir()
+    }
     installed.magshell(*sweep)
-    assert before == {file: file.stat().st_mtime_ns for file in (folder / "dimple_buckling_sweep/points").iterdir()}
+    assert before == {
+        file: file.stat().st_mtime_ns
+        for file in (folder / "dimple_buckling_sweep/points").iterdir()
+    }
     assert len(rows(folder / "dimple_buckling_sweep/sweep.csv")) == 2
 
-    over = ("--over", "mesh.refinement=0.3", "--set=mesh.degree=3", "--result", "knockdown", "--repeat", "1")
+    over = (
+        "--over",
+        "mesh.refinement=0.3",
+        "--set=mesh.degree=3",
+        "--result",
+        "knockdown",
+        "--repeat",
+        "1",
+    )
     installed.magshell("study", CASE, *over)
     assert len(rows(folder / "dimple_buckling_study/study.csv")) == 1
 

@@ -17,7 +17,18 @@ from magshell_fenicsx.simulate.follow import follow
 SCENES, TEN = int(sys.argv[1]) if __name__ == "__main__" else 20, 10
 COARSE = ["symmetry=half", "mesh.degree=2", "mesh.refinement=0.3"]
 
-NAMES = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+NAMES = (
+    "arena",
+    "ordblks",
+    "smblks",
+    "hblks",
+    "hblkhd",
+    "usmblks",
+    "fsmblks",
+    "uordblks",
+    "fordblks",
+    "keepcost",
+)
 
 
 class Allocated(ctypes.Structure):
@@ -27,7 +38,9 @@ class Allocated(ctypes.Structure):
 
 
 def in_use() -> int:
-    """Bytes that are allocated and not freed; how much the process holds beyond them differs from run to run."""
+    """Bytes that are allocated and not freed; how much the process holds beyond them differs from
+    run to run.
+    """
     gc.collect()
     mallinfo2 = ctypes.CDLL(None).mallinfo2
     mallinfo2.restype = Allocated
@@ -36,7 +49,9 @@ def in_use() -> int:
 
 
 def unstable() -> None:
-    """A dimpled half hemisphere, linearly at three times p_c; of every tenth the path through its fold too."""
+    """A dimpled half hemisphere, linearly at three times p_c; of every tenth the path through its
+    fold too.
+    """
     for number in range(SCENES):
         scene = Scene(ms.Case.load(CASES / "dimple_buckling.yaml", COARSE))
         if number % TEN == 0:
@@ -50,7 +65,9 @@ def unstable() -> None:
 @pytest.mark.slow
 def test_unstable_scenes_leave_nothing_behind() -> None:
     """The last ten scenes add less than 0.1 %: a tangent that PETSc lost added more with each."""
-    done = subprocess.run([sys.executable, __file__, str(SCENES)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, __file__, str(SCENES)], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     sizes = [int(line) for line in done.stdout.split()]
     assert len(sizes) == SCENES

@@ -15,20 +15,35 @@ from magshell_fenicsx import __version__
 
 TOP = CASES.parent
 PROJECT = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-OF_DOLFINX = {"fenics-dolfinx", "petsc", "slepc4py", "python-gmsh", "c-compiler", "python"}  # on PyPI there are none
+OF_DOLFINX = {
+    "fenics-dolfinx",
+    "petsc",
+    "slepc4py",
+    "python-gmsh",
+    "c-compiler",
+    "python",
+}  # on PyPI there are none
 CONDA = {"matplotlib-base": "matplotlib"}  # its name there
 
 
 def recipe() -> dict[str, Any]:
     """As conda-build reads it: a template first, then YAML."""
     text = (TOP / "conda-recipe/meta.yaml").read_text(encoding="utf-8")
-    filled = jinja2.Environment(undefined=jinja2.StrictUndefined).from_string(text).render(PYTHON="python")
+    filled = (
+        jinja2.Environment(undefined=jinja2.StrictUndefined)
+        .from_string(text)
+        .render(PYTHON="python")
+    )
     return dict(yaml.safe_load(filled))
 
 
 def named(lines: list[Any]) -> dict[str, str]:
     """Names -> bounds, of lines such as "pydantic>=2.9"."""
-    parts = (re.match(r"([\w-]+)\s*([^#]*\S|)", line) for line in lines if isinstance(line, str) and line != ".")
+    parts = (
+        re.match(r"([\w-]+)\s*([^#]*\S|)", line)
+        for line in lines
+        if isinstance(line, str) and line != "."
+    )
     return {CONDA.get(part[1], part[1]): part[2] for part in parts if part}
 
 
@@ -40,9 +55,13 @@ def test_one_version() -> None:
 
 def test_dependencies_agree() -> None:
     """Of pip, of the environment for conda, and of the recipe; bounds too."""
-    extra = PROJECT["optional-dependencies"]["dolfinx"]  # its other packages have other names on conda-forge
+    extra = PROJECT["optional-dependencies"][
+        "dolfinx"
+    ]  # its other packages have other names on conda-forge
     pip = named(PROJECT["dependencies"]) | {"setuptools": named(extra)["setuptools"]}
-    dependencies = yaml.safe_load((TOP / "environment.yml").read_text(encoding="utf-8"))["dependencies"]
+    dependencies = yaml.safe_load((TOP / "environment.yml").read_text(encoding="utf-8"))[
+        "dependencies"
+    ]
     (inner,) = (entry["pip"] for entry in dependencies if isinstance(entry, dict))
     environment = named(dependencies) | named(inner)
     run = named(recipe()["requirements"]["run"])
@@ -52,13 +71,19 @@ def test_dependencies_agree() -> None:
     assert newest[0] in run["fenics-dolfinx"].split(",")
     assert {name: bound for name, bound in environment.items() if name != "pip"} == run
     assert recipe()["build"]["entry_points"] == [f"magshell = {PROJECT['scripts']['magshell']}"]
-    assert set(recipe()["requirements"]["host"]) == {f"python {PROJECT['requires-python']}", "pip", "setuptools >=77"}
+    assert set(recipe()["requirements"]["host"]) == {
+        f"python {PROJECT['requires-python']}",
+        "pip",
+        "setuptools >=77",
+    }
 
 
 def test_commands_of_the_recipe() -> None:
     """They are what the recipe's test environment runs: names of examples and options exist."""
     commands = [line.split() for line in recipe()["test"]["commands"]]
-    assert [words[:2] for words in commands] == [["magshell", word] for word in ("--version", "example", "run")]
+    assert [words[:2] for words in commands] == [
+        ["magshell", word] for word in ("--version", "example", "run")
+    ]
     assert (CASES / commands[2][2]).is_file()
 
 
@@ -69,13 +94,17 @@ def test_placeholders_are_where_it_is_said() -> None:
     listed = set(re.findall(r"`([^`]+)`", said))
     for name in listed:
         assert "example.org" in (TOP / name).read_text(encoding="utf-8"), name
-    git = subprocess.run(["git", "grep", "-l", "example.org"], cwd=TOP, capture_output=True, text=True)
+    git = subprocess.run(
+        ["git", "grep", "-l", "example.org"], cwd=TOP, capture_output=True, text=True
+    )
     if git.returncode:
         pytest.skip("no repository of git")
     assert set(git.stdout.split()) - {"docs/design.md", "tests/test_metadata.py"} == listed
 
 
-@pytest.mark.parametrize("form", sorted((TOP / ".github/ISSUE_TEMPLATE").glob("*.yml")), ids=lambda form: form.stem)
+@pytest.mark.parametrize(
+    "form", sorted((TOP / ".github/ISSUE_TEMPLATE").glob("*.yml")), ids=lambda form: form.stem
+)
 def test_forms_for_issues(form: Path) -> None:
     """What a form needs: a name, a description, and a label for each field, none twice."""
     content = yaml.safe_load(form.read_text(encoding="utf-8"))

@@ -18,12 +18,24 @@ LAW = ["--set=magnetic.remanence=rotation", f"--set=magnetic.applied={{{CUBIC}}}
 SCENES = {
     "half shell, force": (
         "pole_indentation.yaml",
-        [*COARSER, DEGREE, "--set=symmetry=half", "--set=loading.depth=2", "--set=loading.points=2"],
+        [
+            *COARSER,
+            DEGREE,
+            "--set=symmetry=half",
+            "--set=loading.depth=2",
+            "--set=loading.points=2",
+        ],
     ),
     "meridian": ("pole_indentation.yaml", [DEGREE]),
     "half solid, field, force": (
         "solid_indentation.yaml",
-        [*COARSER, "--set=shell.radius_to_thickness=20", "--set=loading.depth=1", "--set=loading.points=1", *LAW],
+        [
+            *COARSER,
+            "--set=shell.radius_to_thickness=20",
+            "--set=loading.depth=1",
+            "--set=loading.points=1",
+            *LAW,
+        ],
     ),
     "full shell, field, pressure": (
         "dimple_buckling.yaml",
@@ -51,7 +63,12 @@ NEAR = "{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.3 T, po
 SCENES |= {
     "half shell, soft beside a magnet": (
         "magnet_strip.yaml",
-        [*COARSER, "--set=mesh.degree=2", f"--set={SOFT % NEAR}", "--set=loading={kind: field, points: 2}"],
+        [
+            *COARSER,
+            "--set=mesh.degree=2",
+            f"--set={SOFT % NEAR}",
+            "--set=loading={kind: field, points: 2}",
+        ],
     ),
 }
 ROOF = ["--set=loading.control=load", "--set=loading.factor=0.3", "--set=loading.points=2"]
@@ -59,7 +76,12 @@ SCENES |= {
     "symmetry planes, a force at a point": ("benchmarks/hinged_roof_12.7.yaml", ROOF),
     "further solutions": (
         "benchmarks/hinged_roof_12.7.yaml",
-        [*ROOF, "--set=loading.points=1", "--set=loading.search={solutions: 1}", "--set=mesh={degree: 3, size: 127}"],
+        [
+            *ROOF,
+            "--set=loading.points=1",
+            "--set=loading.search={solutions: 1}",
+            "--set=mesh={degree: 3, size: 127}",
+        ],
     ),
     "a moment": ("benchmarks/cantilever_end_moment.yaml", [*ROOF, "--set=loading.factor=0.1"]),
     "a mesh with a fold and two patches": (
@@ -118,7 +140,11 @@ MOVES = "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, 
 SCENES |= {
     "a natural shape": (
         "natural_strip.yaml",
-        [DEGREE, "--set=natural={curvature: [3, '1 + x', 0.5], stretch: ['1 + 0.1*x', 1]}", "--set=loading.points=8"],
+        [
+            DEGREE,
+            "--set=natural={curvature: [3, '1 + x', 0.5], stretch: ['1 + 0.1*x', 1]}",
+            "--set=loading.points=8",
+        ],
     ),
     "an edge that is lifted and turned": (
         "shortened_strip.yaml",
@@ -131,7 +157,15 @@ SCENES |= {
         ],
     ),
 }
-COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")
+COMPARED = (
+    "p_over_pc",
+    "lambda_m",
+    "force",
+    "w_over_h",
+    "w_pole_over_h",
+    "volume_change",
+    "energy",
+)
 VECTORS = ("u", "f", "m")  # columns NAME_ux, ...: of named points, and reactions
 
 
@@ -139,15 +173,19 @@ DRAWN = "half shell, force"  # gathered from all ranks as the fields are
 QUICKEST = "symmetry planes, a force at a point"
 ON_THREE = "an edge that is lifted and turned"
 REST = [name for name in SCENES if name != QUICKEST]
-PARTS = [[QUICKEST], *([pytest.param(REST[i::4], marks=pytest.mark.slow, id=f"part {i}") for i in range(4)])]
+PARTS = [
+    [QUICKEST],
+    *([pytest.param(REST[i::4], marks=pytest.mark.slow, id=f"part {i}") for i in range(4)]),
+]
 
 
 @pytest.mark.parametrize("scenes", PARTS)
 def test_same_path(tmp_path: Path, scenes: list[str]) -> None:
-    """Every column to 1e-8 of its largest value, second derivatives to 1e-5; the same steps, pivots and iterations.
+    """Every column to 1e-8 of its largest value, second derivatives to 1e-5; the same steps, pivots
+    and iterations.
 
-    Between targets to 1e-7; of a natural shape, which moves far within a step, to 1e-5: where a step ends follows from
-    small differences between the points before it.
+    Between targets to 1e-7; of a natural shape, which moves far within a step, to 1e-5: where a
+    step ends follows from small differences between the points before it.
     """
     for ranks in (1, 2, 3):
         chosen = [scene for scene in scenes if ranks != 3 or scene == ON_THREE]
@@ -175,8 +213,13 @@ def _compare(folders: list[Path], of_steps: float) -> None:
         assert len(other) == len(paths[0])
         for key in ("label", "negative_pivots"):
             assert [row[key] for row in other] == [row[key] for row in paths[0]]
-        vectors = [[key for key in paths[0][0] if re.search(f"_{kind}[xyz]$", key)] for kind in VECTORS]
-        for group in [*([key] for key in COMPARED), *vectors]:  # a component that is zero counts beside the others
+        vectors = [
+            [key for key in paths[0][0] if re.search(f"_{kind}[xyz]$", key)] for kind in VECTORS
+        ]
+        for group in [
+            *([key] for key in COMPARED),
+            *vectors,
+        ]:  # a component that is zero counts beside the others
             scale = max((abs(float(row[key])) for row in paths[0] for key in group), default=0.0)
             for key in group:
                 for row, there in zip(paths[0], other, strict=True):
@@ -185,11 +228,17 @@ def _compare(folders: list[Path], of_steps: float) -> None:
                     assert float(there[key]) == wanted, (key, row["point"])
     one = fields[0]
     for other_surface in fields[1:]:
-        places = [np.hstack([found.r0, found.n0]) for found in (one, other_surface)]  # two nodes at a fold
+        places = [
+            np.hstack([found.r0, found.n0]) for found in (one, other_surface)
+        ]  # two nodes at a fold
         same = cKDTree(places[1]).query(places[0])[1]
         assert other_surface.fields.keys() == one.fields.keys()
         for key, values in one.fields.items():
             largest = np.nanmax(np.abs(values), initial=0.0)
             np.testing.assert_allclose(
-                other_surface.fields[key][same], values, rtol=0.0, atol=max(1e-5 * largest, 1e-10), err_msg=key
+                other_surface.fields[key][same],
+                values,
+                rtol=0.0,
+                atol=max(1e-5 * largest, 1e-10),
+                err_msg=key,
             )  # what is not known (nan) is so on any number of ranks

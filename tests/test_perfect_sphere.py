@@ -65,4 +65,7 @@ def test_same_waves_at_the_same_pressure() -> None:
 
 
 if __name__ == "__main__":
-    print("R/h = 90, nu = 0.5, full shell (meridian: mode, p/p_c; surface: waves, p/p_c):", compare("none", 90.0))
+    print(
+        "R/h = 90, nu = 0.5, full shell (meridian: mode, p/p_c; surface: waves, p/p_c):",
+        compare("none", 90.0),
+    )

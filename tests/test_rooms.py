@@ -68,7 +68,11 @@ def trees(room: str) -> list[tuple[str, list[ast.AST]]]:
     """Name and all nodes of each file of a room."""
     files = sorted((PACKAGE / room).rglob("*.py"))
     return [
-        (str(file.relative_to(PACKAGE)), list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))) for file in files
+        (
+            str(file.relative_to(PACKAGE)),
+            list(ast.walk(ast.parse(file.read_text(encoding="utf-8")))),
+        )
+        for file in files
     ]
 
 
@@ -98,7 +102,11 @@ def imported(nodes: list[ast.AST], *, running: bool = False, below: str = "") ->
             names = [node.module or ""]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        yield from (name.removeprefix(f"{package}.").split(".")[0] for name in names if name.startswith(f"{package}."))
+        yield from (
+            name.removeprefix(f"{package}.").split(".")[0]
+            for name in names
+            if name.startswith(f"{package}.")
+        )
 
 
 @pytest.mark.parametrize("room", [*NOT_IMPORTED, *ALONE])
@@ -109,7 +117,9 @@ def test_a_room_knows_what_is_below_it(room: str) -> None:
     upward = NOT_IMPORTED[room] if room in NOT_IMPORTED else others - ALONE[room]
     arrows = {(name, other) for name, tree in files for other in imported(tree) if other in upward}
     assert {
-        (name, other) for name, other in arrows if (name, other) not in {(file, "shells") for file in OF_TYPES}
+        (name, other)
+        for name, other in arrows
+        if (name, other) not in {(file, "shells") for file in OF_TYPES}
     } == set()
 
 
@@ -117,7 +127,8 @@ def test_no_circles() -> None:
     """Of rooms, by what is imported when a program runs; the registry alone is asked from below."""
     rooms = [*NOT_IMPORTED, *ALONE]
     below = {
-        room: {other for _, tree in trees(room) for other in imported(tree, running=True)} - {room} for room in rooms
+        room: {other for _, tree in trees(room) for other in imported(tree, running=True)} - {room}
+        for room in rooms
     }
     below["shape"] -= {"parts"}  # its registry, see below
     order = TopologicalSorter({room: others & set(rooms) for room, others in below.items()})
@@ -140,7 +151,9 @@ def test_no_room_asks_what_kind_a_model_is(room: str) -> None:
 
 
 def test_parts_do_not_know_each_other() -> None:
-    """A part's room imports infrastructure, and infrastructure imports no part but through the registry."""
+    """A part's room imports infrastructure, and infrastructure imports no part but through the
+    registry.
+    """
     rooms = {file.stem for file in (PACKAGE / "parts").iterdir() if file.is_dir()} - {"__pycache__"}
     rooms |= {path.split(".")[0] for path in (*REGISTERED, *KINDS_OF_STEPS.values(), *ABILITIES)}
     arrows = set[tuple[str, str]]()
@@ -148,7 +161,11 @@ def test_parts_do_not_know_each_other() -> None:
         if name.removesuffix(".py").replace("/", ".") in REGISTRY:
             continue
         own = Path(name).parts[1].removesuffix(".py")
-        arrows |= {(name, other) for other in imported(tree, running=True, below="parts") if other in rooms - {own}}
+        arrows |= {
+            (name, other)
+            for other in imported(tree, running=True, below="parts")
+            if other in rooms - {own}
+        }
     assert arrows == set()
 
 
@@ -159,7 +176,9 @@ def test_parts_are_found_by_their_registry(room: str) -> None:
         (name, node.module.removeprefix(f"{PACKAGE.name}."))
         for name, tree in trees(room)
         for node in tree
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(f"{PACKAGE.name}.parts")
+        if isinstance(node, ast.ImportFrom)
+        and node.module
+        and node.module.startswith(f"{PACKAGE.name}.parts")
     }
     assert {module for _, module in modules} <= REGISTRY, modules
 

@@ -1,4 +1,6 @@
-"""Thin strips rolled up by an end moment: as many steps whatever the thickness, the same path under noise."""
+"""Thin strips rolled up by an end moment: as many steps whatever the thickness, the same path under
+noise.
+"""
 
 from functools import cache
 
@@ -14,7 +16,9 @@ E, LENGTH = 1e6, 1.0
 
 
 def rolled(slenderness: float) -> tuple[Scene, list[Record]]:
-    """A strip of that length over thickness, to a full circle: M = 2 pi E h^3/(12 L) with no contraction."""
+    """A strip of that length over thickness, to a full circle: M = 2 pi E h^3/(12 L) with no
+    contraction.
+    """
     h = LENGTH / slenderness
     case = {
         "shell": {
@@ -46,7 +50,9 @@ def quiet() -> tuple[Scene, list[Record]]:
 
 @pytest.mark.slow
 def test_steps_do_not_grow_with_slenderness() -> None:
-    """A thousandfold slenderness: at most three steps for each of the twenty points that are asked for."""
+    """A thousandfold slenderness: at most three steps for each of the twenty points that are asked
+    for.
+    """
     points = []
     for slenderness in (100, 10_000, 100_000):
         scene, records = quiet() if slenderness == 100 else rolled(slenderness)
@@ -64,7 +70,9 @@ def test_the_same_instability_under_noise(noise: str, monkeypatch: pytest.Monkey
     _, clean = quiet()
     monkeypatch.setenv(VARIABLE, noise)
     _, noisy = rolled(100)
-    found = [[r for r in records if r.label in ("fold", "bifurcation")] for records in (clean, noisy)]
+    found = [
+        [r for r in records if r.label in ("fold", "bifurcation")] for records in (clean, noisy)
+    ]
     assert [r.label for r in found[0]] == [r.label for r in found[1]] == ["bifurcation"]
     (a,), (b,) = found
     assert a.point.load_error < 1e-8

@@ -23,7 +23,11 @@ RATE = 16.25 / 2.5  # mT/s
 SNAPPED = 5.0  # mm
 HISTORIES = {
     "ramp": ["loading.3.points=1000"],
-    "step": ["loading.3.history.field={kind: step, to: 5 mT}", "loading.3.duration=0.8 s", "loading.3.points=400"],
+    "step": [
+        "loading.3.history.field={kind: step, to: 5 mT}",
+        "loading.3.duration=0.8 s",
+        "loading.3.points=400",
+    ],
     "triangle": [
         "loading.3.history.field={kind: triangle, size: 16.25 mT, period: 10 s}",
         "loading.3.duration=10 s",
@@ -44,7 +48,9 @@ def computed(settings: list[str]) -> Array:
 def measured(name: str) -> Array:
     """The same as digitised."""
     with (REFERENCE / f"tan_arch_{name}.csv").open(encoding="utf-8") as file:
-        return np.array([[float(row["time_s"]), float(row["midspan_mm"])] for row in csv.DictReader(file)])
+        return np.array(
+            [[float(row["time_s"]), float(row["midspan_mm"])] for row in csv.DictReader(file)]
+        )
 
 
 def crossing(curve: Array, level: float) -> float:
@@ -54,12 +60,16 @@ def crossing(curve: Array, level: float) -> float:
 
 
 def ringing(curve: Array, after: float, last: float) -> tuple[float, float]:
-    """Period in s between the first peaks in some time, and the ratio of successive ones above the rest."""
+    """Period in s between the first peaks in some time, and the ratio of successive ones above the
+    rest.
+    """
     part = curve[(curve[:, 0] > after) & (curve[:, 0] < last)]
     peaks = part[find_peaks(part[:, 1], prominence=0.1)[0]][:3]
     rest = part[-len(part) // 4 :, 1].mean()
     above = peaks[:, 1] - rest
-    return float(np.diff(peaks[:, 0]).mean()), float((above[-1] / above[0]) ** (1 / (len(above) - 1)))
+    return float(np.diff(peaks[:, 0]).mean()), float(
+        (above[-1] / above[0]) ** (1 / (len(above) - 1))
+    )
 
 
 def main() -> None:
@@ -76,7 +86,9 @@ def main() -> None:
         if name != "triangle":
             for who, each in (("computed", ours), ("measured", theirs)):
                 period, ratio = ringing(each, after, last)
-                print(f"{name}, {who}: largest {each[:, 1].max():.3f} mm, period {period:.4f} s, ratio {ratio:.3f}")
+                print(
+                    f"{name}, {who}: largest {each[:, 1].max():.3f} mm, period {period:.4f} s, ratio {ratio:.3f}"
+                )
         axes.plot(*theirs.T, ".", color="C1", markersize=3.5, label="measured")
         axes.plot(*ours.T, color="C0", linewidth=1, label="computed")
         axes.set(xlabel="time (s)", title=name, xlim=SHOWN[name])

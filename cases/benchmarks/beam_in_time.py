@@ -1,7 +1,9 @@
-"""The arch of `beam_in_time.yaml` as a beam in the plane, by NumPy and SciPy alone: when it snaps, and CPU seconds.
+"""The arch of `beam_in_time.yaml` as a beam in the plane, by NumPy and SciPy alone: when it snaps,
+and CPU seconds.
 
-Koiter's energy of a curve, h (a - a0)^2/8 + h^3 (b - b0)^2/24 per length with a = |r'|^2 and the curvature b, on cubic
-Hermite elements of half the arch; `solve_ivp` takes the steps (Radau, exact Jacobian). Units: R, E and R sqrt(rho/E).
+Koiter's energy of a curve, h (a - a0)^2/8 + h^3 (b - b0)^2/24 per length with a = |r'|^2 and the
+curvature b, on cubic Hermite elements of half the arch; `solve_ivp` takes the steps (Radau, exact
+Jacobian). Units: R, E and R sqrt(rho/E).
 
 python3 cases/benchmarks/beam_in_time.py [--elements 8] [--tolerance 1e-4]
 """
@@ -21,18 +23,38 @@ HALFWAY = 1.5 * h  # deflection of the middle that says when it snaps
 
 
 class Beam:
-    """Half an arch: pinned at the first node, its middle, a mirror, at the last; x at a node are r and r'."""
+    """Half an arch: pinned at the first node, its middle, a mirror, at the last; x at a node are r
+    and r'.
+    """
 
     def __init__(self, elements: int) -> None:
         n, length = elements, ANGLE / elements
         s, w = np.polynomial.legendre.leggauss(5)
         s, self._w = (s + 1) / 2, w / 2 * length
         e = length
-        shape = np.stack([1 - 3 * s**2 + 2 * s**3, e * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, e * (s**3 - s**2)])
-        first = np.stack([-6 * s + 6 * s**2, e * (1 - 4 * s + 3 * s**2), 6 * s - 6 * s**2, e * (3 * s**2 - 2 * s)]) / e
+        shape = np.stack(
+            [
+                1 - 3 * s**2 + 2 * s**3,
+                e * (s - 2 * s**2 + s**3),
+                3 * s**2 - 2 * s**3,
+                e * (s**3 - s**2),
+            ]
+        )
+        first = (
+            np.stack(
+                [
+                    -6 * s + 6 * s**2,
+                    e * (1 - 4 * s + 3 * s**2),
+                    6 * s - 6 * s**2,
+                    e * (3 * s**2 - 2 * s),
+                ]
+            )
+            / e
+        )
         second = np.stack([-6 + 12 * s, e * (-4 + 6 * s), 6 - 12 * s, e * (6 * s - 2)]) / e**2
         values, slopes, bends = (
-            np.einsum("kq,ij->qikj", by, np.eye(2)).reshape(5, 2, 8) for by in (shape, first, second)
+            np.einsum("kq,ij->qikj", by, np.eye(2)).reshape(5, 2, 8)
+            for by in (shape, first, second)
         )
         self._values, self._jet = values, np.concatenate([slopes, bends], axis=1)
         angle = ANGLE * (np.arange(n + 1) / n - 1)  # zero at the middle
@@ -51,7 +73,9 @@ class Beam:
         a, g, b = self._metric(jet)
         by_a, by_g = self._slopes(jet)
         by_b = by_g / np.sqrt(a)[..., None] - (g * a**-1.5 / 2)[..., None] * by_a
-        inner = (h * (a - self._a0) / 4)[..., None] * by_a + (h**3 / 12 * (b - self._b0))[..., None] * by_b
+        inner = (h * (a - self._a0) / 4)[..., None] * by_a + (h**3 / 12 * (b - self._b0))[
+            ..., None
+        ] * by_b
         inward = np.stack([-jet[..., 1], jet[..., 0]], axis=-1)
         each = np.einsum("q,qij,eqi->ej", self._w, self._jet, inner)
         each -= pressure * np.einsum("q,qij,eqi->ej", self._w, self._values, inward)
@@ -80,7 +104,9 @@ class Beam:
         K += each(h**3 / 12 * (b - self._b0)) * of_b + h**3 / 12 * outer(by_b, by_b)
         turned = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0]])
         live = pressure * np.einsum("q,qij,ik,qkl->jl", self._w, self._values, turned, self._jet)
-        return self._matrix(np.einsum("q,qij,eqik,qkl->ejl", self._w, self._jet, K, self._jet, optimize=True) - live)
+        return self._matrix(
+            np.einsum("q,qij,eqik,qkl->ejl", self._w, self._jet, K, self._jet, optimize=True) - live
+        )
 
     def _at(self, x: Array) -> Array:
         return np.einsum("qij,ej->eqi", self._jet, x[self._nodes])
@@ -118,7 +144,9 @@ def deflections(elements: int = 8, tolerance: float = 1e-4) -> tuple[Array, Arra
         return np.concatenate([v, -inverse @ beam.forces(placed(y), PRESSURE * t / END) - DRAG * v])
 
     def jacobian(t: float, y: Array) -> Array:
-        return np.block([[none, one], [-inverse @ beam.tangent(placed(y), PRESSURE * t / END), -DRAG * one]])
+        return np.block(
+            [[none, one], [-inverse @ beam.tangent(placed(y), PRESSURE * t / END), -DRAG * one]]
+        )
 
     found = solve_ivp(
         rate,
@@ -140,12 +168,16 @@ def snapped(times: Array, deflection: Array) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--elements", type=int, default=8)
     parser.add_argument("--tolerance", type=float, default=1e-4)
     asked = parser.parse_args()
     times, w = deflections(asked.elements, asked.tolerance)
-    print(f"snaps at {snapped(times, w):.5f}, ends at {w[-1] / h:.4f} h; {time.process_time():.2f} s of CPU")
+    print(
+        f"snaps at {snapped(times, w):.5f}, ends at {w[-1] / h:.4f} h; {time.process_time():.2f} s of CPU"
+    )
 
 
 if __name__ == "__main__":

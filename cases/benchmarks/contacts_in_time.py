@@ -1,5 +1,5 @@
-"""Ten contacts in time: the largest error of their balance of energy, and how far apart two runs are whose Poisson's
-ratios differ by 1e-12, as a table of docs/accuracy.md.
+"""Ten contacts in time: the largest error of their balance of energy, and how far apart two runs
+are whose Poisson's ratios differ by 1e-12, as a table of docs/accuracy.md.
 
 python3 cases/benchmarks/contacts_in_time.py
 """
@@ -15,8 +15,15 @@ from magshell_fenicsx.simulate.follow import follow
 Section = dict[str, Any]
 ENERGIES = ("kinetic", "stored", "dissipated", "work")
 DEFLECTION, SMALL = "w_over_h", 1e-12
-CLAMPED = {"boundary": {"rim": "clamped"}, "symmetry": "axisymmetric", "mesh": {"degree": 3, "refinement": 0.5}}
-PLATE: Section = {"shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}, **CLAMPED}
+CLAMPED = {
+    "boundary": {"rim": "clamped"},
+    "symmetry": "axisymmetric",
+    "mesh": {"degree": 3, "refinement": 0.5},
+}
+PLATE: Section = {
+    "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+    **CLAMPED,
+}
 ROUND = {"geometry": "cap", "polar": 30, "radius": 1.0, "thickness": 0.016, "poisson_ratio": 0.3}
 CAP: Section = {"shell": ROUND, **CLAMPED}
 STRIP: Section = {
@@ -58,9 +65,21 @@ ELASTIC, VISCOUS = {"youngs_modulus": 1.0}, {"viscosity": 0.5}
 CASES: dict[str, tuple[Section, Section, list[Section]]] = {
     "plate thrown at a ball": (PLATE, BALL, [LEFT, moving(velocity=UP)]),
     "the same, fixed step": (PLATE, BALL, [LEFT, moving(velocity=UP, rho_inf=1.0, step=0.05)]),
-    "plate thrown at a plane": (PLATE, FLAT, [LEFT, moving(velocity=UP, rho_inf=1.0, step=0.02, drag=0.05)]),
-    "viscous plate": ({**PLATE, "shell": PLATE["shell"] | VISCOUS}, BALL, [LEFT, moving(velocity=UP)]),
-    "cap released": (CAP, BALL, [HELD, moving(history=ramp("approach", -1.0, 2.0), rho_inf=1.0, step=0.02)]),
+    "plate thrown at a plane": (
+        PLATE,
+        FLAT,
+        [LEFT, moving(velocity=UP, rho_inf=1.0, step=0.02, drag=0.05)],
+    ),
+    "viscous plate": (
+        {**PLATE, "shell": PLATE["shell"] | VISCOUS},
+        BALL,
+        [LEFT, moving(velocity=UP)],
+    ),
+    "cap released": (
+        CAP,
+        BALL,
+        [HELD, moving(history=ramp("approach", -1.0, 2.0), rho_inf=1.0, step=0.02)],
+    ),
     "ball driven in": (CAP, BALL, [contact(-0.2), moving(history=ramp("approach", 1.0, 10.0))]),
     "gas, load jumps": (
         {**CAP, "shell": ROUND | ELASTIC},
@@ -75,7 +94,10 @@ CASES: dict[str, tuple[Section, Section, list[Section]]] = {
     "strip thrown at a rod": (
         STRIP,
         ROD,
-        [LEFT, moving(velocity=["0", "0", "0.003*x**2"], rho_inf=1.0, step=0.1) | {"duration": 30.0}],
+        [
+            LEFT,
+            moving(velocity=["0", "0", "0.003*x**2"], rho_inf=1.0, step=0.1) | {"duration": 30.0},
+        ],
     ),
     "viscous cap on a ball": (
         {**CAP, "shell": ROUND | {"viscosity": 1.0}},
@@ -86,22 +108,33 @@ CASES: dict[str, tuple[Section, Section, list[Section]]] = {
 
 
 def moved(base: Section, bodies: Section, steps: list[Section], change: float = 0.0) -> list[Row]:
-    """The rows in time; with `change` Poisson's ratio is larger by that part of itself, or of one where it is zero."""
+    """The rows in time; with `change` Poisson's ratio is larger by that part of itself, or of one
+    where it is zero.
+    """
     nu = base["shell"]["poisson_ratio"]
     shell = base["shell"] | {"poisson_ratio": nu + change * (nu or 1.0)}
-    scene = Scene(Case.from_source(Source("contact", {**base, "shell": shell, "bodies": bodies, "loading": steps})))
+    scene = Scene(
+        Case.from_source(
+            Source("contact", {**base, "shell": shell, "bodies": bodies, "loading": steps})
+        )
+    )
     return [row for row in rows(scene, follow(scene)) if row["step"] == len(steps)]
 
 
 def imbalance(found: list[Row]) -> float:
     """The largest of a row in time, over its energies."""
-    return max(abs(float(row["imbalance"])) / sum(abs(float(row[name])) for name in ENERGIES) for row in found)
+    return max(
+        abs(float(row["imbalance"])) / sum(abs(float(row[name])) for name in ENERGIES)
+        for row in found
+    )
 
 
 def apart(one: list[Row], other: list[Row]) -> float:
     """The largest difference of a deflection of two runs at the same time, over h."""
     assert [row["time"] for row in one] == [row["time"] for row in other]
-    return max(abs(float(a[DEFLECTION]) - float(b[DEFLECTION])) for a, b in zip(one, other, strict=True))
+    return max(
+        abs(float(a[DEFLECTION]) - float(b[DEFLECTION])) for a, b in zip(one, other, strict=True)
+    )
 
 
 if __name__ == "__main__":

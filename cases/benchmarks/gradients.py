@@ -1,7 +1,9 @@
-"""Every number of some cases: the gradients of their results by it, and differences of whole runs on the same mesh.
+"""Every number of some cases: the gradients of their results by it, and differences of whole runs
+on the same mesh.
 
-`python3 -m benchmarks.gradients [CASE ...]`, in `cases/`, prints the table of docs/benchmarks/gradients.md. The keys
-are all numbers that the sections of a case have, whether they are written or not.
+`python3 -m benchmarks.gradients [CASE ...]`, in `cases/`, prints the table of
+docs/benchmarks/gradients.md. The keys are all numbers that the sections of a case have, whether
+they are written or not.
 """
 
 import sys
@@ -28,16 +30,22 @@ from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import ELSEWHERE, number_of, on_mesh_of, size_of
 from magshell_fenicsx.simulate.record import Record
 
-STEP, LONG = 1e-4, 1e-3  # of what a change of a number is small against; where it changes the result little
+STEP, LONG = (
+    1e-4,
+    1e-3,
+)  # of what a change of a number is small against; where it changes the result little
 WEAK = 1e-2  # of a result: what a relative change of one changes it by where steps are long
-NOTHING = 1e-8  # of a result: what a relative change of one changes it by that is rounding of the runs
+NOTHING = (
+    1e-8  # of a result: what a relative change of one changes it by that is rounding of the runs
+)
 
 
 @dataclass(frozen=True)
 class Line:
     """A result by a key: its gradient and the difference of whole runs; or why there is none.
 
-    `scale` is what a change of one, relative to the number, changes the result by if it changes it by itself.
+    `scale` is what a change of one, relative to the number, changes the result by if it changes it
+    by itself.
     """
 
     key: str
@@ -52,7 +60,9 @@ class Line:
         """Of the gradient over the difference; 0 where both are rounding."""
         if max(abs(self.gradient), abs(self.difference)) <= NOTHING * self.scale:
             return 0.0
-        return abs(self.gradient - self.difference) / max(abs(self.difference), NOTHING * self.scale)
+        return abs(self.gradient - self.difference) / max(
+            abs(self.difference), NOTHING * self.scale
+        )
 
 
 @dataclass
@@ -101,9 +111,13 @@ def keys_of(case: Case) -> list[str]:
     """Of all sections that are no target and no mesh."""
     context = case.problem().context
     sections = {
-        name: section for name, section in context.sections.items() if name not in ("imperfections", *ELSEWHERE)
+        name: section
+        for name, section in context.sections.items()
+        if name not in ("imperfections", *ELSEWHERE)
     }
-    return list(dict.fromkeys(key for name, section in sections.items() for key in numbers(section, name)))
+    return list(
+        dict.fromkeys(key for name, section in sections.items() for key in numbers(section, name))
+    )
 
 
 def with_number(text: str, key: str, value: float) -> Problem:
@@ -165,7 +179,9 @@ def _differences(
 
 def main(names: Sequence[str]) -> None:
     for name in names or CASES:
-        print(f"\n### {name}\n\n{CASES[name].account}\n\n| key | result | gradient | difference of runs | error |")
+        print(
+            f"\n### {name}\n\n{CASES[name].account}\n\n| key | result | gradient | difference of runs | error |"
+        )
         print("| --- | --- | --- | --- | --- |")
         refused = list[Line]()
         try:

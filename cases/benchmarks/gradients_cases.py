@@ -1,4 +1,6 @@
-"""The cases of the table of gradients: small ones, which together have every part that a case file can have."""
+"""The cases of the table of gradients: small ones, which together have every part that a case file
+can have.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -238,7 +240,9 @@ loading:
         ("energy", "tip_uz"),
     ),
     "strip among magnets": Compared(
-        "Magnets and coils of each kind around a strip.", STRIP + HELD + SOURCES, ("energy", "tip_uz")
+        "Magnets and coils of each kind around a strip.",
+        STRIP + HELD + SOURCES,
+        ("energy", "tip_uz"),
     ),
     "vibrating strip": Compared(
         "Its frequencies in the field.",
@@ -252,7 +256,9 @@ loading:
         ("energy", "A_uz", "force"),
     ),
     "plane": Compared("The cap under a plane.", pressed("kind: plane"), ("A_uz", "force")),
-    "rod": Compared("The cap under a rod.", pressed("kind: rod, radius: 3 mm, edge: 1 mm"), ("A_uz", "force")),
+    "rod": Compared(
+        "The cap under a rod.", pressed("kind: rod, radius: 3 mm, edge: 1 mm"), ("A_uz", "force")
+    ),
     "ellipsoid": Compared(
         "A strip under an ellipsoid that stands obliquely.",
         pressed_strip(

@@ -1,4 +1,5 @@
-"""The hyperboloid of Lee and Bathe: energies against those of its meridian, for thin and thinner shells.
+"""The hyperboloid of Lee and Bathe: energies against those of its meridian, for thin and thinner
+shells.
 
 `python3 -m benchmarks.hyperboloid` (with PYTHONPATH=cases) writes docs/hyperboloid/README.md.
 """
@@ -61,14 +62,20 @@ difference from half as many. **error** is the relative error of U on triangles 
 def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     """U E h^k/p^2 of the whole shell from the waves m = 2 of the meridian, with k of `POWER`."""
     h = 1 / R_over_h
-    settings = ["shell.azimuth=null", "boundary={bottom: symmetry, top: clamped}", f"shell.thickness={h}"]
+    settings = [
+        "shell.azimuth=null",
+        "boundary={bottom: symmetry, top: clamped}",
+        f"shell.thickness={h}",
+    ]
     load = "loading.loads=[{over: all, pressure: 1.0}]"
     case = Case.load(CASE, [*settings, load, f"mesh={{refinement: {refinement}}}"])
     problem = make_problem(case)
     span, length = problem.meridian, case.shell.reference
     assert span
     vertices = meridian_vertices(problem)
-    if edge == "free":  # no strong layers, and bending is so soft that rounding grows with the number of intervals
+    if (
+        edge == "free"
+    ):  # no strong layers, and bending is so soft that rounding grows with the number of intervals
         vertices = np.linspace(0.0, span.length, round(INTERVALS * refinement) + 1)
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
     conditions = {**problem.conditions, "top": edge}
@@ -76,7 +83,9 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     waves, carrier = model.excluded_modes.waves, model.factory.carrier
     v = ufl.TestFunction(waves.V)
     along = carriers.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
-    form = np.pi * carrier.over_area()(-ufl.dot(kin.normal(carrier.j0), along))  # of the pressure E h/R
+    form = np.pi * carrier.over_area()(
+        -ufl.dot(kin.normal(carrier.j0), along)
+    )  # of the pressure E h/R
     f = fem.assemble_vector(fem.form(form)).array.copy()
     for support in waves.held(M):
         f[support.dof_indices()[0]] = 0
@@ -86,7 +95,9 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
 
 
 def energy(edge: Edge, R_over_h: float, size: float, *settings: str, graded: bool = False) -> float:
-    """The same from triangles, as small across the layer at the edge as its width √h asks for if they are graded."""
+    """The same from triangles, as small across the layer at the edge as its width √h asks for if
+    they are graded.
+    """
     h = 1 / R_over_h
     p = 1e-4 * h ** (POWER[edge] + 1)
     more = [f"shell.thickness={h}", f"boundary.top={edge}", f"mesh.size={size}"]
@@ -114,7 +125,12 @@ def rows(edge: Edge, thin: Sequence[float], sizes: Sequence[float], *, graded: b
         errors = [abs(energy(edge, R_over_h, size, graded=graded) / finer - 1) for size in sizes]
         slope = np.log(errors[-2] / errors[-1]) / np.log(sizes[-2] / sizes[-1])
         order = f"{slope:.1f}" if errors[-1] > 2 * abs(exact / finer - 1) else "-"
-        cells = [f"{R_over_h:g}", f"{finer:.9g}", f"{abs(exact / finer - 1):.0e}", *(f"{e:.1e}" for e in errors)]
+        cells = [
+            f"{R_over_h:g}",
+            f"{finer:.9g}",
+            f"{abs(exact / finer - 1):.0e}",
+            *(f"{e:.1e}" for e in errors),
+        ]
         lines.append(f"| {' | '.join([*cells, order])} |")
         print(edge, lines[-1], flush=True)
     return lines
@@ -128,8 +144,15 @@ def degrees(thin: Sequence[float]) -> list[str]:
             errors = []
             for R_over_h in thin:
                 exact = reference("free", R_over_h, 2.0)
-                errors.append(abs(energy("free", R_over_h, size, f"mesh.degree={degree}") / exact - 1))
-            cells = [f"{degree}", f"{size:g}", *(f"{e:.1e}" for e in errors), f"{errors[-1] / errors[0]:.2g}"]
+                errors.append(
+                    abs(energy("free", R_over_h, size, f"mesh.degree={degree}") / exact - 1)
+                )
+            cells = [
+                f"{degree}",
+                f"{size:g}",
+                *(f"{e:.1e}" for e in errors),
+                f"{errors[-1] / errors[0]:.2g}",
+            ]
             lines.append(f"| {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     return lines
@@ -138,13 +161,26 @@ def degrees(thin: Sequence[float]) -> list[str]:
 def main() -> None:
     """Write the page."""
     thin, sizes, text = (10.0, 100.0, 1000.0, 10000.0), (0.4, 0.2, 0.1), TEXT
-    tables = (("clamped", "p²/(E h)", True), ("clamped", "p²/(E h)", False), ("free", "p²/(E h³)", False))
+    tables = (
+        ("clamped", "p²/(E h)", True),
+        ("clamped", "p²/(E h)", False),
+        ("free", "p²/(E h³)", False),
+    )
     for edge, unit, graded in tables:
-        head = [f"U over {unit}", "its error", *(f"error, size {size:g}" for size in sizes), "order"]
+        head = [
+            f"U over {unit}",
+            "its error",
+            *(f"error, size {size:g}" for size in sizes),
+            "order",
+        ]
         mesh = {"clamped": ", graded meshes" if graded else ", uniform meshes", "free": ""}[edge]
         text += f"## {edge.capitalize()} edges{mesh}\n\n| R/h | {' | '.join(head)} |\n{'| --- ' * (len(head) + 1)}|\n"
         text += "\n".join(rows(edge, thin, sizes, graded=graded)) + "\n\n"  # type: ignore[arg-type]
-    names = "| degree | size | " + " | ".join(f"error, R/h = {R_over_h:g}" for R_over_h in thin[1::2]) + " | ratio |"
+    names = (
+        "| degree | size | "
+        + " | ".join(f"error, R/h = {R_over_h:g}" for R_over_h in thin[1::2])
+        + " | ratio |"
+    )
     text += f"## Free edges, degrees with equally many unknowns\n\n{names}\n{'| --- ' * 5}|\n"
     text += "\n".join(degrees(thin[1::2])) + "\n"
     OUT.parent.mkdir(exist_ok=True)

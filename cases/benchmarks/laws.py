@@ -1,6 +1,8 @@
-"""The paper's shell with each law of its material: k_d and the indentation, with the largest strains there.
+"""The paper's shell with each law of its material: k_d and the indentation, with the largest
+strains there.
 
-`.ci/in-env sh -c 'PYTHONPATH=cases python3 -m benchmarks.laws'` prints the rows of docs/accuracy.md.
+`.ci/in-env sh -c 'PYTHONPATH=cases python3 -m benchmarks.laws'` prints the rows of
+docs/accuracy.md.
 """
 
 from collections.abc import Iterator
@@ -25,7 +27,9 @@ PLACES = np.linspace(0.02, 0.98, 9)[:, None]  # within each cell
 
 
 def largest_strains(scene: Scene, record: Record) -> tuple[float, float]:
-    """Of the middle layer and of the faces, on a meridian, a thickness away from the pole, where a force acts."""
+    """Of the middle layer and of the faces, on a meridian, a thickness away from the pole, where a
+    force acts.
+    """
     model, state = scene.model, record.point.state
     assert isinstance(model, MeridianModel)
     jets_of, h = model.carrier.tables(model.V, PLACES), model.material.h
@@ -61,7 +65,9 @@ def rows() -> Iterator[str]:
             targets = [record for record in records if record.label == "target"]
             for depth, record in ((1.5, targets[0]), (6, targets[-1])):
                 force = record.point.state.mu["force"]
-                yield _row(f"F, w/h = {depth:g}", R_over_h, law, force, largest_strains(scene, record))
+                yield _row(
+                    f"F, w/h = {depth:g}", R_over_h, law, force, largest_strains(scene, record)
+                )
 
 
 def _row(what: str, R_over_h: float, law: str, value: float, strains: tuple[float, float]) -> str:

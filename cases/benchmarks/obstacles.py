@@ -1,11 +1,12 @@
-"""The popular nonlinear shell benchmarks: whole curves against Sze, Liu and Lo (2004), at several meshes.
+"""The popular nonlinear shell benchmarks: whole curves against Sze, Liu and Lo (2004), at several
+meshes.
 
-`make benchmarks`, or `python3 -m benchmarks.obstacles [NAME]...`, writes docs/benchmarks/; runs that are
-complete in results/benchmarks/, by the same sources, are taken as they are. The table is of all: with a NAME it is left
-alone.
+`make benchmarks`, or `python3 -m benchmarks.obstacles [NAME]...`, writes docs/benchmarks/; runs
+that are complete in results/benchmarks/, by the same sources, are taken as they are. The table is
+of all: with a NAME it is left alone.
 
-The published numbers are of a shear-flexible, finite-strain element (S4R of ABAQUS) on one mesh each; see
-docs/benchmarks/README.md for the sources.
+The published numbers are of a shear-flexible, finite-strain element (S4R of ABAQUS) on one mesh
+each; see docs/benchmarks/README.md for the sources.
 """
 
 import argparse
@@ -66,7 +67,12 @@ PULLED = {"w_A": "A_ux", "minus_u_B": "-B_uy", "minus_u_C": "-C_uy"}
 OBSTACLES = [
     Obstacle("cantilever_end_shear", "cantilever_end_shear", SHEAR, 5e-3),
     Obstacle("cantilever_end_moment", "cantilever_end_moment", EXACT, 5e-3),
-    Obstacle("slit_annular_plate", "slit_annular_plate", {"w_inner": "inner_uz", "w_outer": "outer_uz"}, 5e-3),
+    Obstacle(
+        "slit_annular_plate",
+        "slit_annular_plate",
+        {"w_inner": "inner_uz", "w_outer": "outer_uz"},
+        5e-3,
+    ),
     Obstacle(
         "hemisphere_hole",
         "hemisphere_18deg_hole",
@@ -81,7 +87,13 @@ OBSTACLES = [
         1e-2,
         second="pinched_cylinder_calculix",
     ),
-    Obstacle("pinched_semicylinder", "pinched_semicylinder", {"minus_w_A_isotropic": "-A_ux"}, 1e-2, (0.5, 1.0)),
+    Obstacle(
+        "pinched_semicylinder",
+        "pinched_semicylinder",
+        {"minus_w_A_isotropic": "-A_ux"},
+        1e-2,
+        (0.5, 1.0),
+    ),
     Obstacle("hinged_roof_12.7", "hinged_roof_12.7_isotropic", {"minus_w_C": "-C_ux"}, 1e-2),
     Obstacle("hinged_roof_6.35", "hinged_roof_6.35_isotropic", {"minus_w_C": "-C_ux"}, 1e-2),
 ]
@@ -90,7 +102,9 @@ OBSTACLES = [
 def published(table: str, column: str) -> Array:
     """(n, 2): displacement and load factor."""
     with (CASES / "reference" / f"{table}.csv").open(encoding="utf-8") as file:
-        return np.array([[float(row[column]), float(row["load_factor"])] for row in csv.DictReader(file)])
+        return np.array(
+            [[float(row[column]), float(row["load_factor"])] for row in csv.DictReader(file)]
+        )
 
 
 def second_opinion(obstacle: Obstacle) -> dict[str, Array]:
@@ -104,7 +118,9 @@ def second_opinion(obstacle: Obstacle) -> dict[str, Array]:
 
 def computed(rows: Sequence[Mapping[str, Any]], column: str) -> Array:
     """The same of a run's path, every accepted point of it."""
-    return _curve([row for row in rows if row["label"] != "bifurcation" and not int(row["branch"])], column)
+    return _curve(
+        [row for row in rows if row["label"] != "bifurcation" and not int(row["branch"])], column
+    )
 
 
 def _curve(rows: Sequence[Mapping[str, Any]], column: str) -> Array:
@@ -113,7 +129,8 @@ def _curve(rows: Sequence[Mapping[str, Any]], column: str) -> Array:
 
 
 def along_curve(curve: Array, reference: Array) -> float:
-    """Largest distance of the reference points from a curve; displacements over their largest, loads over one.
+    """Largest distance of the reference points from a curve; displacements over their largest,
+    loads over one.
 
     Points beyond the curve's largest load are left out.
     """
@@ -124,12 +141,16 @@ def along_curve(curve: Array, reference: Array) -> float:
     farthest = 0.0
     for point in reference[reference[:, 1] <= curve[:, 1].max() + 1e-9] / scale:
         t = np.clip(((point - start) * way).sum(axis=1) / length, 0, 1)
-        farthest = max(farthest, float(np.linalg.norm(start + t[:, None] * way - point, axis=1).min()))
+        farthest = max(
+            farthest, float(np.linalg.norm(start + t[:, None] * way - point, axis=1).min())
+        )
     return farthest
 
 
 def at_equal_load(curve: Array, reference: Array) -> float | None:
-    """Largest difference of displacements at equal loads, over the largest; None where the load turns back."""
+    """Largest difference of displacements at equal loads, over the largest; None where the load
+    turns back.
+    """
     if (np.diff(curve[:, 1]) < 0).any() or (np.diff(reference[:, 1]) < 0).any():
         return None
     found = []
@@ -144,7 +165,10 @@ def measured(obstacle: Obstacle, refinement: float) -> tuple[Line, list[dict[str
     """Run a benchmark on a mesh, unless its folder in results/ has it already; its path."""
     case = Case.load(CASES / f"{obstacle.case}.yaml", [f"mesh.refinement={refinement:g}"])
     found, rows = finished(case, RESULTS / f"{obstacle.case}_{refinement:g}")
-    of: dict[str, Callable[[Array, Array], float | None]] = {"along": along_curve, "equal": at_equal_load}
+    of: dict[str, Callable[[Array, Array], float | None]] = {
+        "along": along_curve,
+        "equal": at_equal_load,
+    }
     errors = {
         kind: {
             column: error(computed(rows, ours), published(obstacle.table, column))
@@ -172,12 +196,18 @@ def finished(case: Case, folder: Path) -> tuple[dict[str, Any], list[dict[str, s
     """Summary and path of a case, run unless its folder has it already, computed by these sources."""
     with suppress(AlreadyComplete):
         try:
-            run(case, folder, resume=(folder / "checkpoint").exists() or (folder / "summary.json").exists())
+            run(
+                case,
+                folder,
+                resume=(folder / "checkpoint").exists() or (folder / "summary.json").exists(),
+            )
         except OtherSources:
             print(f"{folder} is of other sources of magshell_fenicsx: again", flush=True)
             run(case, folder)
     with (folder / "path.csv").open(encoding="utf-8") as file:
-        return json.loads((folder / "summary.json").read_text(encoding="utf-8")), list(csv.DictReader(file))
+        return json.loads((folder / "summary.json").read_text(encoding="utf-8")), list(
+            csv.DictReader(file)
+        )
 
 
 def hard_magnetic(which: str) -> tuple[Array, Array]:
@@ -188,9 +218,14 @@ def hard_magnetic(which: str) -> tuple[Array, Array]:
     assert case.magnetic.applied.flux_density
     unit = 1e3 * case.magnetic.applied.flux_density / case.lambda_m
     length = case.points["tip"][0]
-    curve = np.array([[unit * float(row["lambda_m"]), abs(float(row["tip_uz"])) / length] for row in rows])
+    curve = np.array(
+        [[unit * float(row["lambda_m"]), abs(float(row["tip_uz"])) / length] for row in rows]
+    )
     with (CASES / "reference" / f"hard_magnetic_beam_{which}.csv").open(encoding="utf-8") as file:
-        points = [(float(row["field_mT"]), float(row["tip_deflection_over_length"])) for row in csv.DictReader(file)]
+        points = [
+            (float(row["field_mT"]), float(row["tip_deflection_over_length"]))
+            for row in csv.DictReader(file)
+        ]
     return curve, np.array(points)
 
 
@@ -217,7 +252,9 @@ def main() -> None:
             column: (computed(rows, ours), published(obstacle.table, column))
             for column, ours in obstacle.columns.items()
         }
-        write_whole(OUT / f"{obstacle.case}.png", draw(obstacle.case, curves, second_opinion(obstacle)))
+        write_whole(
+            OUT / f"{obstacle.case}.png", draw(obstacle.case, curves, second_opinion(obstacle))
+        )
     if not names:
         write(lines, OUT / "obstacles.csv")
 

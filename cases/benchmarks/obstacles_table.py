@@ -32,8 +32,8 @@ class Line:
     Attributes
     ----------
     along, equal
-        By column of the published table: the largest difference over the largest displacement, along the
-        curve and at equal loads (None where the load turns back).
+        By column of the published table: the largest difference over the largest displacement,
+        along the curve and at equal loads (None where the load turns back).
     turns
         Folds of the load on the path.
     """
@@ -98,11 +98,17 @@ def write(lines: Sequence[Line], file: Path) -> None:
     """Write the CSV and, beside it, the same for people."""
     found = rows(lines)
     write_csv(found, list(found[0]), file)
-    file.with_suffix(".md").write_text(f"# The obstacle course: all meshes\n\n{markdown(lines)}", encoding="utf-8")
+    file.with_suffix(".md").write_text(
+        f"# The obstacle course: all meshes\n\n{markdown(lines)}", encoding="utf-8"
+    )
 
 
-def draw(title: str, curves: Mapping[str, tuple[Array, Array]], second: Mapping[str, Array]) -> bytes:
-    """Computed curves (n, 2) of displacement and load factor, published points, another code's curves; a PNG file."""
+def draw(
+    title: str, curves: Mapping[str, tuple[Array, Array]], second: Mapping[str, Array]
+) -> bytes:
+    """Computed curves (n, 2) of displacement and load factor, published points, another code's
+    curves; a PNG file.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -114,7 +120,15 @@ def draw(title: str, curves: Mapping[str, tuple[Array, Array]], second: Mapping[
         axes.plot(*reference.T, "o", color=f"C{number}", markersize=3.5, markerfacecolor="none")
         if name in second:
             axes.plot(*second[name].T, "+", color=f"C{number}", markersize=4)
-    axes.plot([], [], "o", color="0.4", markersize=3.5, markerfacecolor="none", label="published, or exact")
+    axes.plot(
+        [],
+        [],
+        "o",
+        color="0.4",
+        markersize=3.5,
+        markerfacecolor="none",
+        label="published, or exact",
+    )
     if second:
         axes.plot([], [], "+", color="0.4", markersize=4, label="a second code")
     axes.set(xlabel="displacement (the case's unit of length)", ylabel="load factor")
@@ -139,8 +153,21 @@ def draw_beams(beams: Mapping[str, tuple[Array, Array]]) -> bytes:
     for number, (name, (curve, measured)) in enumerate(beams.items()):
         axes.plot(*curve.T, color=f"C{number}", label=said[name])
         axes.plot(*measured.T, "o", color=f"C{number}", markersize=4, markerfacecolor="none")
-    axes.plot([], [], "o", color="0.4", markersize=4, markerfacecolor="none", label="measured, Zhao et al. (2019)")
-    axes.set(xlabel="applied field  (mT)", ylabel="tip deflection over length", ylim=(0, None), xlim=(0, None))
+    axes.plot(
+        [],
+        [],
+        "o",
+        color="0.4",
+        markersize=4,
+        markerfacecolor="none",
+        label="measured, Zhao et al. (2019)",
+    )
+    axes.set(
+        xlabel="applied field  (mT)",
+        ylabel="tip deflection over length",
+        ylim=(0, None),
+        xlim=(0, None),
+    )
     axes.legend(frameon=False, fontsize=8)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=170)

@@ -1,8 +1,10 @@
-"""CPU time of a point of a path in a shell's own field over that without: the hemisphere of `own_field.yaml`, whole.
+"""CPU time of a point of a path in a shell's own field over that without: the hemisphere of
+`own_field.yaml`, whole.
 
 Points under pressure are counted up to the instability, and exact sums over pairs at each.
 
-.ci/in-env sh -c 'OMP_NUM_THREADS=1 PYTHONPATH=cases python3 -m benchmarks.own_field --refinement 0.56'
+.ci/in-env sh -c 'OMP_NUM_THREADS=1 PYTHONPATH=cases python3 -m benchmarks.own_field --refinement
+0.56'
 """
 
 import argparse
@@ -44,7 +46,10 @@ def seconds(case: dict[str, Any], points: int, counted: Counted) -> list[float]:
             break
         if pressure := record.point.state.mu["pressure"]:
             found.append(time.process_time() - before)
-            print(f"{pressure:.6f} {found[-1]:8.3f} s {counted.count - count:4d} exact sums", flush=True)
+            print(
+                f"{pressure:.6f} {found[-1]:8.3f} s {counted.count - count:4d} exact sums",
+                flush=True,
+            )
     return found
 
 

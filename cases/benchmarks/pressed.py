@@ -1,6 +1,8 @@
-"""A hemisphere pressed by a rigid plate, and by a stiff shell that stands for it: user CPU of whole runs, alternating.
+"""A hemisphere pressed by a rigid plate, and by a stiff shell that stands for it: user CPU of whole
+runs, alternating.
 
-The shell is a coarse disc with a clamped edge, a thousand times as stiff. Both press by 0.4 h on the same mesh.
+The shell is a coarse disc with a clamped edge, a thousand times as stiff. Both press by 0.4 h on
+the same mesh.
 
 python3 cases/benchmarks/pressed.py [--rounds 3] [--size "9 mm"]
 """
@@ -21,7 +23,13 @@ DOME = {
     "youngs_modulus": "1 MPa",
     "poisson_ratio": 0.5,
 }
-DISC = {"geometry": "disc", "radius": "18 mm", "thickness": "1 mm", "youngs_modulus": "1 GPa", "poisson_ratio": 0.5}
+DISC = {
+    "geometry": "disc",
+    "radius": "18 mm",
+    "thickness": "1 mm",
+    "youngs_modulus": "1 GPa",
+    "poisson_ratio": 0.5,
+}
 CLAMPED = {"equator": "clamped"}
 DEPTH = 0.4  # mm
 
@@ -73,5 +81,10 @@ if __name__ == "__main__":
         for name, case in cases(given.size).items():
             (Path(folder) / f"{name}.yaml").write_text(json.dumps(case), encoding="utf-8")
         for _ in range(given.rounds):
-            plate, shell = (seconds(Path(folder) / f"{name}.yaml", Path(folder) / name) for name in ("plate", "shell"))
-            print(f"plate {plate:.2f} s, shell {shell:.2f} s, {shell / plate:.2f} times", flush=True)
+            plate, shell = (
+                seconds(Path(folder) / f"{name}.yaml", Path(folder) / name)
+                for name in ("plate", "shell")
+            )
+            print(
+                f"plate {plate:.2f} s, shell {shell:.2f} s, {shell / plate:.2f} times", flush=True
+            )

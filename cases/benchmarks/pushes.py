@@ -1,5 +1,6 @@
-"""Random pushes of a sheet that folds on itself and of a disc that crumples: where each stops and why, the smallest
-gap, and how often the shell intersects itself at an accepted point, by an independent test of triangles.
+"""Random pushes of a sheet that folds on itself and of a disc that crumples: where each stops and
+why, the smallest gap, and how often the shell intersects itself at an accepted point, by an
+independent test of triangles.
 
 A line for each push in the table; those that it has are not done again. At the end their counts.
 
@@ -47,12 +48,13 @@ class Push:
     factor
         The part of the motion that was reached.
     why
-        It stopped there: "target" is all of it, "fold" a limit point of the load, "failed" what is not explained.
+        It stopped there: "target" is all of it, "fold" a limit point of the load, "failed" what is
+        not explained.
     points, touching
         How many were accepted, and at how many of them the shell touches itself.
     gap
-        The smallest between faces, over h, of all points; nan if none is near. Triangles are flat, which makes
-        it wrong by up to a thousandth.
+        The smallest between faces, over h, of all points; nan if none is near. Triangles are flat,
+        which makes it wrong by up to a thousandth.
     intersections
         Pairs of triangles that pass through each other, of all points.
     said
@@ -79,7 +81,10 @@ def passing(one: Array, other: Array) -> NDArray[np.bool_]:
         d, s = a[:, [1, 2, 0]] - a, a - b[:, None, 0]
         normal, q = np.cross(d, e2), np.cross(s, e1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            u, v, t = (np.sum(x * y, axis=-1) / np.sum(normal * e1, axis=-1) for x, y in ((s, normal), (q, d), (q, e2)))
+            u, v, t = (
+                np.sum(x * y, axis=-1) / np.sum(normal * e1, axis=-1)
+                for x, y in ((s, normal), (q, d), (q, e2))
+            )
             found |= ((u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)).any(axis=1)
     return found
 
@@ -88,7 +93,12 @@ def distances(one: Array, other: Array) -> Array:
     """Of two triangles (n, 3, 3) that do not pass through each other, without sides of no length."""
     least = np.full(len(one), np.inf)
     for i, j in product(range(3), range(3)):  # two sides
-        p, q, d, e = one[:, i], other[:, j], one[:, i - 1] - one[:, i], other[:, j - 1] - other[:, j]
+        p, q, d, e = (
+            one[:, i],
+            other[:, j],
+            one[:, i - 1] - one[:, i],
+            other[:, j - 1] - other[:, j],
+        )
         dd, ee, de, r = *(np.sum(x * y, axis=1) for x, y in ((d, d), (e, e), (d, e))), p - q
         square = np.maximum(dd * ee - de**2, 1e-12 * dd * ee)
         s = np.clip((de * np.sum(e * r, axis=1) - ee * np.sum(d * r, axis=1)) / square, 0, 1)
@@ -118,13 +128,17 @@ def quarters(X: Array) -> Array:
     """Four parts (n, 4, 3, 2) of each of some triangles."""
     a, b, c = X[:, 0], X[:, 1], X[:, 2]
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    parts = [np.stack(each, axis=1) for each in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    parts = [
+        np.stack(each, axis=1) for each in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    ]
     return np.stack(parts, axis=1)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The mid-surface of a scene, undeformed or at a displacement; its triangles have their corners on it."""
+    """The mid-surface of a scene, undeformed or at a displacement; its triangles have their corners
+    on it.
+    """
 
     scene: Scene
     r: Array
@@ -137,14 +151,18 @@ class Surface:
     def at(self, cell: Ints, X: Array) -> Array:
         """The places (n, 3, 3) of the corners (n, 3, 2) in cells (n,)."""
         V = self.scene.model.V
-        shape = V.element.basix_element.tabulate(0, X.reshape(-1, 2))[0, :, :, 0].reshape(*X.shape[:2], -1)
+        shape = V.element.basix_element.tabulate(0, X.reshape(-1, 2))[0, :, :, 0].reshape(
+            *X.shape[:2], -1
+        )
         return np.asarray(np.einsum("nmk,nki->nmi", shape, self.r[V.dofmap.list[cell]]))
 
 
 def looked_at(now: Surface, before: Surface) -> tuple[int, float]:
-    """How many triangles, not near in the undeformed shell, pass through each other; their least distance.
+    """How many triangles, not near in the undeformed shell, pass through each other; their least
+    distance.
 
-    Where that is less than h, both are halved, and again, for triangles are flat and may be nearer than the surface.
+    Where that is less than h, both are halved, and again, for triangles are flat and may be nearer
+    than the surface.
     """
     cells = len(now.scene.model.V.dofmap.list)
     cell, X = np.repeat(np.arange(cells), PARTS**2), np.tile(triangles(), (cells, 1, 1))
@@ -169,7 +187,9 @@ def looked_at(now: Surface, before: Surface) -> tuple[int, float]:
     return int(passing(at[i], at[j]).sum()), float(least)
 
 
-def mesh(file: Path, nodes: Array, cells: Sequence[Sequence[int]], held: Callable[[Array], str]) -> Path:
+def mesh(
+    file: Path, nodes: Array, cells: Sequence[Sequence[int]], held: Callable[[Array], str]
+) -> Path:
     """A mesh file of flat triangles; `held` names a part of the edge by the middle of a side."""
     sides = Counter(tuple(sorted((c[k - 1], c[k]))) for c in cells for k in range(3))
     edge = {side: held(nodes[[*side]].mean(axis=0)) for side, times in sides.items() if times == 1}
@@ -177,10 +197,30 @@ def mesh(file: Path, nodes: Array, cells: Sequence[Sequence[int]], held: Callabl
     elements = [f"2 2 1 1 {a + 1} {b + 1} {c + 1}" for a, b, c in cells]
     for (a, b), name in edge.items():
         elements.append("1 2 {0} {0} {1} {2}".format(names.index(name) + 2, a + 1, b + 1))
-    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names) + 1), '2 1 "all"']
-    text += [*(f'1 {k} "{name}"' for k, name in enumerate(names, 2)), "$EndPhysicalNames", "$Nodes", str(len(nodes))]
-    text += [*(f"{k} {x!r} {y!r} 0" for k, (x, y) in enumerate(nodes.tolist(), 1)), "$EndNodes", "$Elements"]
-    text += [str(len(elements)), *(f"{k} {element}" for k, element in enumerate(elements, 1)), "$EndElements"]
+    text = [
+        "$MeshFormat",
+        "2.2 0 8",
+        "$EndMeshFormat",
+        "$PhysicalNames",
+        str(len(names) + 1),
+        '2 1 "all"',
+    ]
+    text += [
+        *(f'1 {k} "{name}"' for k, name in enumerate(names, 2)),
+        "$EndPhysicalNames",
+        "$Nodes",
+        str(len(nodes)),
+    ]
+    text += [
+        *(f"{k} {x!r} {y!r} 0" for k, (x, y) in enumerate(nodes.tolist(), 1)),
+        "$EndNodes",
+        "$Elements",
+    ]
+    text += [
+        str(len(elements)),
+        *(f"{k} {element}" for k, element in enumerate(elements, 1)),
+        "$EndElements",
+    ]
     file.write_text("\n".join(text) + "\n", encoding="utf-8")
     return file
 
@@ -193,31 +233,53 @@ def sheet(file: Path) -> Path:
     for p in range(CELLS):
         q, r, s = p + 1, n + p + 1, n + p
         cells += [(p, q, s), (q, r, s)] if p % 2 else [(p, q, r), (p, r, s)]
-    return mesh(file, nodes, cells, lambda at: {0.0: "left", 1.0: "right"}.get(float(at[0]), "sides"))
+    return mesh(
+        file, nodes, cells, lambda at: {0.0: "left", 1.0: "right"}.get(float(at[0]), "sides")
+    )
 
 
 def disc(file: Path) -> Path:
     """A disc of rings of cells, whose rim has the parts left and right."""
     angles = [2 * np.pi * np.arange(6 * k) / (6 * k) for k in range(1, RINGS + 1)]
-    rings = [RADIUS * k / RINGS * np.stack([np.cos(a), np.sin(a)], axis=1) for k, a in enumerate(angles, 1)]
+    rings = [
+        RADIUS * k / RINGS * np.stack([np.cos(a), np.sin(a)], axis=1)
+        for k, a in enumerate(angles, 1)
+    ]
     nodes = np.concatenate([np.zeros((1, 2)), *rings])
-    cells = scipy.spatial.Delaunay(nodes + 1e-6 * np.stack([nodes[:, 1] ** 2, nodes[:, 0] ** 2], axis=1)).simplices
+    cells = scipy.spatial.Delaunay(
+        nodes + 1e-6 * np.stack([nodes[:, 1] ** 2, nodes[:, 0] ** 2], axis=1)
+    ).simplices
     x = 0.75 * RADIUS
-    return mesh(file, nodes, cells.tolist(), lambda at: "left" if at[0] < -x else "right" if at[0] > x else "sides")
+    return mesh(
+        file,
+        nodes,
+        cells.tolist(),
+        lambda at: "left" if at[0] < -x else "right" if at[0] > x else "sides",
+    )
 
 
 def motion(seed: int) -> dict[str, Any]:
-    """The right end is turned over by about half a turn, and pressed on the rest; a disc is also twisted."""
+    """The right end is turned over by about half a turn, and pressed on the rest; a disc is also
+    twisted.
+    """
     rng, is_sheet = np.random.default_rng(seed), seed < SHEETS
     tilt, far = (0.15, 0.1) if is_sheet else (0.5, 0.15)
     axis = np.array([0.0, -1.0, 0.0]) + rng.uniform(-tilt, tilt, 3) * [1, 0, 1]
-    point = [rng.uniform(0.6, 0.75), WIDTH / 2, 0.0] if is_sheet else [rng.uniform(0.1, 0.2) * RADIUS, 0.0, 0.0]
+    point = (
+        [rng.uniform(0.6, 0.75), WIDTH / 2, 0.0]
+        if is_sheet
+        else [rng.uniform(0.1, 0.2) * RADIUS, 0.0, 0.0]
+    )
     turn = {
         "axis": axis.tolist(),
         "point": [float(x) for x in point],
         "angle": float(rng.uniform(180, 300 if is_sheet else 240)),
     }
-    moved = [0.0, float(rng.uniform(-far, far)), float(h * (rng.uniform(-8, -2) if is_sheet else rng.uniform(-3, 0)))]
+    moved = [
+        0.0,
+        float(rng.uniform(-far, far)),
+        float(h * (rng.uniform(-8, -2) if is_sheet else rng.uniform(-3, 0))),
+    ]
     return {"supports": ["right"], "rotation": turn, "translation": moved}
 
 
@@ -238,7 +300,13 @@ def case(file: Path, seed: int) -> Case:
             "boundary": {"left": "clamped", "right": "clamped"},
             "contact": [["shell", "shell"]],
             "mesh": {"degree": 3},
-            "loading": {"kind": "edge", "control": "load", "points": 12, "factor": 1, "moves": [motion(seed)]},
+            "loading": {
+                "kind": "edge",
+                "control": "load",
+                "points": 12,
+                "factor": 1,
+                "moves": [motion(seed)],
+            },
         }
     )
 
@@ -269,7 +337,10 @@ def read(table: Path) -> list[Push]:
     if not table.exists():
         return []
     with table.open(encoding="utf-8") as file:
-        return [Push(**{each.name: each.type(row[each.name]) for each in fields(Push)}) for row in csv.DictReader(file)]  # type: ignore[operator]
+        return [
+            Push(**{each.name: each.type(row[each.name]) for each in fields(Push)})
+            for row in csv.DictReader(file)
+        ]  # type: ignore[operator]
 
 
 def pushes(seeds: Sequence[int], table: Path) -> Iterator[Push]:

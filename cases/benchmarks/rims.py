@@ -1,4 +1,5 @@
-"""One dimple at 40 degrees from the pole of a full shell, with and without edges of elements along its rim.
+"""One dimple at 40 degrees from the pole of a full shell, with and without edges of elements along
+its rim.
 
 `python3 -m benchmarks.rims` (with PYTHONPATH=cases) prints the table of docs/study/rims.md.
 """
@@ -17,7 +18,9 @@ CASE = Path(__file__).parents[1] / "dimple_buckling.yaml"
 DIMPLES = ((1.64, 3.2), (4.0, 3.2), (1.64, 1.5))  # depth over h, width
 
 
-def knockdown(depth: float, width: float, refinement: float, *settings: str, matched: bool) -> float:
+def knockdown(
+    depth: float, width: float, refinement: float, *settings: str, matched: bool
+) -> float:
     """k_d of a dimple at 40 degrees; the shell is whole but for other `settings`."""
     dimple = f"{{kind: dimple, amplitude: {depth}, width: {width}, at: {{polar: 40}}}}"
     common = [f"shell.imperfections=[{dimple}]", f"mesh.refinement={refinement}", "symmetry=none"]
@@ -34,7 +37,9 @@ def main(refinements: Sequence[float] = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0)) -> None
     """Print k_d, the rim matched and not."""
     for depth, width in DIMPLES:
         for refinement in refinements:
-            found = (knockdown(depth, width, refinement, matched=matched) for matched in (True, False))
+            found = (
+                knockdown(depth, width, refinement, matched=matched) for matched in (True, False)
+            )
             print(depth, width, refinement, *(f"{k_d:.7f}" for k_d in found), flush=True)
 
 

@@ -29,7 +29,10 @@ from magshell_fenicsx.simulate.scene import build_model
 
 CASES = Path(__file__).parent
 OUT = CASES.parents[1] / "docs" / "extremes"
-FINER = ("mesh.degree=5", "mesh.refinement=2")  # of the solution that one without a reference is compared with
+FINER = (
+    "mesh.degree=5",
+    "mesh.refinement=2",
+)  # of the solution that one without a reference is compared with
 LIMIT = 300.0  # seconds for a row
 
 
@@ -42,7 +45,8 @@ class Variant:
     settings
         As of `--set`.
     value
-        "first": of the first instability; "fold": of the first fold; or a column of path.csv, at the end.
+        "first": of the first instability; "fold": of the first fold; or a column of path.csv, at
+        the end.
     reference
         Of the value, from an independent solver; None compares with a finer mesh of higher degree.
     against
@@ -56,11 +60,21 @@ class Variant:
     against: str = ""
 
 
-def _varied(case: str, key: str, references: dict[float, float | None], *others: str) -> list[Variant]:
-    return [Variant(case, (f"{key}={number:g}", *others), reference=r) for number, r in references.items()]
+def _varied(
+    case: str, key: str, references: dict[float, float | None], *others: str
+) -> list[Variant]:
+    return [
+        Variant(case, (f"{key}={number:g}", *others), reference=r)
+        for number, r in references.items()
+    ]
 
 
-LAMBDA, NU, THICKNESS, PENALTY = "magnetic.lambda_m", "shell.poisson_ratio", "shell.radius_to_thickness", "mesh.penalty"
+LAMBDA, NU, THICKNESS, PENALTY = (
+    "magnetic.lambda_m",
+    "shell.poisson_ratio",
+    "shell.radius_to_thickness",
+    "mesh.penalty",
+)
 HALF = ("symmetry=half", "mesh.refinement=0.6")
 CLASSICAL, FIELD, DIMPLE = (
     "loading={kind: pressure}",
@@ -69,13 +83,24 @@ CLASSICAL, FIELD, DIMPLE = (
 )
 K_D = 0.326233289  # R/h = 90, nu = 0.5, delta/h = 1.64: axisymmetric, nine digits
 VARIANTS = [
-    *_varied("thickness", THICKNESS, {20: None, 90: None, 300: None, 1000: 0.325723564, 3000: None, 10000: None}),
+    *_varied(
+        "thickness",
+        THICKNESS,
+        {20: None, 90: None, 300: None, 1000: 0.325723564, 3000: None, 10000: None},
+    ),
     *_varied("thickness", THICKNESS, {1000: 0.325723564}, *HALF),
     *_varied("beyond", THICKNESS, {1000: 0.325723564}),
-    *(Variant("beyond", (f"{THICKNESS}={number}",), against="thickness") for number in (3000, 10000)),
+    *(
+        Variant("beyond", (f"{THICKNESS}={number}",), against="thickness")
+        for number in (3000, 10000)
+    ),
     *_varied("poisson", NU, {-0.9: None, 0: None, 0.3: None, 0.5: K_D}),
     *_varied("poisson", NU, {-0.9: None}, *HALF),
-    *_varied("dimple", "shell.defect.amplitude", {0.01: None, 0.1: None, 0.5: None, 1.64: K_D, 3: None, 6: None}),
+    *_varied(
+        "dimple",
+        "shell.defect.amplitude",
+        {0.01: None, 0.1: None, 0.5: None, 1.64: K_D, 3: None, 6: None},
+    ),
     *_varied("field", LAMBDA, {-0.02: -0.0033554, -0.005: -0.0033554, -0.00184: 0.120723848}),
     *_varied("field", LAMBDA, {0.00184: 0.552053778, 0.01: None, 0.05: None}),
     *_varied("critical_field", NU, {0.3: -0.000946554, 0.5: -0.001042}),
@@ -104,10 +129,16 @@ def line(variant: Variant) -> Line:
     seconds = time.perf_counter() - start
     found, reference, source = value_of(result, variant.value), variant.reference, "reference"
     if reference is None and found is not None:
-        finer = Case.load(CASES / f"{variant.against or variant.case}.yaml", (*variant.settings, *FINER))
+        finer = Case.load(
+            CASES / f"{variant.against or variant.case}.yaml", (*variant.settings, *FINER)
+        )
         reference, source = value_of(run(finer, time_limit=LIMIT), variant.value), "finer mesh"
     newton, scene = result.scene.newton, result.scene
-    steps = [row for row in result.rows if row["label"] in ("start", "field", "step") and not row["branch"]]
+    steps = [
+        row
+        for row in result.rows
+        if row["label"] in ("start", "field", "step") and not row["branch"]
+    ]
     return Line(
         family=variant.case,
         variant=", ".join(variant.settings),
@@ -139,7 +170,9 @@ def slivers(aspect: float, way: str) -> Line:
     problem = replace(problem, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
     model = build_model(problem, MPI.COMM_WORLD)
     newton = BorderedNewton(model.system)
-    path = EquilibriumPath(newton, "lambda_m", "load", StepOptions(target / 4, target, 1e-4 * target))
+    path = EquilibriumPath(
+        newton, "lambda_m", "load", StepOptions(target / 4, target, 1e-4 * target)
+    )
     unloaded = State(model.zero(), {"lambda_m": 0.0})
     points, said = [path.start(unloaded)], "reached"
     try:
@@ -148,7 +181,9 @@ def slivers(aspect: float, way: str) -> Line:
         said = f"stopped: {e}"
     last = points[-1].state
     tip = float(model.displacement(last.u, "pole")[2]) if said == "reached" else None
-    step = smallest([model.deflection(point.state.u, "pole") / problem.material.h for point in points])
+    step = smallest(
+        [model.deflection(point.state.u, "pole") / problem.material.h for point in points]
+    )
     seconds = time.perf_counter() - start
     return Line(
         family="slivers",
@@ -185,7 +220,9 @@ def value_of(result: Result, name: str) -> float | None:
     if name not in ("first", "fold"):
         return float(result.rows[-1][name])
     kinds = ("fold",) if name == "fold" else ("fold", "bifurcation")
-    return next((float(point["value"]) for point in result.limit_points if point["kind"] in kinds), None)
+    return next(
+        (float(point["value"]) for point in result.limit_points if point["kind"] in kinds), None
+    )
 
 
 def outcome(result: Result) -> str:
@@ -207,8 +244,11 @@ def smallest(w_over_h: Sequence[float]) -> float | None:
     return min((float(d) for d in np.abs(np.diff(w_over_h))), default=None)
 
 
-def condition_estimate(factors: Factorisation, size: int, comm: MPI.Comm, iterations: int = 30) -> float:
-    """Largest over smallest |eigenvalue| of the matrix last factored; a lower bound, good to some per cent.
+def condition_estimate(
+    factors: Factorisation, size: int, comm: MPI.Comm, iterations: int = 30
+) -> float:
+    """Largest over smallest |eigenvalue| of the matrix last factored; a lower bound, good to some
+    per cent.
 
     Parameters
     ----------

@@ -1,4 +1,5 @@
-"""The figures of Pezzulla, Yan and Reis: sweeps of the cases in cases/figures/, their numbers and pictures.
+"""The figures of Pezzulla, Yan and Reis: sweeps of the cases in cases/figures/, their numbers and
+pictures.
 
 `make figures`, or `python3 -m figures.figures [NAME]...`; what has been computed is kept.
 """
@@ -118,8 +119,15 @@ def knockdowns(done: Sweep) -> list[dict[str, Any]]:
     for point, outcome in pairs:
         if point.case.lambda_m:
             found = sweep_row(outcome)
-            change = outcome.knockdown - none if outcome.knockdown is not None and none is not None else None
-            kept = {key: found[key] for key in ("w_pole_over_h", "kind", "mode", "stopped", "dofs", "wall_s")}
+            change = (
+                outcome.knockdown - none
+                if outcome.knockdown is not None and none is not None
+                else None
+            )
+            kept = {
+                key: found[key]
+                for key in ("w_pole_over_h", "kind", "mode", "stopped", "dofs", "wall_s")
+            }
             rows.append({**point.values, "k_d": outcome.knockdown, "delta_k_d": change, **kept})
     return rows
 
@@ -148,7 +156,11 @@ def draw(figure: Figure, rows: Sequence[dict[str, Any]], x: str, y: str, file: P
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     groups = list(dict.fromkeys((row[FIELD], row[ENERGY]) for row in rows))
     for field, energy in groups:
-        line = [row for row in rows if (row[FIELD], row[ENERGY]) == (field, energy) and row[y] is not None]
+        line = [
+            row
+            for row in rows
+            if (row[FIELD], row[ENERGY]) == (field, energy) and row[y] is not None
+        ]
         xy = [float(row[x]) for row in line], [row[y] for row in line]
         axes.plot(*xy, color=COLOURS[float(field)], **styles[energy])
         if line[-1].get("label") == "step":
@@ -160,9 +172,17 @@ def draw(figure: Figure, rows: Sequence[dict[str, Any]], x: str, y: str, file: P
         if f in shown
     ]
     used = {energy for _, energy in groups}
-    legend += [Line2D([], [], color="0.3", label=NAMES[e], **style) for e, style in styles.items() if e in used]
+    legend += [
+        Line2D([], [], color="0.3", label=NAMES[e], **style)
+        for e, style in styles.items()
+        if e in used
+    ]
     if not figure.along:
-        legend.append(Line2D([], [], color="0.3", linestyle="", marker="x", label="the displacement turns back"))
+        legend.append(
+            Line2D(
+                [], [], color="0.3", linestyle="", marker="x", label="the displacement turns back"
+            )
+        )
     picture.legend(handles=legend, loc="outside right upper", frameon=False, fontsize=9)
     change = r"change of the knockdown factor  $\Delta k_\mathrm{d}$"
     axes.set(xlabel=figure.x_label, ylabel=change if figure.along else r"force  $FR/(2\pi D)$")
@@ -174,7 +194,9 @@ def draw(figure: Figure, rows: Sequence[dict[str, Any]], x: str, y: str, file: P
 
 
 def main(names: Sequence[str]) -> int:
-    """Make the named figures, or all; curves that end at a fold are part of them, so that is no error."""
+    """Make the named figures, or all; curves that end at a fold are part of them, so that is no
+    error.
+    """
     for name in names:
         if name not in FIGURES:
             print(f"{name}: no such figure; there are {', '.join(FIGURES)}", file=sys.stderr)

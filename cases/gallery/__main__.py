@@ -11,7 +11,8 @@ from pathlib import Path
 
 from PIL import Image
 
-import magshell_fenicsx.parts.registered  # noqa: F401  # the columns of all parts, by which a path.csv is read
+# the columns of all parts, by which a path.csv is read
+import magshell_fenicsx.parts.registered  # noqa: F401
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.output.store.known import case_in
@@ -53,14 +54,27 @@ def row(file: Path) -> str:
         more = ["--data", f"cases/{file.stem}.csv"]
     if over := OVER.get(file.stem):
         kind, more = "boundary", [word for each in over for word in ("--over", each)]
-    command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
+    command, folder = (
+        ["magshell", kind, f"cases/{file.name}", *more],
+        CASES.parent / "results" / "gallery" / file.stem,
+    )
     before = os.times()
     said = subprocess.run(
-        [*command, "--out", str(folder)], cwd=CASES.parent, capture_output=True, text=True, check=False
+        [*command, "--out", str(folder)],
+        cwd=CASES.parent,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     after = os.times()
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    lines = [line.strip() for line in said.stdout.splitlines() if line.strip() and not line.startswith("results in")]
+    cpu = (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
+    lines = [
+        line.strip()
+        for line in said.stdout.splitlines()
+        if line.strip() and not line.startswith("results in")
+    ]
     last = lines[-1] if lines else said.stderr.strip()
     end = f" Ends with exit code {said.returncode}." if said.returncode else ""
     _add_shapes(folder)
@@ -81,10 +95,11 @@ def thumbnails(names: Sequence[str]) -> str:
 
 
 def telling(folder: Path) -> list[str]:
-    """The pictures that show the result best: of field maps these, of sensors their readings, of motions and snaps the
-    curve, of a bifurcation its mode.
+    """The pictures that show the result best: of field maps these, of sensors their readings, of
+    motions and snaps the curve, of a bifurcation its mode.
 
-    Where the branch that begins there is followed, that is the shell. Beside bodies and magnets these are shown.
+    Where the branch that begins there is followed, that is the shell. Beside bodies and magnets
+    these are shown.
     """
     if not (folder / "path.csv").exists():
         return []
@@ -95,7 +110,9 @@ def telling(folder: Path) -> list[str]:
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
     steps = case_in(folder)["loading"]
-    if any(step.get("then") == "follow" for step in (steps if isinstance(steps, list) else [steps])):
+    if any(
+        step.get("then") == "follow" for step in (steps if isinstance(steps, list) else [steps])
+    ):
         return ["shell.png"]
     if any(row["label"] == "bifurcation" for row in rows):
         return ["instabilities.png"]
@@ -105,16 +122,26 @@ def telling(folder: Path) -> list[str]:
 
 def _add_shapes(folder: Path) -> None:
     """On the curve of a snap: the shell as it is, at its first fold and at the end."""
-    if telling(folder) == ["curve.png"] and (rows := read_rows(folder / "path.csv"))[-1]["amplitude"] != "time":
+    if (
+        telling(folder) == ["curve.png"]
+        and (rows := read_rows(folder / "path.csv"))[-1]["amplitude"] != "time"
+    ):
         fold = next(row for row in rows if row["label"] == "fold")
         points = ",".join(str(row["point"]) for row in (rows[0], fold, rows[-1]))
-        subprocess.run(["magshell", "plot", str(folder), "--shapes", points], capture_output=True, check=True)
+        subprocess.run(
+            ["magshell", "plot", str(folder), "--shapes", points], capture_output=True, check=True
+        )
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters stay legible."""
+    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters
+    stay legible.
+    """
     with Image.open(source) as opened:
-        wide, picture = opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN, opened.convert("RGB")
+        wide, picture = (
+            opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN,
+            opened.convert("RGB"),
+        )
     picture.thumbnail((WIDTH * (2 if wide else 1), 10 * WIDTH))
     picture.save(target, optimize=True)
 
@@ -124,13 +151,18 @@ def main(names: list[str]) -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     page = OUT / "README.md"
     known = {
-        text.partition("\n")[0]: f"## {text}" for text in (page.read_text() if page.exists() else "").split("\n## ")[1:]
+        text.partition("\n")[0]: f"## {text}"
+        for text in (page.read_text() if page.exists() else "").split("\n## ")[1:]
     }
     for file in sorted(CASES.glob("*.yaml")):
         if not names or file.stem in names:
             known[file.stem] = row(file)
             print(file.stem, flush=True)
-        parts = [HEAD, thumbnails(sorted(known)), *(known[name].strip() + "\n" for name in sorted(known))]
+        parts = [
+            HEAD,
+            thumbnails(sorted(known)),
+            *(known[name].strip() + "\n" for name in sorted(known)),
+        ]
         page.write_text("\n".join(parts), encoding="utf-8")
 
 

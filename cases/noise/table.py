@@ -1,7 +1,8 @@
 """Every case under noise: make noise ARGS="[--seeds 20] [--seconds 60] [CASE ...]"
 
-The noise (`assembly/evaluated.py`) stands for the rounding of another processor, at 1e-15, 1e-14 and 1e-13 in
-turn. A case should reach the same end through the same instabilities, with numbers within their estimated errors.
+The noise (`assembly/evaluated.py`) stands for the rounding of another processor, at 1e-15, 1e-14
+and 1e-13 in turn. A case should reach the same end through the same instabilities, with numbers
+within their estimated errors.
 """
 
 import argparse
@@ -79,7 +80,9 @@ def u_ratio(a: ms.Record, b: ms.Record, scene: ms.Scene) -> float:
     """The same of the displacement at a point that was asked for."""
     length = scene.model.system.length
     moved = max_abs(scene.comm, a.point.state.u - b.point.state.u) / length
-    scale = max(1.0, MOTION * max_abs(scene.comm, a.point.state.u) / length)  # as points are accepted
+    scale = max(
+        1.0, MOTION * max_abs(scene.comm, a.point.state.u) / length
+    )  # as points are accepted
     tolerance = scene.newton.options.tolerance * scale
     return moved / (a.point.error + b.point.error + tolerance)
 
@@ -111,7 +114,15 @@ def row(file: Path, seeds: int, seconds: float, coarse: bool) -> str:
             pairs = zip(clean.instabilities, noisy.instabilities, strict=True)
             load = max([load, *(load_ratio(a, b) for a, b in pairs)])
         if len(clean.targets) == len(noisy.targets):
-            u = max([u, *(u_ratio(a, b, clean.scene) for a, b in zip(clean.targets, noisy.targets, strict=True))])
+            u = max(
+                [
+                    u,
+                    *(
+                        u_ratio(a, b, clean.scene)
+                        for a, b in zip(clean.targets, noisy.targets, strict=True)
+                    ),
+                ]
+            )
     return f"| {file.stem} | {done} | {ends} | {same} | {load:.2g} | {u:.2g} |"
 
 
@@ -119,12 +130,18 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--coarse", action="store_true", help="degree 3 and twice the element size, where there is one")
+    parser.add_argument(
+        "--coarse",
+        action="store_true",
+        help="degree 3 and twice the element size, where there is one",
+    )
     parser.add_argument("cases", nargs="*", type=Path)
     given = parser.parse_args()
     folder = Path(__file__).parents[1]
     every = [
-        file for pattern in ("*.yaml", "benchmarks/*.yaml", "extreme/*.yaml") for file in sorted(folder.glob(pattern))
+        file
+        for pattern in ("*.yaml", "benchmarks/*.yaml", "extreme/*.yaml")
+        for file in sorted(folder.glob(pattern))
     ]
     print(HEAD)
     for file in given.cases or every:

@@ -7,8 +7,9 @@
 # %% [markdown]
 # # A dimpled hemisphere buckles under pressure, in a field
 #
-# The field along the axis comes first, then the pressure, up to the fold. From the fold's null vector follows how
-# the knockdown factor depends on the field, on the depth of the dimple and on the remanence of each part.
+# The field along the axis comes first, then the pressure, up to the fold. From the fold's null
+# vector follows how the knockdown factor depends on the field, on the depth of the dimple and on
+# the remanence of each part.
 
 # %%
 from pathlib import Path
@@ -20,8 +21,8 @@ case = ms.Case.load(CASES / "dimple_buckling.yaml", ["magnetic.lambda_m=0.00184"
 scene = ms.Scene(case)
 print(", ".join(scene.problem.included))
 
-# %% [markdown]
-# Records come one by one; each holds the displacement and the amplitudes (`record.point.state.u`, `.mu`).
+# %% [markdown] Records come one by one; each holds the displacement and the amplitudes
+# (`record.point.state.u`, `.mu`).
 
 # %%
 records = []

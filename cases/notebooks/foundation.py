@@ -7,8 +7,9 @@
 # %% [markdown]
 # # One's own energy: a shell on an elastic foundation
 #
-# A Winkler foundation resists the normal displacement with the energy k/2 w^2 per undeformed area. Its stiffness k, in
-# E h/R^2, is an amplitude like the pressure: it can be followed, held, and the fold is derived by it.
+# A Winkler foundation resists the normal displacement with the energy k/2 w^2 per undeformed area.
+# Its stiffness k, in E h/R^2, is an amplitude like the pressure: it can be followed, held, and the
+# fold is derived by it.
 
 # %%
 from pathlib import Path
@@ -50,13 +51,15 @@ print(f"k_d = {fold.value:.9f}, d k_d / d k = {slope:.6f}")
 # The same slope from folds at other stiffnesses.
 
 # %%
-folds = {change: ms.fold_at(scene, buckling(K + change)[-1]).value for change in (-2 * STEP, -STEP, STEP, 2 * STEP)}
+folds = {
+    change: ms.fold_at(scene, buckling(K + change)[-1]).value
+    for change in (-2 * STEP, -STEP, STEP, 2 * STEP)
+}
 difference = (8 * (folds[STEP] - folds[-STEP]) - (folds[2 * STEP] - folds[-2 * STEP])) / (12 * STEP)
 print(f"by finite differences {difference:.6f}")
 
-# %% [markdown]
-# The stiffness itself as the control: the pressure is held below that fold while the foundation is taken away, and the
-# shell buckles where too little is left of it.
+# %% [markdown] The stiffness itself as the control: the pressure is held below that fold while the
+# foundation is taken away, and the shell buckles where too little is left of it.
 
 # %%
 P = 0.345

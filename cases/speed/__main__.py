@@ -22,7 +22,8 @@ OUT = Path("results") / "bench.json"
 
 
 def bench(items: Mapping[str, Item], file: Path) -> dict[str, Any]:
-    """Measure a set of benchmarks into a JSON file, which is written after each, and a table beside it; its content.
+    """Measure a set of benchmarks into a JSON file, which is written after each, and a table beside
+    it; its content.
 
     Raises
     ------
@@ -34,7 +35,10 @@ def bench(items: Mapping[str, Item], file: Path) -> dict[str, Any]:
         print(f"{name} ...", flush=True)
         numbers = measure_item(item)
         entry = {key: {"median": median(values), "all": values} for key, values in numbers.items()}
-        print("  " + ", ".join(f"{key} {median(values):.4g}" for key, values in numbers.items()), flush=True)
+        print(
+            "  " + ", ".join(f"{key} {median(values):.4g}" for key, values in numbers.items()),
+            flush=True,
+        )
         found["items"][name] = entry
         found["derived"] = derived(found["items"])
         write_whole(file, (json.dumps(found, indent=1) + "\n").encode())

@@ -39,11 +39,15 @@ def _run(item: Item, cache: str | None) -> dict[str, Any]:
     if item.kind == "run":
         settings = [word for setting in item.settings for word in ("--set", setting)]
         with TemporaryDirectory() as out:
-            used = _checked(measure("magshell_fenicsx", ["run", case, *settings, "--out", out], item.ranks))
+            used = _checked(
+                measure("magshell_fenicsx", ["run", case, *settings, "--out", out], item.ranks)
+            )
         return _process(used)
     arguments = [item.kind, case, json.dumps(item.settings), json.dumps(list(item.references))]
     used = _checked(measure("speed.workload", arguments, item.ranks, WITH_CAMPAIGNS | environment))
-    report = json.loads(next(line for line in used.output.splitlines() if line.startswith("{")))  # MPI may say more
+    report = json.loads(
+        next(line for line in used.output.splitlines() if line.startswith("{"))
+    )  # MPI may say more
     values, stopped = report.pop("values", {}), report.pop("stopped", None)
     if stopped or None in values.values():
         raise BenchFailed(f"stopped early: {stopped}")

@@ -30,7 +30,9 @@ TABLE = {  # column -> key, form
 
 
 def derived(items: Mapping[str, Any]) -> dict[str, float]:
-    """Ratios within one benchmark, which need no second machine: those that the items measured allow."""
+    """Ratios within one benchmark, which need no second machine: those that the items measured
+    allow.
+    """
 
     def of(name: str, *keys: str) -> float:
         return float(sum(items[name][key]["median"] for key in keys))
@@ -38,11 +40,13 @@ def derived(items: Mapping[str, Any]) -> dict[str, float]:
     found = {}
     if K_D_20_000 in items:
         work = of(K_D_20_000, "factor_wall_s", "back_solve_wall_s")
-        found["share of factorisation and back-solve in the solve phase at 20 000 unknowns"] = work / of(
-            K_D_20_000, "solve_phase_wall_s"
+        found["share of factorisation and back-solve in the solve phase at 20 000 unknowns"] = (
+            work / of(K_D_20_000, "solve_phase_wall_s")
         )
     if ONE_RANK in items and TWO_RANKS in items:
-        one, two = (of(name, *(f"{piece}_wall_s" for piece in PIECES)) for name in (ONE_RANK, TWO_RANKS))
+        one, two = (
+            of(name, *(f"{piece}_wall_s" for piece in PIECES)) for name in (ONE_RANK, TWO_RANKS)
+        )
         found["2 ranks against 1, iteration at 100 000 unknowns"] = one / two
     for small, large in pairwise(ITERATIONS):
         if small in items and large in items:
@@ -69,7 +73,9 @@ def compare(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
     if new["machine"] != old["machine"]:
         scale = median([ratio for (_, key), ratio in ratios.items() if key.endswith("_s")] or [1.0])
         lines += [f"new: {described(new['machine'])}", f"old: {described(old['machine'])}"]
-        lines.append(f"Not the same machine or versions: times are divided by their median ratio {scale:.3g}.")
+        lines.append(
+            f"Not the same machine or versions: times are divided by their median ratio {scale:.3g}."
+        )
     for (name, key), ratio in ratios.items():
         ratio /= scale if key.endswith("_s") else 1.0
         mark = "  more" if ratio > MARKED else "  less" if ratio < 1 / MARKED else ""
@@ -81,7 +87,10 @@ def table(found: Mapping[str, Any]) -> str:
     """The benchmark in Markdown, for people: medians, then what is derived."""
     lines = [["", *TABLE], ["---"] * (len(TABLE) + 1)]
     for name, numbers in found["items"].items():
-        values = [format(numbers[key]["median"], form) if key in numbers else "" for key, form in TABLE.values()]
+        values = [
+            format(numbers[key]["median"], form) if key in numbers else ""
+            for key, form in TABLE.values()
+        ]
         lines.append([name, *values])
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     ratios = "\n".join(f"- {name}: {value:.3g}" for name, value in found["derived"].items())

@@ -1,4 +1,5 @@
-"""Time and memory of a Newton iteration against unknowns, on several numbers of ranks; see docs/scale.md.
+"""Time and memory of a Newton iteration against unknowns, on several numbers of ranks; see
+docs/scale.md.
 
 `python3 -m speed.scale [--refinement R]... [--ranks N]... [--degree K] [--repeats N]`
 """
@@ -15,7 +16,11 @@ from magshell_fenicsx.platform.environment import described, fingerprint
 from magshell_fenicsx.platform.processes import measure
 
 PIECES = ("tangent", "factor", "back_solves", "residual")
-DEFAULT = (1.0, 2.0, 4.0)  # 1.1e4, 3.0e4 and 9.7e4 unknowns at degree 4; 7.5 and 14 make 3e5 and 1e6
+DEFAULT = (
+    1.0,
+    2.0,
+    4.0,
+)  # 1.1e4, 3.0e4 and 9.7e4 unknowns at degree 4; 7.5 and 14 make 3e5 and 1e6
 Row = Mapping[str, float]
 
 
@@ -34,8 +39,12 @@ def row(refinement: float, degree: int, ranks: int, repeats: int) -> Row:
     arguments = ["scale", str(repeats), str(degree), str(refinement)]
     used = measure("speed.workload", arguments, ranks, WITH_CAMPAIGNS)
     if used.code:
-        raise ScaleFailed(f"refinement {refinement:g} on {ranks} ranks: exit code {used.code}: {used.errors.strip()}")
-    found = json.loads(next(line for line in used.output.splitlines() if line.startswith("{")))  # MPI may say more
+        raise ScaleFailed(
+            f"refinement {refinement:g} on {ranks} ranks: exit code {used.code}: {used.errors.strip()}"
+        )
+    found = json.loads(
+        next(line for line in used.output.splitlines() if line.startswith("{"))
+    )  # MPI may say more
     return {**found, "ranks": ranks, "peak_mb": used.peak_mb or float("nan")}
 
 
@@ -52,24 +61,45 @@ def exponent(rows: Sequence[Row], kind: str) -> float:
 
 def table(rows: Iterable[Row]) -> list[str]:
     """Markdown: CPU seconds of all ranks, wall seconds and peak memory."""
-    names = ["unknowns", "ranks", *(p.replace("_", "-") for p in PIECES), "iteration, CPU s", "wall s", "peak GB"]
+    names = [
+        "unknowns",
+        "ranks",
+        *(p.replace("_", "-") for p in PIECES),
+        "iteration, CPU s",
+        "wall s",
+        "peak GB",
+    ]
     lines = ["| " + " | ".join(names) + " |", "| " + " | ".join("---" for _ in names) + " |"]
     for r in rows:
         times = [f"{r[f'{piece}_cpu_s']:.3g}" for piece in PIECES]
         sums = [f"{iteration(r, kind):.3g}" for kind in ("cpu", "wall")]
-        cells = [f"{r['dofs']:.0f}", f"{r['ranks']:.0f}", *times, *sums, f"{r['peak_mb'] / 1024:.2f}"]
+        cells = [
+            f"{r['dofs']:.0f}",
+            f"{r['ranks']:.0f}",
+            *times,
+            *sums,
+            f"{r['peak_mb'] / 1024:.2f}",
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
 def main(words: Sequence[str]) -> None:
-    parser = argparse.ArgumentParser(prog="speed.scale", description="time and memory against unknowns")
+    parser = argparse.ArgumentParser(
+        prog="speed.scale", description="time and memory against unknowns"
+    )
     parser.add_argument(
-        "--refinement", type=float, nargs="+", default=DEFAULT, help="of the mesh; 14 makes 1e6 unknowns"
+        "--refinement",
+        type=float,
+        nargs="+",
+        default=DEFAULT,
+        help="of the mesh; 14 makes 1e6 unknowns",
     )
     parser.add_argument("--ranks", type=int, nargs="+", default=(1, 2))
     parser.add_argument("--degree", type=int, choices=(2, 3, 4, 5), default=4)
-    parser.add_argument("--repeats", type=int, default=3, help="iterations, of which the medians are told")
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="iterations, of which the medians are told"
+    )
     given = parser.parse_args(words)
     rows = []
     try:

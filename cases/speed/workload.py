@@ -1,8 +1,8 @@
 """Parts of a run and of a Newton iteration, timed in a separate process without writing files.
 
-`[mpirun -n N] python3 -m speed.workload KIND CASE SETTINGS RESULTS`, the last two JSON lists, prints one line of JSON;
-`python3 -m speed.workload scale REPEATS DEGREE REFINEMENT` that of the parts of an iteration. Times are wall seconds of
-the slowest rank and CPU seconds of all ranks.
+`[mpirun -n N] python3 -m speed.workload KIND CASE SETTINGS RESULTS`, the last two JSON lists,
+prints one line of JSON; `python3 -m speed.workload scale REPEATS DEGREE REFINEMENT` that of the
+parts of an iteration. Times are wall seconds of the slowest rank and CPU seconds of all ranks.
 """
 
 import json
@@ -59,7 +59,11 @@ def measured(scene: Scene, repeats: int) -> dict[str, float]:
         "back_solves": lambda: (factorisation.solve(rhs), factorisation.solve(rhs)),
         "residual": lambda: system.residual(u, MU),
     }
-    found = {"first_wall_s": first[0], "first_cpu_s": first[1], "negative_pivots": factorisation.negative_pivots}
+    found = {
+        "first_wall_s": first[0],
+        "first_cpu_s": first[1],
+        "negative_pivots": factorisation.negative_pivots,
+    }
     runs = [{name: timed(comm, do) for name, do in pieces.items()} for _ in range(repeats)]
     for name in pieces:
         for place, kind in enumerate(("wall", "cpu")):
@@ -90,7 +94,11 @@ def path(scene: Scene, results: list[str]) -> Report:
             result.stopped = str(e)
 
     wall, cpu = timed(comm, solve)
-    found = {"knockdown": result.knockdown, "limit_points": result.limit_points, "snaps": snaps(result.rows)}
+    found = {
+        "knockdown": result.knockdown,
+        "limit_points": result.limit_points,
+        "snaps": snaps(result.rows),
+    }
     rows = [{key: str(value) for key, value in row.items()} for row in result.rows]
     newton = scene.newton
     return {
@@ -117,7 +125,11 @@ def kernels(scene: Scene, results: list[str]) -> Report:
     return {"kernels": len(scene.model.kernels.names)}
 
 
-KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iteration": iteration, "kernels": kernels}
+KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {
+    "path": path,
+    "iteration": iteration,
+    "kernels": kernels,
+}
 
 
 def scale(repeats: str, degree: str, refinement: str) -> tuple[Scene, Report]:

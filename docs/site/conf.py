@@ -9,7 +9,9 @@ html_title = "magshell_fenicsx"
 html_show_copyright = False
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
 exclude_patterns = ["site"]
-nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}  # cases/notebooks, which docs/notebooks is
+nb_custom_formats = {
+    ".py": ["jupytext.reads", {"fmt": "py:percent"}]
+}  # cases/notebooks, which docs/notebooks is
 nb_execution_mode = "force"
 nb_execution_timeout = 300  # s for a cell
 nb_execution_raise_on_error = True
@@ -21,7 +23,11 @@ autodoc_typehints = "description"
 napoleon_use_ivar = True
 
 # pages outside docs/ that the site contains too
-OUTSIDE = {"README.md": "readme.md", "CONTRIBUTING.md": "contributing.md", "meshes/README.md": "meshes.md"}
+OUTSIDE = {
+    "README.md": "readme.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "meshes/README.md": "meshes.md",
+}
 
 
 def _as_myst(app, name, source):
@@ -43,7 +49,10 @@ def _included(app, relative, parent, content):
 
 def _escaped(app, what, name, obj, options, lines):
     """A bar is a magnitude in our docstrings, a star a product or a list of arguments."""
-    lines[:] = [line if ">>>" in line else re.sub(r"([|*])(?=\w)|(?<=\w)\|", r"\\\g<0>", line) for line in lines]
+    lines[:] = [
+        line if ">>>" in line else re.sub(r"([|*])(?=\w)|(?<=\w)\|", r"\\\g<0>", line)
+        for line in lines
+    ]
 
 
 def setup(app):

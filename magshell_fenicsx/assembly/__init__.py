@@ -1,1 +1,4 @@
-"""Energies as vectors and matrices: point kernels, batches of cells, sparsity, scatter. Knows no shells."""
+"""Energies as vectors and matrices: point kernels, batches of cells, sparsity, scatter.
+
+Knows no shells.
+"""

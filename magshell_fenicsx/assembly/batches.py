@@ -1,4 +1,5 @@
-"""Cells and edges in batches that share their reference tables, and the matrices of cells and of pairs of cells.
+"""Cells and edges in batches that share their reference tables, and the matrices of cells and of
+pairs of cells.
 
 The matrices are made of Hessians at points, and multiply vectors.
 """
@@ -61,7 +62,9 @@ class Batch:
         return len(self.cells[0]) * len(self.rule.weights)
 
 
-Chosen: TypeAlias = NDArray[np.bool_] | None  # local cells that count, None for all; an edge counts with one of them
+Chosen: TypeAlias = (
+    NDArray[np.bool_] | None
+)  # local cells that count, None for all; an edge counts with one of them
 
 
 def cell_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
@@ -76,7 +79,9 @@ def cell_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> li
 def interior_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
     """Batches of the owned interior edges."""
     cells, edges, backwards = interior_edges(V)
-    return list(_edge_batches(V, degree, *_counted(cells, np.column_stack([edges, backwards]), chosen)))
+    return list(
+        _edge_batches(V, degree, *_counted(cells, np.column_stack([edges, backwards]), chosen))
+    )
 
 
 def boundary_batches(
@@ -93,19 +98,27 @@ def _counted(
     return cells[which], kinds[which]
 
 
-def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells' orientations differ."""
+def interior_edges(
+    V: fem.FunctionSpace,
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells'
+    orientations differ.
+    """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
-    facets = np.flatnonzero(np.diff(links.offsets[: topology.index_map(1).size_local + 1]) == 2).astype(np.int32)
+    facets = np.flatnonzero(
+        np.diff(links.offsets[: topology.index_map(1).size_local + 1]) == 2
+    ).astype(np.int32)
     cells = links.array[links.offsets[facets][:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
     starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
     return cells, edges, starts[0] != starts[1]
 
 
-def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def boundary_edges(
+    V: fem.FunctionSpace, facets: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The owned ones of some boundary edges: cells (n, 1), number in the cell (n, 1)."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
@@ -118,11 +131,16 @@ def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDA
 def _edge_batches(
     V: fem.FunctionSpace, degree: int, cells: NDArray[np.int32], kinds: NDArray[np.int32]
 ) -> Iterator[Batch]:
-    """Group edges by their number in the cell of each side and, with two sides, by relative orientation."""
+    """Group edges by their number in the cell of each side and, with two sides, by relative
+    orientation.
+    """
     sides = cells.shape[1]
     for kind in np.unique(kinds, axis=0):
         backwards = (False, bool(kind[-1]))[:sides]
-        rules = [edge_rule(degree, int(edge), back) for edge, back in zip(kind[:sides], backwards, strict=True)]
+        rules = [
+            edge_rule(degree, int(edge), back)
+            for edge, back in zip(kind[:sides], backwards, strict=True)
+        ]
         X, w = tuple(points for points, _ in rules), rules[0][1]
         rule = Rule(X, tuple(Table.tabulate(V.element.basix_element, x) for x in X), w)
         covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
@@ -138,14 +156,18 @@ def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]
     return [entities[i : i + size] for i in range(0, len(entities), size)]
 
 
-def _local_edges(V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]) -> NDArray[np.int32]:
+def _local_edges(
+    V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]
+) -> NDArray[np.int32]:
     """Number of each facet in its cell."""
     V.mesh.topology.create_connectivity(2, 1)
     edges = V.mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells]
     return np.asarray(np.argmax(edges == facets[:, None], axis=1), dtype=np.int32)
 
 
-def _corner(V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]) -> NDArray[np.int32]:
+def _corner(
+    V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]
+) -> NDArray[np.int32]:
     """The vertex at which an edge starts in a cell."""
     first = np.array(EDGES)[:, 0][edges]
     return np.asarray(compat.corner_numbers(V.mesh)[cells, first])
@@ -154,9 +176,13 @@ def _corner(V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.in
 def edge_width(
     V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Flat area of the cells, averaged over the sides, over the flat length of their edge (its number on side 0)."""
+    """Flat area of the cells, averaged over the sides, over the flat length of their edge (its
+    number on side 0).
+    """
     corners = [V.mesh.geometry.x[compat.corner_numbers(V.mesh)[side]] for side in cells]
-    areas = [np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners]
+    areas = [
+        np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners
+    ]
     start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
     return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))
 
@@ -164,8 +190,8 @@ def edge_width(
 class Contraction:
     """K[ac, bd] = sum over points and parts of w D_i[a] D_j[b] H[ic, jd].
 
-    The products of the shape functions' derivatives are the same for all entities of a rule. For a symmetric (skew)
-    block they are symmetric (skew) in a, b, so only a <= b is computed.
+    The products of the shape functions' derivatives are the same for all entities of a rule. For a
+    symmetric (skew) block they are symmetric (skew) in a, b, so only a <= b is computed.
     """
 
     def __init__(self, rule: Rule, pairs: Pairs) -> None:
@@ -190,7 +216,9 @@ class Contraction:
 
 
 class Blocks:
-    """Hessians at the points of a batch, sorted for the contraction: (entities, components, points, pairs)."""
+    """Hessians at the points of a batch, sorted for the contraction: (entities, components, points,
+    pairs).
+    """
 
     def __init__(self, batch: Batch, pairs: Pairs) -> None:
         entities, points = len(batch.cells[0]), len(batch.rule.weights)
@@ -220,7 +248,9 @@ class Blocks:
 
 def _product(H: Array, products: Array) -> Array:
     entities, components = H.shape[:2]
-    return np.asarray(H.reshape(entities * components, -1) @ products).reshape(entities, components, -1)
+    return np.asarray(H.reshape(entities * components, -1) @ products).reshape(
+        entities, components, -1
+    )
 
 
 def _places(all_pairs: tuple[Pair, ...], some: tuple[Pair, ...]) -> slice | list[int]:
@@ -235,7 +265,9 @@ Ints = NDArray[np.int32]
 
 
 def add_own(y: Array, K: Array, nodes: Ints, x: Array) -> None:
-    """Add the matrices (cells, 9, pairs a <= b) of cells times x (nodes, 3) to y; see `BlockMatrix.add_cells`."""
+    """Add the matrices (cells, 9, pairs a <= b) of cells times x (nodes, 3) to y; see
+    `BlockMatrix.add_cells`.
+    """
     a, b = np.triu_indices(nodes.shape[1])
     blocks = np.empty((len(K), len(a), 3, 3))
     for number, (c, d) in enumerate(COMPONENTS):
@@ -245,11 +277,17 @@ def add_own(y: Array, K: Array, nodes: Ints, x: Array) -> None:
         blocks[:, :, d, c] -= K[:, number]
     np.add.at(y, nodes[:, a], np.einsum("epcd,epd->epc", blocks, x[nodes[:, b]]))
     beside = a < b
-    np.add.at(y, nodes[:, b[beside]], np.einsum("epdc,epd->epc", blocks[:, beside], x[nodes[:, a[beside]]]))
+    np.add.at(
+        y,
+        nodes[:, b[beside]],
+        np.einsum("epdc,epd->epc", blocks[:, beside], x[nodes[:, a[beside]]]),
+    )
 
 
 def add_coupled(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
-    """Add the blocks (pairs of cells, 9, functions^2) and their transposes; see `BlockMatrix.add_coupling`."""
+    """Add the blocks (pairs of cells, 9, functions^2) and their transposes; see
+    `BlockMatrix.add_coupling`.
+    """
     n = rows.shape[1]
     blocks = K.reshape(len(K), 3, 3, n, n)
     np.add.at(y, rows, np.einsum("ecdab,ebd->eac", blocks, x[columns]))

@@ -1,4 +1,6 @@
-"""A mesh as a whole, whatever its ranks: its pieces that are not connected, and its cells on every rank."""
+"""A mesh as a whole, whatever its ranks: its pieces that are not connected, and its cells on every
+rank.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -30,14 +32,22 @@ class CellsOfAll:
     @classmethod
     def of(cls, V: fem.FunctionSpace) -> "CellsOfAll":
         """Of a space; collective."""
-        comm, index, count = V.mesh.comm, V.dofmap.index_map, V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+        comm, index, count = (
+            V.mesh.comm,
+            V.dofmap.index_map,
+            V.mesh.topology.index_map(V.mesh.topology.dim).size_local,
+        )
         local = V.dofmap.list[:count]
         nodes = index.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         first = sum(comm.allgather(count)[: comm.rank])
-        return cls(np.concatenate(comm.allgather(nodes)).astype(np.intp), range(first, first + count), comm)
+        return cls(
+            np.concatenate(comm.allgather(nodes)).astype(np.intp), range(first, first + count), comm
+        )
 
     def gathered(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values of this rank's cells (those of ghosts after them are left out) -> of all; collective."""
+        """Values of this rank's cells (those of ghosts after them are left out) -> of all;
+        collective.
+        """
         return over_ranks(self.comm, values[: len(self.own)])
 
 
@@ -50,11 +60,16 @@ def whole(f: fem.Function) -> NDArray[np.float64]:
     """The values (nodes, components) of all ranks, by global numbers; collective."""
     V = f.function_space
     size = V.dofmap.bs
-    return over_ranks(V.mesh.comm, f.x.array[: size * V.dofmap.index_map.size_local].reshape(-1, size))
+    return over_ranks(
+        V.mesh.comm, f.x.array[: size * V.dofmap.index_map.size_local].reshape(-1, size)
+    )
 
 
-def add_own(b: NDArray[np.float64], forces: NDArray[np.float64], own: tuple[int, int], comm: MPI.Comm) -> None:
-    """Add the forces (nodes, 3) that ranks have on any nodes to the local vectors of their owners; collective.
+def add_own(
+    b: NDArray[np.float64], forces: NDArray[np.float64], own: tuple[int, int], comm: MPI.Comm
+) -> None:
+    """Add the forces (nodes, 3) that ranks have on any nodes to the local vectors of their owners;
+    collective.
 
     Parameters
     ----------
@@ -67,7 +82,9 @@ def add_own(b: NDArray[np.float64], forces: NDArray[np.float64], own: tuple[int,
 
 
 def pieces(V: fem.FunctionSpace) -> NDArray[np.int32]:
-    """The number of the piece of each local node, ghosts included, the same on all ranks; collective."""
+    """The number of the piece of each local node, ghosts included, the same on all ranks;
+    collective.
+    """
     comm, index, cells = V.mesh.comm, V.dofmap.index_map, V.dofmap.list
     count, mine = _components(
         np.repeat(cells[:, 0], cells.shape[1]), cells.ravel(), index.size_local + index.num_ghosts
@@ -77,12 +94,17 @@ def pieces(V: fem.FunctionSpace) -> NDArray[np.int32]:
     owners = fem.Function(V)
     owners.x.array.reshape(-1, V.dofmap.bs)[:] = code[:, None]
     owners.x.scatter_forward()
-    same = np.unique(np.column_stack([code, owners.x.array.reshape(-1, V.dofmap.bs)[:, 0].astype(np.int64)]), axis=0)
+    same = np.unique(
+        np.column_stack([code, owners.x.array.reshape(-1, V.dofmap.bs)[:, 0].astype(np.int64)]),
+        axis=0,
+    )
     joined = np.concatenate(comm.allgather(same))
     return np.asarray(_components(joined[:, 0], joined[:, 1], sum(counts))[1][code], dtype=np.int32)
 
 
-def _components(one: NDArray[np.int64], other: NDArray[np.int64], count: int) -> tuple[int, NDArray[np.int32]]:
+def _components(
+    one: NDArray[np.int64], other: NDArray[np.int64], count: int
+) -> tuple[int, NDArray[np.int32]]:
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), (count, count))
     number, labels = connected_components(graph, directed=False)
     return int(number), labels

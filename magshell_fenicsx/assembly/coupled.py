@@ -1,8 +1,10 @@
-"""Terms whose tangent has entries outside the pattern of the others: between some unknowns, or between all of them.
+"""Terms whose tangent has entries outside the pattern of the others: between some unknowns, or
+between all of them.
 
-The couplings of contact change from state to state: the sum with the sparse matrix has a pattern of its own, which has
-room for what couples soon. It is kept, and with it what the factorisation knows of it, until an entry is outside. Where
-all unknowns act on each other, the rest stands beside it (`assembly.whole.WholeMatrix`).
+The couplings of contact change from state to state: the sum with the sparse matrix has a pattern of
+its own, which has room for what couples soon. It is kept, and with it what the factorisation knows
+of it, until an entry is outside. Where all unknowns act on each other, the rest stands beside it
+(`assembly.whole.WholeMatrix`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,19 +48,24 @@ class KnowsFields(Protocol):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """A field, and the derivatives of energy Pi + force v . dPi/du by its values in own cells. Collective.
+        """A field, and the derivatives of energy Pi + force v . dPi/du by its values in own cells.
+        Collective.
 
         None if the term has no field of that name.
         """
 
 
-def couplings(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> list[Couplings]:
+def couplings(
+    V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
+) -> list[Couplings]:
     """What the terms among these add that are `Coupled`; `clamped` are homogeneous conditions."""
     coupled = [t for t in terms if isinstance(t, Coupled)]
     return [ChangingEntries(V, coupled, clamped)] if coupled else []
 
 
-def of_all(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]) -> "OfAll | None":
+def of_all(
+    V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
+) -> "OfAll | None":
     """What the terms among these add that are a `WholeTerm`; None if there are none."""
     whole_terms = [t for t in terms if isinstance(t, WholeTerm)]
     return OfAll(WholeMatrix(V, clamped), whole_terms) if whole_terms else None
@@ -66,7 +73,9 @@ def of_all(V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.Di
 
 @dataclass(frozen=True)
 class OfAll:
-    """Those of terms in which all unknowns act on each other: what stands beside the sparse tangent."""
+    """Those of terms in which all unknowns act on each other: what stands beside the sparse
+    tangent.
+    """
 
     matrix: WholeMatrix
     terms: Sequence[WholeTerm]
@@ -91,12 +100,17 @@ class Coupled(Protocol):
     name: str
 
     def entries(self) -> Entries:
-        """This rank's part of d2Pi/du2, in any order; entries at the same place are added up. Collective."""
+        """This rank's part of d2Pi/du2, in any order; entries at the same place are added up.
+
+        Collective.
+        """
 
     def around(self) -> tuple[Longs, Longs]:
-        """Pairs of global nodes, in any order, between which this rank may have entries. Collective.
+        """Pairs of global nodes, in any order, between which this rank may have entries.
+        Collective.
 
-        It is a function of `since`, and of nothing that was evaluated before: a resumed run has the same pattern.
+        It is a function of `since`, and of nothing that was evaluated before: a resumed run has the
+        same pattern.
         """
 
     @property
@@ -107,7 +121,9 @@ class Coupled(Protocol):
 class ChangingEntries:
     """The entries of coupled terms, which change from state to state."""
 
-    def __init__(self, V: fem.FunctionSpace, terms: Sequence[Coupled], clamped: Sequence[fem.DirichletBC]) -> None:
+    def __init__(
+        self, V: fem.FunctionSpace, terms: Sequence[Coupled], clamped: Sequence[fem.DirichletBC]
+    ) -> None:
         self._terms, self._comm = terms, V.mesh.comm
         sizes = self._comm.allgather(V.dofmap.index_map.size_local)
         self._size = V.dofmap.index_map_bs
@@ -155,14 +171,17 @@ class ChangingEntries:
         rows, columns = (np.concatenate(each) for each in zip(*parts, strict=True))
         count = len(self._fixed) // self._size
         rows, columns = np.divmod(np.unique(rows * count + columns), count)
-        i, j = (self._size * each[:, None, None] + np.arange(self._size) for each in (rows, columns))
+        i, j = (
+            self._size * each[:, None, None] + np.arange(self._size) for each in (rows, columns)
+        )
         i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
         ones = np.ones(i.size, dtype=np.int8)
         return _ones(_owned(self._comm, self._ranges, self._fixed, (i.ravel(), j.ravel(), ones)))
 
 
 class _Sum:
-    """A sparse matrix plus changing entries, in a pattern that is kept; the constructor is collective.
+    """A sparse matrix plus changing entries, in a pattern that is kept; the constructor is
+    collective.
 
     Parameters
     ----------
@@ -177,7 +196,10 @@ class _Sum:
     def __init__(self, of: PETSc.Mat, room: csr_array, first: int) -> None:
         self.of, self.room = of, room
         starts, columns, _ = of.getValuesCSR()
-        both = csr_array((np.ones(len(columns), dtype=np.int8), columns, starts), room.shape) + 2 * room
+        both = (
+            csr_array((np.ones(len(columns), dtype=np.int8), columns, starts), room.shape)
+            + 2 * room
+        )
         self._of, self._at_room = (np.flatnonzero(both.data & bit) for bit in (1, 2))
         self._keys = _keys(room)
         own = (both.indices >= first) & (both.indices < first + room.shape[0])
@@ -213,7 +235,10 @@ class _Sum:
 
 
 def with_entries(K: PETSc.Mat, entries: Entries, fixed: NDArray[np.bool_]) -> PETSc.Mat:
-    """A new matrix with entries too, without those of `fixed` unknowns; K itself if there are none. Collective."""
+    """A new matrix with entries too, without those of `fixed` unknowns; K itself if there are none.
+
+    Collective.
+    """
     ranges = np.asarray(K.getOwnershipRanges())
     added = _owned(K.comm.tompi4py(), ranges, fixed, entries)
     if not K.comm.tompi4py().allreduce(added.nnz):
@@ -221,8 +246,13 @@ def with_entries(K: PETSc.Mat, entries: Entries, fixed: NDArray[np.bool_]) -> PE
     return _Sum(K, _ones(added), int(ranges[K.comm.rank])).filled(added)
 
 
-def _owned(comm: MPI.Comm, ranges: Longs, fixed: NDArray[np.bool_], entries: tuple[Longs, Longs, Any]) -> csr_array:
-    """The rows of own unknowns of entries that ranks have, summed, without those of fixed unknowns. Collective."""
+def _owned(
+    comm: MPI.Comm, ranges: Longs, fixed: NDArray[np.bool_], entries: tuple[Longs, Longs, Any]
+) -> csr_array:
+    """The rows of own unknowns of entries that ranks have, summed, without those of fixed unknowns.
+
+    Collective.
+    """
     rows, columns, values = entries
     kept = ~(fixed[rows] | fixed[columns])
     own = rows[kept], columns[kept], values[kept]
@@ -250,7 +280,9 @@ def pairs_of(nodes: Longs) -> tuple[Longs, Longs]:
 
 def _ones(matrix: csr_array) -> csr_array:
     """Its pattern."""
-    return csr_array((np.ones(matrix.nnz, dtype=np.int8), matrix.indices, matrix.indptr), matrix.shape)
+    return csr_array(
+        (np.ones(matrix.nnz, dtype=np.int8), matrix.indices, matrix.indptr), matrix.shape
+    )
 
 
 def _keys(matrix: csr_array) -> Longs:

@@ -1,8 +1,8 @@
 """A state of a system, evaluated: its energies, forces and tangent; for tests, with noise.
 
-MAGSHELL_NOISE="1e-14 3" adds noise of relative size 1e-14 with the seed 3 to residual and tangent, which imitates the
-rounding of another processor. Each evaluation draws new numbers. The noise of a matrix is symmetric. No noise depends
-on the distribution of unknowns over ranks.
+MAGSHELL_NOISE="1e-14 3" adds noise of relative size 1e-14 with the seed 3 to residual and tangent,
+which imitates the rounding of another processor. Each evaluation draws new numbers. The noise of a
+matrix is symmetric. No noise depends on the distribution of unknowns over ranks.
 """
 
 import os
@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 
 ASIDE = 1e-3  # the largest displacement of a difference, over h
-CENTRAL = {1.0: 2 / 3, -1.0: -2 / 3, 2.0: -1 / 12, -2.0: 1 / 12}  # multiple of a step -> weight over it of a slope
+CENTRAL = {
+    1.0: 2 / 3,
+    -1.0: -2 / 3,
+    2.0: -1 / 12,
+    -2.0: 1 / 12,
+}  # multiple of a step -> weight over it of a slope
 
 Given = TypeVar("Given")
 VARIABLE = "MAGSHELL_NOISE"
@@ -33,21 +38,25 @@ Array = NDArray[np.float64]
 class Evaluated:
     """A state of a system: its energies, forces and tangent.
 
-    What is asked of it is a function of the state alone, whatever was evaluated before, and changes nothing that
-    another evaluation sees. What terms find from displacement and amplitudes is shared by all that is asked of a state;
-    see `following.Follows`.
+    What is asked of it is a function of the state alone, whatever was evaluated before, and changes
+    nothing that another evaluation sees. What terms find from displacement and amplitudes is shared
+    by all that is asked of a state; see `following.Follows`.
     """
 
     def __init__(self, system: "FiniteElementSystem", u: Vector, mu: Amplitudes) -> None:
         self._system, self._u, self._mu = system, u, mu
 
     def of(self, function: Callable[[], Given]) -> Given:
-        """What a function of the system's u, and of the placement and the numbers in forms, gives at the state."""
+        """What a function of the system's u, and of the placement and the numbers in forms, gives
+        at the state.
+        """
         self._system._put(self._u, self._mu)
         return function()
 
     def assembled(self, function: Callable[[], Given]) -> Given:
-        """The same of a function that assembles compiled forms, which take the terms' fields as they are."""
+        """The same of a function that assembles compiled forms, which take the terms' fields as
+        they are.
+        """
         system = self._present
         for term in system.terms:
             if isinstance(term, FormTerm):
@@ -66,7 +75,9 @@ class Evaluated:
         """The energy without the potentials of loads."""
         system, mu = self._present, self._mu
         own = (t for t in system.terms if t.amplitude is None or t.amplitude in system.coordinates)
-        return float(system.comm.allreduce(sum(factor_of(t.amplitude, mu) * t.energy() for t in own)))
+        return float(
+            system.comm.allreduce(sum(factor_of(t.amplitude, mu) * t.energy() for t in own))
+        )
 
     def integral(self, form: fem.Form) -> float:
         """The value of a compiled form, summed over all ranks."""
@@ -88,7 +99,8 @@ class Evaluated:
         return self._system._summed(part)
 
     def residual(self, *, rough: bool = False) -> Vector:
-        """dPi/du, and u itself along directions in which nodes on oblique planes are held; `rough` as in `Roughly`.
+        """dPi/du, and u itself along directions in which nodes on oblique planes are held; `rough`
+        as in `Roughly`.
 
         The terms that are not numbers are noted in the system's `strange`.
         """
@@ -100,13 +112,20 @@ class Evaluated:
                 system.strange = self._not_numbers(factors)
         else:
             V = system.u.function_space.dofmap
-            parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
-            noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]
+            parts = [
+                system._summed(system._gradient({name: factor})) for name, factor in factors.items()
+            ]
+            noisy = [
+                system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs)
+                for part in parts
+            ]
             whole = np.asarray(np.sum(noisy, axis=0))
         return whole if system.projection is None else whole + system.projection.outside(self._u)
 
     def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
-        """The terms whose energy or gradient is not a number, with why if they say so (`no_number`); collective."""
+        """The terms whose energy or gradient is not a number, with why if they say so
+        (`no_number`); collective.
+        """
         system = self._system
         used = [t for t in system.terms if factors[t.name]]
         sizes = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
@@ -115,7 +134,9 @@ class Evaluated:
         return strange or ["the sum of all terms"]
 
     def forces(self, name: str = "") -> Vector:
-        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
+        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on
+        the shell.
+        """
         system, mu = self._present, self._mu
         part = system._gradient({name: 1.0} if name else system._factors(mu))
         if system.moving and system._pressed and not name:
@@ -130,7 +151,11 @@ class Evaluated:
             system._put(self._u, self._mu)
             system.u.x.array[: system.size] += way * step * v
             system.u.x.scatter_forward()
-            along += weight / step * system._summed(system._gradient(system._factors(self._mu)), held=False)
+            along += (
+                weight
+                / step
+                * system._summed(system._gradient(system._factors(self._mu)), held=False)
+            )
         return along
 
     def load(self, name: str, *, held: bool = True) -> Vector:
@@ -147,7 +172,9 @@ class Evaluated:
         if system.moving and name in system.moving.names:
             own = float(system._gradient(system._factors(mu)) @ system.moving.rate(mu, name))
             for edge, A in system.moving.turning(mu, name):
-                own += float(system._gradient({edge: 1.0}) @ system.moving.along(A, system.u.x.array))
+                own += float(
+                    system._gradient({edge: 1.0}) @ system.moving.along(A, system.u.x.array)
+                )
         else:
             slopes = system.parameters[name].slopes if name in system.parameters else ()
             own = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
@@ -159,7 +186,9 @@ class Evaluated:
         system, mu = self._present, self._mu
         moving = system.moving
         if moving and {name, other} & moving.names:
-            own = system._motion_curvature(moving, mu, *sorted((name, other), key=moving.names.__contains__))
+            own = system._motion_curvature(
+                moving, mu, *sorted((name, other), key=moving.names.__contains__)
+            )
             return float(system.comm.allreduce(own)) + system._of_lids(mu, name, other)
         if name not in system.parameters:
             name, other = other, name
@@ -173,7 +202,11 @@ class Evaluated:
         return float(system.comm.allreduce(own))
 
     def tangent(
-        self, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None, *, rough: bool = False
+        self,
+        stress: Sequence[Weighted] = (),
+        times: Mapping[str, float] | None = None,
+        *,
+        rough: bool = False,
     ) -> PETSc.Mat | Beside | Skewed:
         """d2Pi/du2, see `FiniteElementSystem.tangent`."""
         system = self._system
@@ -208,7 +241,9 @@ class Noise:
 
     def on_vector(self, b: Array, first: int) -> Array:
         """A vector whose entries on this rank begin with the number `first`, with noise."""
-        return b * self._factors(first + np.arange(len(b), dtype=np.uint64), np.zeros(1, dtype=np.uint64))
+        return b * self._factors(
+            first + np.arange(len(b), dtype=np.uint64), np.zeros(1, dtype=np.uint64)
+        )
 
     def on_matrix(self, K: PETSc.Mat) -> None:
         """Put noise on an assembled matrix."""

@@ -1,8 +1,8 @@
 """What follows from other values: it is found anew where these have changed, and nowhere else.
 
-A system computes at one state after another. What it keeps from state to state is kept here, by the values that it was
-found from, so that nobody needs to say what has become old: a displacement, a placement, a field or a number is simply
-changed.
+A system computes at one state after another. What it keeps from state to state is kept here, by the
+values that it was found from, so that nobody needs to say what has become old: a displacement, a
+placement, a field or a number is simply changed.
 """
 
 from collections.abc import Callable
@@ -49,11 +49,14 @@ class Follows(Generic[Found]):
 
     def _is_of(self, values: tuple[Any, ...]) -> bool:
         seen = self._seen
-        return seen is not None and len(seen) == len(values) and all(map(np.array_equal, values, seen))
+        return (
+            seen is not None and len(seen) == len(values) and all(map(np.array_equal, values, seen))
+        )
 
 
 class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
-    """Vectors at the quadrature points of cells: a coefficient of forms with the quadrature of that degree.
+    """Vectors at the quadrature points of cells: a coefficient of forms with the quadrature of that
+    degree.
 
     It is a parameter of densities at the same points, too.
 
@@ -67,7 +70,9 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
 
     def __init__(self, domain: mesh.Mesh, degree: int, size: int) -> None:
         cell = domain.basix_cell()
-        super().__init__(fem.functionspace(domain, basix.ufl.quadrature_element(cell, (size,), degree=degree)))
+        super().__init__(
+            fem.functionspace(domain, basix.ufl.quadrature_element(cell, (size,), degree=degree))
+        )
         self.points = basix.make_quadrature(cell, degree)[0]
         self._dofs = self.function_space.dofmap.list
         self.values = np.zeros((len(self._dofs), len(self.points), size))
@@ -97,7 +102,9 @@ def values_of(field: fem.Function) -> Array | int:
 
 
 def at_quadrature(field: fem.Function, points: Array) -> Array:
-    """(cells, points, components) of a field at points of the reference cell; (.., 3) of a meridian's plane vectors."""
+    """(cells, points, components) of a field at points of the reference cell; (.., 3) of a
+    meridian's plane vectors.
+    """
     size, V = field.function_space.dofmap.bs, field.function_space
     shape = V.element.basix_element.tabulate(0, points)[0, :, :, 0]
     values = np.asarray(shape @ field.x.array.reshape(-1, size)[V.dofmap.list])

@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Share:
-    """What a term gives to a gradient: `energy` times Pi_f plus `work` times the derivative of Pi_u[w] by f."""
+    """What a term gives to a gradient: `energy` times Pi_f plus `work` times the derivative of
+    Pi_u[w] by f.
+    """
 
     term: FormTerm
     energy: float
@@ -34,7 +36,8 @@ class FieldGradient:
     forces
         (cells, nodes, components) of this rank's own cells; the components are the field's.
     places, normals
-        (cells, nodes, 3) of these nodes, undeformed, over R; of a deviation those of the perfect shell.
+        (cells, nodes, 3) of these nodes, undeformed, over R; of a deviation those of the perfect
+        shell.
     """
 
     field: fem.Function
@@ -47,7 +50,9 @@ class FieldGradient:
         return float(self._sum(np.sum(self.forces * change)))
 
     def cells(self) -> Array:
-        """(cells, components): of a field that is the same within each cell, of this rank's own cells."""
+        """(cells, components): of a field that is the same within each cell, of this rank's own
+        cells.
+        """
         return np.asarray(self.forces.sum(axis=1))
 
     def within(self, cells: NDArray[np.bool_]) -> Array:
@@ -58,11 +63,14 @@ class FieldGradient:
         return self.field.function_space.mesh.comm.allreduce(own)
 
 
-def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.Function, log: KernelLog) -> Array:
-    """The sum of the shares' derivatives by f, (cells, nodes, components) on this rank's own cells; collective.
+def by_field(
+    shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.Function, log: KernelLog
+) -> Array:
+    """The sum of the shares' derivatives by f, (cells, nodes, components) on this rank's own cells;
+    collective.
 
-    A field that is the same in neighbouring cells, such as a placement, changes in each cell alone: the sum over cells
-    that share a node is what the node's own change gives.
+    A field that is the same in neighbouring cells, such as a placement, changes in each cell alone:
+    the sum over cells that share a node is what the node's own change gives.
 
     Parameters
     ----------
@@ -81,7 +89,9 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
                 continue
             taken = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))
-            form = log.compile(f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v))
+            form = log.compile(
+                f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v)
+            )
             share.term.renew()
             fem.assemble_vector(derivatives.x.array, form)
     derivatives.x.scatter_reverse(InsertMode.add)

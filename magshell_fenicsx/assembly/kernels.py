@@ -1,10 +1,12 @@
 """Compilation: forms by FFCx, functions at points by ours, and the time that both take.
 
-Kernels are begun where they are declared, and compiled side by side when the first of them is asked for: then it is
-known how many there are, and the largest, on which the others would wait at the end, are compiled first.
+Kernels are begun where they are declared, and compiled side by side when the first of them is asked
+for: then it is known how many there are, and the largest, on which the others would wait at the
+end, are compiled first.
 
-Two scenes that differ only in numbers have the same forms. A process compiles each form once and keeps it under the
-signature of the form that it is derived from: for the next scene UFL neither differentiates nor signs the derivative.
+Two scenes that differ only in numbers have the same forms. A process compiles each form once and
+keeps it under the signature of the form that it is derived from: for the next scene UFL neither
+differentiates nor signs the derivative.
 """
 
 import ctypes
@@ -27,10 +29,17 @@ from magshell_fenicsx.platform import compat
 from magshell_fenicsx.platform.compiler import RENEWED, Library, side_by_side
 from magshell_fenicsx.platform.processes import raised_by_all, world
 
-# -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
-# No -march: the cache may be shared by unlike machines, and it gains nothing here.
+# -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the
+# run time. No -march: the cache may be shared by unlike machines, and it gains nothing here.
 # -fno-strict-overflow, as Python's own modules have it: without, sums are rounded otherwise.
-FORM_OPTIONS = ("-fno-strict-overflow", "-std=c17", "-O1", "-g0", "-ffast-math", f"-I{compat.form_include()}")
+FORM_OPTIONS = (
+    "-fno-strict-overflow",
+    "-std=c17",
+    "-O1",
+    "-g0",
+    "-ffast-math",
+    f"-I{compat.form_include()}",
+)
 SILENT_SECONDS = 1.0  # of compilation that nobody need be told of
 REPEAT_SECONDS = 30.0  # between two lines on standard error
 
@@ -39,7 +48,9 @@ Key = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class _Shared:
-    """A compiled form apart from its mesh: the places of its fields and numbers among those of what it is made from."""
+    """A compiled form apart from its mesh: the places of its fields and numbers among those of what
+    it is made from.
+    """
 
     kernels: compat.Kernels
     fields: list[int]
@@ -59,7 +70,8 @@ class Derived:
     of
         The other form.
     how
-        What is made of it: with the signature of `of` and the place of `u` this determines the form.
+        What is made of it: with the signature of `of` and the place of `u` this determines the
+        form.
     make
         Makes it.
     u
@@ -98,10 +110,14 @@ class Derived:
         return _bound(self.of, shared.kernels, spaces, *given)
 
     def shared(self, made: ufl.Form, kernels: compat.Kernels) -> _Shared | None:
-        """What is kept of the compiled form; None if it has other fields or numbers, or labels, which no other has."""
+        """What is kept of the compiled form; None if it has other fields or numbers, or labels,
+        which no other has.
+        """
         if has_type(self.of, Label):
             return None
-        fields = [_place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())]
+        fields = [
+            _place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())
+        ]
         numbers = [_place(each, self.numbers) for each in made.constants()]
         if None in fields or None in numbers:
             return None
@@ -139,14 +155,18 @@ def itself(form: ufl.Form) -> Derived:
 
 
 def _entries(form: ufl.Form) -> int:
-    """The size of the element tensor of a form, for a rough order of the times that kernels take to compile."""
+    """The size of the element tensor of a form, for a rough order of the times that kernels take to
+    compile.
+    """
     layouts = [each.ufl_function_space().dofmap for each in form.arguments()]
     sides = 1 + any(integral.integral_type() == "interior_facet" for integral in form.integrals())
     return int(prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts))
 
 
 def _print_to_stderr() -> Callable[[str], None]:
-    """Return a function that prints a line on rank 0, unless it has printed one in the last `REPEAT_SECONDS`."""
+    """Return a function that prints a line on rank 0, unless it has printed one in the last
+    `REPEAT_SECONDS`.
+    """
     last = -REPEAT_SECONDS
 
     def tell(line: str) -> None:
@@ -232,13 +252,19 @@ class KernelLog:
 
     def _compiled_together(self, named: Mapping[str, Derived]) -> list[fem.Form]:
         begun = [self.begin(name, form) for name, form in named.items()]
-        given = [form.of for form in named.values() if isinstance(form.of, ufl.Form) and not form.of.empty()]
+        given = [
+            form.of
+            for form in named.values()
+            if isinstance(form.of, ufl.Form) and not form.of.empty()
+        ]
         if given:
             self.finish(_domain_of(given[0]).ufl_cargo().comm)
         return [compiled() for compiled in begun]
 
     def begin(self, name: str, form: Derived) -> Callable[[], fem.Form]:
-        """Return a function that gives the compiled form: from this process, from the cache or from the compiler."""
+        """Return a function that gives the compiled form: from this process, from the cache or from
+        the compiler.
+        """
         start, key = time.perf_counter(), form.key
         try:
             if key in _compiled_forms:
@@ -247,7 +273,12 @@ class KernelLog:
             made = form.make()
             if not isinstance(made, ufl.Form) or made.empty():
                 return lambda: None if isinstance(made, ufl.Form) else made
-            of_form = compat.form_signature(made), partial(compat.form_code, made), FORM_OPTIONS, _entries(made)
+            of_form = (
+                compat.form_signature(made),
+                partial(compat.form_code, made),
+                FORM_OPTIONS,
+                _entries(made),
+            )
             library = self._library(*of_form)
             return cache(lambda: self._form(form, made, library()))
         finally:
@@ -258,12 +289,17 @@ class KernelLog:
         if key and (shared := form.shared(made, kernels)):
             _compiled_forms[key] = shared
         spaces = [each.ufl_function_space() for each in made.arguments()]
-        return _bound(made, kernels, spaces, kernels.in_order(made.coefficients()), made.constants())
+        return _bound(
+            made, kernels, spaces, kernels.in_order(made.coefficients()), made.constants()
+        )
 
     def load(
         self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """Return a function that gives a library, whose function gives `size` numbers. See `Library`."""
+        """Return a function that gives a library, whose function gives `size` numbers.
+
+        See `Library`.
+        """
         start = time.perf_counter()
         library = self._library(key, source, options, size)
         self._note(name, start)
@@ -296,7 +332,10 @@ class KernelLog:
         raised_by_all(comm, self._finish)
 
     def _finish(self) -> None:
-        start, begun = time.perf_counter(), sorted(self._begun.values(), key=lambda each: -each.size)
+        start, begun = (
+            time.perf_counter(),
+            sorted(self._begun.values(), key=lambda each: -each.size),
+        )
         self._begun.clear()
         _status.compile([each.library for each in begun if not each.library.there])
         self.seconds += time.perf_counter() - start

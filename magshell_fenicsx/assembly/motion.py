@@ -46,7 +46,11 @@ class Motion:
         x, y, z = self.turn / (angle or 1.0)
         N = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         NN, c, s = N @ N, np.cos(mu * angle), np.sin(mu * angle)
-        return np.eye(3) + s * N + (1 - c) * NN, angle * (c * N + s * NN), angle**2 * (c * NN - s * N)
+        return (
+            np.eye(3) + s * N + (1 - c) * NN,
+            angle * (c * N + s * NN),
+            angle**2 * (c * NN - s * N),
+        )
 
 
 @dataclass(frozen=True)

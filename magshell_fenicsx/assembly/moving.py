@@ -1,9 +1,11 @@
-"""Nodes whose displacement is prescribed by rigid motions, edges whose normals turn with them, and the lids there.
+"""Nodes whose displacement is prescribed by rigid motions, edges whose normals turn with them, and
+the lids there.
 
-Under a live pressure rigid lids close the shell at edges that move, and the pressure presses on the edges too. The
-potential of the pressure is the volume that the surface sweeps when its points move straight to their places. An edge
-that moves sweeps with it. With a lid on the edge, which moves as rigidly, the two volumes add up to the change of the
-volume enclosed, whatever the shape of the lid: the lids here are cones.
+Under a live pressure rigid lids close the shell at edges that move, and the pressure presses on the
+edges too. The potential of the pressure is the volume that the surface sweeps when its points move
+straight to their places. An edge that moves sweeps with it. With a lid on the edge, which moves as
+rigidly, the two volumes add up to the change of the volume enclosed, whatever the shape of the lid:
+the lids here are cones.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,8 +22,13 @@ from magshell_fenicsx.assembly.shape_tables import CORNERS
 
 Array = NDArray[np.float64]
 Amplitudes = Mapping[str, float]
-Side = tuple[Array, Array, tuple[int, int]]  # its first and last place in the reference cell, and the corners there
-HALVES = 0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12)  # Gauss points of equal weights, exact for cubic polynomials
+Side = tuple[
+    Array, Array, tuple[int, int]
+]  # its first and last place in the reference cell, and the corners there
+HALVES = (
+    0.5 - np.sqrt(1 / 12),
+    0.5 + np.sqrt(1 / 12),
+)  # Gauss points of equal weights, exact for cubic polynomials
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,8 @@ class Curve:
     nodes
         (sides, functions): local numbers.
     values, slopes
-        (sides, points, functions): the shape functions at points of a rule; their derivatives along times its weights.
+        (sides, points, functions): the shape functions at points of a rule; their derivatives along
+        times its weights.
     corners
         (sides, 2): the first and the last corner, by numbers that are the same on all ranks.
     """
@@ -53,22 +61,33 @@ class Curve:
     ) -> "Curve":
         """Of the facets that this rank owns; `sides` by their numbers in a cell.
 
-        Beside local cells that are `pressed` from inside, where that is -1, the surface is on their right.
+        Beside local cells that are `pressed` from inside, where that is -1, the surface is on their
+        right.
         """
         topology, element, dim = V.mesh.topology, V.element.basix_element, V.mesh.topology.dim
         for dims in ((dim - 1, dim), (dim, dim - 1), (dim, 0)):
             topology.create_connectivity(*dims)
         facets = facets[facets < topology.index_map(dim - 1).size_local]
-        x, weights = (np.asarray(each) for each in basix.make_quadrature(basix.CellType.interval, 3 * element.degree))
+        x, weights = (
+            np.asarray(each)
+            for each in basix.make_quadrature(basix.CellType.interval, 3 * element.degree)
+        )
         values, slopes = {}, {}
         for number, (first, last, _) in sides.items():
             table = element.tabulate(1, first + x * (last - first))[..., 0]
-            values[number], slopes[number] = table[0], weights[:, None] * np.tensordot(last - first, table[1:], 1)
+            values[number], slopes[number] = (
+                table[0],
+                weights[:, None] * np.tensordot(last - first, table[1:], 1),
+            )
         cells = [int(topology.connectivity(dim - 1, dim).links(facet)[0]) for facet in facets]
         of_cell = topology.connectivity(dim, dim - 1)
-        numbers = [int(np.flatnonzero(of_cell.links(c) == f)[0]) for c, f in zip(cells, facets, strict=True)]
+        numbers = [
+            int(np.flatnonzero(of_cell.links(c) == f)[0])
+            for c, f in zip(cells, facets, strict=True)
+        ]
         corners = [
-            topology.connectivity(dim, 0).links(c)[list(sides[n][2])] for c, n in zip(cells, numbers, strict=True)
+            topology.connectivity(dim, 0).links(c)[list(sides[n][2])]
+            for c, n in zip(cells, numbers, strict=True)
         ]
         shape = len(cells), len(weights), element.dim
         turned = np.ones(len(cells)) if pressed is None else pressed[cells]
@@ -76,7 +95,9 @@ class Curve:
             V.dofmap.list[cells],
             np.reshape([values[n] for n in numbers], shape),
             turned[:, None, None] * np.reshape([slopes[n] for n in numbers], shape),
-            topology.index_map(0).local_to_global(np.array(corners, dtype=np.int32).ravel()).reshape(-1, 2),
+            topology.index_map(0)
+            .local_to_global(np.array(corners, dtype=np.int32).ravel())
+            .reshape(-1, 2),
         )
 
     def at(self, x: Array) -> Array:
@@ -90,13 +111,20 @@ class Curve:
 
 def triangle_sides() -> dict[int, Side]:
     """The sides of a triangle, which is on their left."""
-    return {i: (CORNERS[a], CORNERS[b], (a, b)) for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)))}
+    return {
+        i: (CORNERS[a], CORNERS[b], (a, b)) for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)))
+    }
 
 
 def level_sides(height: float) -> dict[int, Side]:
     """Lines on the side faces of a hexahedron at a height, 0 to 1; the face above is on their left."""
-    corners = np.array([[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height], [1.0, 1.0, height]])
-    return {i: (corners[a], corners[b], (a, b)) for i, (a, b) in {1: (0, 1), 3: (1, 3), 4: (3, 2), 2: (2, 0)}.items()}
+    corners = np.array(
+        [[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height], [1.0, 1.0, height]]
+    )
+    return {
+        i: (corners[a], corners[b], (a, b))
+        for i, (a, b) in {1: (0, 1), 3: (1, 3), 4: (3, 2), 2: (2, 0)}.items()
+    }
 
 
 def ends(curves: Sequence[Curve], comm: MPI.Comm) -> NDArray[np.int64]:
@@ -126,7 +154,14 @@ class Lid:
     moment: Array
 
     @classmethod
-    def over(cls, curves: Sequence[Curve], x: Array, motions: Sequence[Motion], origin: Array, comm: MPI.Comm) -> "Lid":
+    def over(
+        cls,
+        curves: Sequence[Curve],
+        x: Array,
+        motions: Sequence[Motion],
+        origin: Array,
+        comm: MPI.Comm,
+    ) -> "Lid":
         """The cone over curves through nodes at x (nodes, 3); collective."""
         area, moment = np.zeros(3), np.zeros((3, 3))
         for curve in curves:
@@ -143,7 +178,9 @@ class Lid:
         return cls(motions, np.zeros(3), -area if last else area, np.zeros((3, 3)))
 
     def swept(self, mu: Amplitudes) -> tuple[float, dict[str, float], dict[Pair, float]]:
-        """The volume that it sweeps when its points move straight to their places; first and second derivatives."""
+        """The volume that it sweeps when its points move straight to their places; first and second
+        derivatives.
+        """
         turn, place = turned(self.motions, mu), moved(self.motions, mu, self.origin[None])
         whole = turn.x.T - np.eye(3), place.x[0] - self.origin  # u = G y + s
         by = {name: (turn.by[name].T, place.by[name][0]) for name in turn.by}
@@ -158,8 +195,14 @@ class Lid:
                 first[a] += float((bent * own + _cofactor(F, F) * self._pressed(G, s)).sum()) / 2
             for (a, b), (G, s) in twice.items():
                 bent = 2 * tau**2 * _cofactor(by[a][0], by[b][0]) + 2 * tau * _cofactor(F, G)
-                mixed = [2 * tau * _cofactor(F, by[i][0]) * self._pressed(*by[j]) for i, j in ((a, b), (b, a))]
-                second[a, b] += float((bent * own + sum(mixed) + _cofactor(F, F) * self._pressed(G, s)).sum()) / 2
+                mixed = [
+                    2 * tau * _cofactor(F, by[i][0]) * self._pressed(*by[j])
+                    for i, j in ((a, b), (b, a))
+                ]
+                second[a, b] += (
+                    float((bent * own + sum(mixed) + _cofactor(F, F) * self._pressed(G, s)).sum())
+                    / 2
+                )
         return volume, first, second
 
     def _pressed(self, G: Array, s: Array) -> Array:
@@ -205,10 +248,11 @@ class Pressed:
         return sum(lid.swept(mu)[2].get((name, other), 0.0) for lid in self.lids)
 
     def on_edges(self, x0: Array, u: Array) -> Array:
-        """Nodal forces (nodes, 3) of p = 1 on the edges, less those in the derivative of the volume that is swept.
+        """Nodal forces (nodes, 3) of p = 1 on the edges, less those in the derivative of the volume
+        that is swept.
 
-        An edge that moves straight by u sweeps a ribbon. Where a node moves further by v, the volume between the two
-        ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
+        An edge that moves straight by u sweeps a ribbon. Where a node moves further by v, the
+        volume between the two ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
         """
         forces = np.zeros_like(x0)
         for curve in self.curves:
@@ -249,8 +293,8 @@ class Body:
 class Moving:
     """The displacement E(mu) of all nodes that move; vectors are local, with ghosts.
 
-    The energy of a clamped edge depends on its normal through Q^T r alone, Q the edge's rotation. So its derivatives
-    by Q are those by the displacement along A r, with A = Q dQ^T.
+    The energy of a clamped edge depends on its normal through Q^T r alone, Q the edge's rotation.
+    So its derivatives by Q are those by the displacement along A r, with A = Q dQ^T.
 
     Parameters
     ----------
@@ -260,7 +304,9 @@ class Moving:
         What a live pressure does at edges that move.
     """
 
-    def __init__(self, r0: fem.Function, bodies: Sequence[Body], pressed: Pressed | None = None) -> None:
+    def __init__(
+        self, r0: fem.Function, bodies: Sequence[Body], pressed: Pressed | None = None
+    ) -> None:
         self.pressed = pressed
         self._axes = list(PLANE[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
@@ -282,7 +328,9 @@ class Moving:
         """Write the rotations into the terms of the edges; amplitudes that are not given are zero."""
         for body in self._bodies:
             if body.turn is not None:
-                body.turn.value[:] = turned(body.motions, dict.fromkeys(body.names, 0.0) | dict(mu)).x.T
+                body.turn.value[:] = turned(
+                    body.motions, dict.fromkeys(body.names, 0.0) | dict(mu)
+                ).x.T
 
     def rate(self, mu: Amplitudes, name: str) -> Array:
         """dE/dmu."""
@@ -295,11 +343,15 @@ class Moving:
         """d2E/dmu_i dmu_j."""
         bends = np.zeros(len(self._r0.x.array))
         for body, places in self._with(name, other):
-            bends[body.dofs] = self._components(body, moved(body.motions, mu, places).twice[name, other])
+            bends[body.dofs] = self._components(
+                body, moved(body.motions, mu, places).twice[name, other]
+            )
         return bends
 
     def on_edges(self, u: Array) -> Array:
-        """Nodal forces of p = 1 that the derivative of its potential does not have, see `Pressed.on_edges`."""
+        """Nodal forces of p = 1 that the derivative of its potential does not have, see
+        `Pressed.on_edges`.
+        """
         if not (self.pressed and self.pressed.curves):
             return np.zeros_like(u)
         return self.pressed.on_edges(self._r0.x.array.reshape(-1, 3), u.reshape(-1, 3)).ravel()

@@ -1,11 +1,12 @@
 """Free parameters of terms, and the derivatives of energies by them.
 
-A parameter is a constant in forms, or an amplitude of the undeformed placement, to which shapes are added that grow:
+A parameter is a constant in forms, or an amplitude of the undeformed placement, to which shapes are
+added that grow:
 
     r0 = r0_drawn + sum_i mu_i d_i
 
-Displacements are measured from r0, the shape without stress. All terms follow it; their derivatives by such an
-amplitude are differences of fourth order over steps of h/200, exact to about 1e-9.
+Displacements are measured from r0, the shape without stress. All terms follow it; their derivatives
+by such an amplitude are differences of fourth order over steps of h/200, exact to about 1e-9.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -54,8 +55,8 @@ class Parameter:
     slopes
         dPi_i/dp as terms with the amplitudes mu_i.
     twice
-        Makes the derivatives of the slopes by another parameter in the terms, or by p itself. Where q is no constant
-        but has a method `bends`, that makes them.
+        Makes the derivatives of the slopes by another parameter in the terms, or by p itself. Where
+        q is no constant but has a method `bends`, that makes them.
     """
 
     constant: Settable
@@ -131,7 +132,10 @@ class Growing:
         self._r0, self.drawn, self._values = r0, r0.copy(), dict.fromkeys(shapes, 0.0)
         self._shapes = {name: np.array(d.x.array) for name, d in shapes.items()}
         comm = r0.function_space.mesh.comm
-        largest = {name: comm.allreduce(np.abs(d).max(initial=0.0), MPI.MAX) for name, d in self._shapes.items()}
+        largest = {
+            name: comm.allreduce(np.abs(d).max(initial=0.0), MPI.MAX)
+            for name, d in self._shapes.items()
+        }
         self.steps = {name: STEP * length / size if size else 1.0 for name, size in largest.items()}
 
     def value(self, name: str) -> float:
@@ -147,7 +151,9 @@ class Growing:
         self._r0.x.array[:] = self.drawn.x.array + grown
 
     def by(self, name: str, of: Callable[[float], float]) -> float:
-        """The sum over neighbouring placements of a function of the weight: a derivative of what is linear in it."""
+        """The sum over neighbouring placements of a function of the weight: a derivative of what is
+        linear in it.
+        """
         value, step = self._values[name], self.steps[name]
         total = 0.0
         for number, weight in FOURTH:
@@ -157,11 +163,17 @@ class Growing:
         return total
 
     def parameters(
-        self, terms: Sequence[Term], others: Mapping[str, Parameter], gradients: ResidualAssembler | None = None
+        self,
+        terms: Sequence[Term],
+        others: Mapping[str, Parameter],
+        gradients: ResidualAssembler | None = None,
     ) -> dict[str, Parameter]:
         """The amplitudes as free parameters of the terms, beside the other ones."""
         values = {name: GrowingValue(self, name, terms, others) for name in self._values}
-        return {name: Parameter(value, value.slopes(gradients), value.bends) for name, value in values.items()}
+        return {
+            name: Parameter(value, value.slopes(gradients), value.bends)
+            for name, value in values.items()
+        }
 
 
 @dataclass(eq=False)

@@ -1,8 +1,9 @@
 """Densities at many points at once: their values, gradients and Hessians.
 
-A density is a function of a few vectors that vary between points. Its kernels do not depend on mesh, degree or
-quadrature. The points are represented as cells of an interval, and the vectors as functions that are constant in each.
-A kernel is a function in C of operations on scalars (`scalars`), for many points in one call and four points at once.
+A density is a function of a few vectors that vary between points. Its kernels do not depend on
+mesh, degree or quadrature. The points are represented as cells of an interval, and the vectors as
+functions that are constant in each. A kernel is a function in C of operations on scalars
+(`scalars`), for many points in one call and four points at once.
 """
 
 import ctypes
@@ -32,7 +33,9 @@ from magshell_fenicsx.platform.kept import keep, recall
 
 Pair = tuple[int, int]
 Array = NDArray[np.float64]
-COMPILED: TypeAlias = Callable[[int, int, int, int, int], None]  # addresses but for the fourth: number of points
+COMPILED: TypeAlias = Callable[
+    [int, int, int, int, int], None
+]  # addresses but for the fourth: number of points
 
 
 class Points:
@@ -66,7 +69,8 @@ class Points:
 
 
 class PointKernel:
-    """A function of fields and constants at points, which is compiled when it is first evaluated, if not before.
+    """A function of fields and constants at points, which is compiled when it is first evaluated,
+    if not before.
 
     Attributes
     ----------
@@ -82,7 +86,10 @@ class PointKernel:
         size: int,
     ) -> None:
         self._library, self.size = library, size
-        self._constants, self._fields = [c.value for c in constants], [f.x.array for f in fields]  # views
+        self._constants, self._fields = (
+            [c.value for c in constants],
+            [f.x.array for f in fields],
+        )  # views
         self._places = np.array([values.ctypes.data for values in self._fields], np.uintp)
         self._sizes = np.array([f.ufl_shape[0] for f in fields], np.int32)
 
@@ -92,15 +99,21 @@ class PointKernel:
 
     def evaluate(self, count: int, values: Array) -> None:
         """Fill a contiguous array (count, size) for the first points."""
-        constants = np.concatenate([np.ravel(value) for value in (*self._constants, 0.0)])  # never empty
-        fields, sizes, c, out = (array.ctypes.data for array in (self._places, self._sizes, constants, values))
+        constants = np.concatenate(
+            [np.ravel(value) for value in (*self._constants, 0.0)]
+        )  # never empty
+        fields, sizes, c, out = (
+            array.ctypes.data for array in (self._places, self._sizes, constants, values)
+        )
         self._function(fields, sizes, c, count, out)
 
 
 Made = Callable[[Scalars, list[list[int]]], list[int]]  # from the nodes of each expression
 
 
-def _kernel(name: str, expressions: Sequence[Expr], asked: str, size: int, made: Made, log: KernelLog) -> PointKernel:
+def _kernel(
+    name: str, expressions: Sequence[Expr], asked: str, size: int, made: Made, log: KernelLog
+) -> PointKernel:
     """Compile what is made of some expressions, or load it.
 
     Parameters
@@ -127,7 +140,9 @@ _KEYS: dict[tuple[str, ...], str] = {}  # of what was translated before, by its 
 
 
 def _key_of(structure: tuple[str, ...], key: Callable[[], str]) -> str:
-    """The key, from this process or one before: to translate an expression takes as long as all else of a kernel."""
+    """The key, from this process or one before: to translate an expression takes as long as all
+    else of a kernel.
+    """
     if structure not in _KEYS:
         depends = repr((_version(), ufl.__version__, structure))
         name = f"magshell_key_{hashlib.sha256(depends.encode()).hexdigest()[:40]}"
@@ -155,9 +170,13 @@ def _graph(
 
 def _key(asked: str, graph: Scalars, nodes: list[list[int]]) -> str:
     """What the code of a kernel depends on; neither the order nor the number of other operations."""
-    number = {node: i for i, node in enumerate(graph.reached([node for each in nodes for node in each]))}
+    number = {
+        node: i for i, node in enumerate(graph.reached([node for each in nodes for node in each]))
+    }
     operations = [
-        (graph.operations[node][0], *(number[operand] for operand in operands)) if operands else graph.operations[node]
+        (graph.operations[node][0], *(number[operand] for operand in operands))
+        if operands
+        else graph.operations[node]
         for node in number
         for operands in [graph.operands(node)]
     ]
@@ -178,7 +197,9 @@ def point_values(name: str, W: Expr, log: KernelLog) -> PointKernel:
     return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0], log)
 
 
-def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog) -> PointKernel:
+def point_gradient(
+    name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog
+) -> PointKernel:
     """Compile the sum of dW/dz for some W, each with its own z of the same size."""
     size = sums[0][1].ufl_shape[0]
 
@@ -194,7 +215,8 @@ def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: Ke
 
 @dataclass(frozen=True)
 class Pairs:
-    """The nonzero blocks (3, 3) of a Hessian: d2W/dz_i dz_j for parts i, j of z, on one or two sides.
+    """The nonzero blocks (3, 3) of a Hessian: d2W/dz_i dz_j for parts i, j of z, on one or two
+    sides.
 
     A block and its transpose are stored as symmetric and skew part.
 
@@ -257,9 +279,17 @@ def point_hessian(
         for first in range(0, sides * parts, parts):
             same = [(first + i, first + j) for i, j in pairs.same]
             skew = [(first + i, first + j) for i, j in pairs.skew]
-            outputs += [mean(block(i, j, c, d), block(i, j, d, c)) for c, d in COMPONENTS for i, j in same]
-            outputs += [mean(block(i, j, c, d), graph.minus(block(i, j, d, c))) for c, d in SKEW for i, j in skew]
-        outputs += [block(i, parts + j, c, d) for c in range(3) for d in range(3) for i, j in pairs.cross]
+            outputs += [
+                mean(block(i, j, c, d), block(i, j, d, c)) for c, d in COMPONENTS for i, j in same
+            ]
+            outputs += [
+                mean(block(i, j, c, d), graph.minus(block(i, j, d, c)))
+                for c, d in SKEW
+                for i, j in skew
+            ]
+        outputs += [
+            block(i, parts + j, c, d) for c in range(3) for d in range(3) for i, j in pairs.cross
+        ]
         return graph.replaced(outputs, dict.fromkeys(inputs, graph.zero)) if at_zero else outputs
 
     size = sides * (6 * len(pairs.same) + 3 * len(pairs.skew)) + 9 * len(pairs.cross)
@@ -274,13 +304,20 @@ def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog) -> PointK
         (density,), inputs = nodes
         _, second = graph.derivatives(density, inputs, second=True)
         pairs = [(min(i, j), max(i, j)) for i, j in combinations_with_replacement(inputs, 2)]
-        return graph.replaced([second.get(pair, graph.zero) for pair in pairs], dict.fromkeys(inputs, graph.zero))
+        return graph.replaced(
+            [second.get(pair, graph.zero) for pair in pairs], dict.fromkeys(inputs, graph.zero)
+        )
 
     return _kernel(name, [W, z], "whole hessian", size * (size + 1) // 2, made, log)
 
 
 NAME = "evaluate_many"
-OPTIONS = ("-std=gnu17", "-O1", "-g0", "-ffast-math")  # -O2 compiles five times slower, for 15 % of the run time
+OPTIONS = (
+    "-std=gnu17",
+    "-O1",
+    "-g0",
+    "-ffast-math",
+)  # -O2 compiles five times slower, for 15 % of the run time
 INFIX = {"+", "*", "/", "<", ">", "<=", ">=", "==", "!=", "&", "|"}
 MASKS = INFIX - {"+", "*", "/"} | {"!"}
 PREAMBLE = """#include <math.h>
@@ -326,13 +363,17 @@ def point_code(scalars: Scalars, outputs: Sequence[int]) -> str:
             names[node], kind = f"x{node}", "mask" if name in MASKS else "four"
             lines.append(f"const {kind} x{node} = {_operation(name, rest, names, functions)};")
         lines += [f"A[{k}] = none + {names[node]};" for k in wanted.get(node, ())]
-    helpers = "".join((OF_ONE if count == 1 else OF_TWO).format(f=f) for f, count in functions.items())
+    helpers = "".join(
+        (OF_ONE if count == 1 else OF_TWO).format(f=f) for f, count in functions.items()
+    )
     body = "\n".join(f"    {line}" for line in lines)
     return PREAMBLE + helpers + POINTS.format(name=NAME, count=len(outputs), body=body)
 
 
 def function_of(library: ctypes.CDLL) -> COMPILED:
-    """The function of a library, with the types of its arguments: fields, sizes, constants, count, out."""
+    """The function of a library, with the types of its arguments: fields, sizes, constants, count,
+    out.
+    """
     function, pointer = library[NAME], ctypes.c_void_p
     function.argtypes, function.restype = [pointer, pointer, pointer, ctypes.c_int64, pointer], None
     return function
@@ -340,7 +381,13 @@ def function_of(library: ctypes.CDLL) -> COMPILED:
 
 def _operation(name: str, rest: list[int], names: dict[int, str], functions: dict[str, int]) -> str:
     if name == "field":
-        return "{" + ", ".join(f"values[{rest[0]}][at[{i}] * sizes[{rest[0]}] + {rest[1]}]" for i in range(4)) + "}"
+        return (
+            "{"
+            + ", ".join(
+                f"values[{rest[0]}][at[{i}] * sizes[{rest[0]}] + {rest[1]}]" for i in range(4)
+            )
+            + "}"
+        )
     if name == "constant":
         return f"none + constants[{rest[0]}]"
     operands = [names[node] for node in rest]
@@ -349,9 +396,15 @@ def _operation(name: str, rest: list[int], names: dict[int, str], functions: dic
     if name == "!":
         return f"~{operands[0]}"
     if name in INFIX:
-        first = f"(none + {operands[0]})" if operands[0][0] == "(" and name in MASKS else operands[0]
+        first = (
+            f"(none + {operands[0]})" if operands[0][0] == "(" and name in MASKS else operands[0]
+        )
         return f"{first} {name} {operands[1]}"
     if name in ("jn", "yn"):  # of an order that is a number
-        return "{" + ", ".join(f"{name}((int){operands[0]}, {operands[1]}[{i}])" for i in range(4)) + "}"
+        return (
+            "{"
+            + ", ".join(f"{name}((int){operands[0]}, {operands[1]}[{i}])" for i in range(4))
+            + "}"
+        )
     functions[name] = len(operands)
     return f"four_{name}({', '.join(f'none + {operand}' for operand in operands)})"

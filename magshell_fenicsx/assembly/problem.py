@@ -1,7 +1,8 @@
 """The sum of terms on a finite-element space, as a system for the solvers.
 
-A state is evaluated, never visited: what `FiniteElementSystem.at` gives is a function of the state alone. What a state
-has from its history stands in it, and goes on by `FiniteElementSystem.advance` when a path accepts it.
+A state is evaluated, never visited: what `FiniteElementSystem.at` gives is a function of the state
+alone. What a state has from its history stands in it, and goes on by `FiniteElementSystem.advance`
+when a path accepts it.
 """
 
 import itertools
@@ -23,13 +24,30 @@ from magshell_fenicsx.assembly.evaluated import Evaluated, Noise
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameters import Derivative, Parameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
-from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
+from magshell_fenicsx.assembly.terms import (
+    Counted,
+    FormTerm,
+    ResidualAssembler,
+    TangentAssembler,
+    Term,
+    factor_of,
+)
 from magshell_fenicsx.assembly.whole import WholeTerm
 from magshell_fenicsx.continuation.factor import Stopwatch
-from magshell_fenicsx.continuation.system import Amplitudes, Beside, Skewed, State, Vector, Weighted, symmetric_part
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    Beside,
+    Skewed,
+    State,
+    Vector,
+    Weighted,
+    symmetric_part,
+)
 from magshell_fenicsx.platform import compat
 
-Setting: TypeAlias = tuple[Settable, float]  # a number of the terms, and its value in a state that has none
+Setting: TypeAlias = tuple[
+    Settable, float
+]  # a number of the terms, and its value in a state that has none
 
 
 DIFFERENCE = 1e-5  # of the length: the step of differences of forces
@@ -55,10 +73,11 @@ class FiniteElementSystem:
     parameters
         Free parameters of terms, by name.
     moving
-        Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero there, and
-        whatever u holds there is replaced by E(mu).
+        Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero
+        there, and whatever u holds there is replaced by E(mu).
     history
-        Numbers that states have beside their amplitudes, by name, with their values where a state has none.
+        Numbers that states have beside their amplitudes, by name, with their values where a state
+        has none.
 
     Attributes
     ----------
@@ -89,22 +108,33 @@ class FiniteElementSystem:
         self.parameters = parameters or {}
         self.moving, self._pressed = moving, moving.pressed if moving else None
         self._counted = [t for t in terms if isinstance(t, Counted)]
-        self.history: dict[str, Setting] = {**(history or {}), **{t.turn: (t, 0.0) for t in self._counted}}
+        self.history: dict[str, Setting] = {
+            **(history or {}),
+            **{t.turn: (t, 0.0) for t in self._counted},
+        }
         free = {name: parameter.constant for name, parameter in self.parameters.items()}
-        self._numbers = {name: (number, float(number.value)) for name, number in free.items()} | self.history
+        self._numbers = {
+            name: (number, float(number.value)) for name, number in free.items()
+        } | self.history
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
-        self.strange: list[str] = []  # terms that were not numbers at the latest residual that was none
+        self.strange: list[
+            str
+        ] = []  # terms that were not numbers at the latest residual that was none
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
-        fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
+        fixed = np.unique(
+            np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)])
+        )
         self._fixed = fixed[fixed < self.size]
         self.couplings, self.of_all = couplings(V, terms, clamped), of_all(V, terms, clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
-        self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
+        self._own_residual = [
+            t for t in terms if gradients is None or t.name not in gradients.names
+        ]
         for term in self._own_residual:
             term.compile_residual()
         if assembler is None:
@@ -115,7 +145,9 @@ class FiniteElementSystem:
             self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
     def with_number(self, name: str, number: Settable, value: float) -> "FiniteElementSystem":
-        """The same system, all states of which have a value of a further number of its terms, in place."""
+        """The same system, all states of which have a value of a further number of its terms, in
+        place.
+        """
         other = copy(self)
         other._numbers = {name: (number, value)} | self._numbers
         if self._assembler is None:
@@ -139,12 +171,18 @@ class FiniteElementSystem:
         if not self._counted:
             return state
         past = {t.turn: before.get(t.turn, 0.0) for t in self._counted}
-        angles = self.at(State(state.u, state.mu | past)).of(lambda: {t.turn: t.angle() for t in self._counted})
+        angles = self.at(State(state.u, state.mu | past)).of(
+            lambda: {t.turn: t.angle() for t in self._counted}
+        )
         return State(state.u, state.mu | angles)
 
     def placed(self, state: State) -> State:
         """The state with the displacement of the nodes that move."""
-        return State(self.with_ghosts(state.u, state.mu)[: self.size], state.mu) if self.moving else state
+        return (
+            State(self.with_ghosts(state.u, state.mu)[: self.size], state.mu)
+            if self.moving
+            else state
+        )
 
     def with_ghosts(self, u: Vector, mu: Amplitudes | None = None) -> NDArray[np.float64]:
         """The displacement of all nodes on this rank, of those that move too."""
@@ -235,7 +273,9 @@ class FiniteElementSystem:
         return finite if self.comm.size == 1 else bool(self.comm.allreduce(finite, MPI.LAND))
 
     def step_along(self, v: Vector, part: float) -> float:
-        """What v is multiplied by so that its largest entry is a part of the system's length; collective."""
+        """What v is multiplied by so that its largest entry is a part of the system's length;
+        collective.
+        """
         largest = self.comm.allreduce(float(np.abs(v).max(initial=0.0)), MPI.MAX)
         return float(part * self.length / (largest or 1.0))
 
@@ -257,7 +297,10 @@ class FiniteElementSystem:
         if other not in moving.names:
             return float(bend)
         R, r = self._gradient(self._factors(mu)), self.u.x.array
-        bend += moving.rate(mu, other) @ self._turning_column(mu, name) + moving.bend(mu, name, other) @ R
+        bend += (
+            moving.rate(mu, other) @ self._turning_column(mu, name)
+            + moving.bend(mu, name, other) @ R
+        )
         rates = dict(moving.turning(mu, other))
         for edge, A in moving.turning(mu, name):
             if edge in rates:
@@ -269,9 +312,13 @@ class FiniteElementSystem:
     def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
         """This rank's part of d2Pi/du dmu at all nodes, of the displacement that is set."""
         if self.moving and name in self.moving.names:
-            return self._times(self.moving.rate(mu, name), self._factors(mu)) + self._turning_column(mu, name)
+            return self._times(
+                self.moving.rate(mu, name), self._factors(mu)
+            ) + self._turning_column(mu, name)
         if name in self.parameters:
-            slopes = [(factor_of(slope.amplitude, mu), slope) for slope in self.parameters[name].slopes]
+            slopes = [
+                (factor_of(slope.amplitude, mu), slope) for slope in self.parameters[name].slopes
+            ]
             return self._gradient(self._multiplied(name), slopes)
         return self._gradient(self._multiplied(name))
 
@@ -308,7 +355,11 @@ class FiniteElementSystem:
         return product
 
     def _tangent(
-        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]], *, rough: bool = False
+        self,
+        factors: Mapping[str, float],
+        stress: Sequence[tuple[float, NDArray[np.float64]]],
+        *,
+        rough: bool = False,
     ) -> PETSc.Mat | Beside | Skewed:
         """That of the terms with these factors; `stress` has ghosts."""
         if self._assembler:
@@ -322,7 +373,9 @@ class FiniteElementSystem:
             K = self.of_all.beside(K, factors, rough=rough)
             if isinstance(K, Beside) and rough:
                 of_all = {t.name: factors[t.name] for t in self.of_all.terms}
-                present, foreseen = (self._present_of_all(of_all, rough=rough) for rough in (False, True))
+                present, foreseen = (
+                    self._present_of_all(of_all, rough=rough) for rough in (False, True)
+                )
                 K = replace(K, present=present, foreseen=foreseen)
             K = symmetric_part(K) if N or self.projection or self.noise else K
         if self.projection:
@@ -331,7 +384,9 @@ class FiniteElementSystem:
             self.noise.on_matrix(K)
         return Skewed(K, N) if N else K
 
-    def _present_of_all(self, factors: Mapping[str, float], *, rough: bool) -> Callable[[Vector], Vector]:
+    def _present_of_all(
+        self, factors: Mapping[str, float], *, rough: bool
+    ) -> Callable[[Vector], Vector]:
         """The tangent of some terms, at the displacement that is set now, times a vector: by
         differences of forces.
 
@@ -352,7 +407,11 @@ class FiniteElementSystem:
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""
-        loads = [t for t in self.terms if isinstance(t, FormTerm) and not t.has_potential and factors[t.name]]
+        loads = [
+            t
+            for t in self.terms
+            if isinstance(t, FormTerm) and not t.has_potential and factors[t.name]
+        ]
         if not loads:
             return None
         if self._N is None:
@@ -363,7 +422,9 @@ class FiniteElementSystem:
         self._N.assemble()
         return self.projection.both_sides(self._N) if self.projection else self._N
 
-    def _of_forms(self, K: PETSc.Mat, factors: Mapping[str, float], held: list[fem.DirichletBC]) -> PETSc.Mat:
+    def _of_forms(
+        self, K: PETSc.Mat, factors: Mapping[str, float], held: list[fem.DirichletBC]
+    ) -> PETSc.Mat:
         """The tangent from the terms' own forms."""
         K.zeroEntries()
         for t in self.terms:
@@ -376,9 +437,14 @@ class FiniteElementSystem:
         return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = (), *, rough: bool = False
+        self,
+        factors: Mapping[str, float],
+        besides: Sequence[tuple[float, Derivative]] = (),
+        *,
+        rough: bool = False,
     ) -> NDArray[np.float64]:
-        """This rank's part of the gradient of the terms with these factors, by name, plus further terms.
+        """This rank's part of the gradient of the terms with these factors, by name, plus further
+        terms.
 
         If `rough`, those in which all unknowns act on each other may be foreseen.
         """

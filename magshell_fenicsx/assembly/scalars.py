@@ -1,6 +1,7 @@
 """An expression of UFL as operations on scalars, each of which occurs once, and its derivatives.
 
-Fields and constants are the inputs. A node is the number of an operation; the operands of a node have smaller numbers.
+Fields and constants are the inputs. A node is the number of an operation; the operands of a node
+have smaller numbers.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,9 +21,18 @@ from ufl.corealg.traversal import traverse_unique_terminals, unique_post_travers
 Nodes = NDArray[np.int64]
 First = dict[int, int]  # operand or input -> derivative
 Second = dict[tuple[int, int], int]  # two of them, the smaller one first -> second derivative
-Operation = tuple[Any, ...]  # its name, then the operands' nodes; of an input or a number what it is
+Operation = tuple[
+    Any, ...
+]  # its name, then the operands' nodes; of an input or a number what it is
 
-COMPARISONS = {classes.LT: "<", classes.GT: ">", classes.LE: "<=", classes.GE: ">=", classes.EQ: "==", classes.NE: "!="}
+COMPARISONS = {
+    classes.LT: "<",
+    classes.GT: ">",
+    classes.LE: "<=",
+    classes.GE: ">=",
+    classes.EQ: "==",
+    classes.NE: "!=",
+}
 COMPARISONS |= {classes.AndCondition: "&", classes.OrCondition: "|"}
 LARGEST_POWER = 4.5  # that is written as a product
 UNCHANGED = (classes.Variable, classes.Real, classes.Conj)  # all is real here
@@ -34,8 +44,9 @@ class Scalars:
     Attributes
     ----------
     operations
-        By node. Names are those of C, and "number", "field" (its position among the fields, component), "constant"
-        (place among the values of all constants) and "pick" (condition, what is taken if it holds, what else).
+        By node. Names are those of C, and "number", "field" (its position among the fields,
+        component), "constant" (place among the values of all constants) and "pick" (condition, what
+        is taken if it holds, what else).
     """
 
     def __init__(self) -> None:
@@ -91,7 +102,13 @@ class Scalars:
 
     def over(self, a: int, b: int) -> int:
         y = self.value(b)
-        return self.times(a, self.number(1 / y)) if y else self.zero if a == self.zero else self.node("/", a, b)
+        return (
+            self.times(a, self.number(1 / y))
+            if y
+            else self.zero
+            if a == self.zero
+            else self.node("/", a, b)
+        )
 
     def power(self, a: int, b: int) -> int:
         exponent = self.value(b)
@@ -112,8 +129,14 @@ class Scalars:
         return total
 
     def reached(self, nodes: Iterable[int]) -> list[int]:
-        """All nodes on which some depend, and themselves; operands first, each shortly before it is needed."""
-        order, seen, stack = list[int](), set[int](), [(node, False) for node in reversed(list(nodes))]
+        """All nodes on which some depend, and themselves; operands first, each shortly before it is
+        needed.
+        """
+        order, seen, stack = (
+            list[int](),
+            set[int](),
+            [(node, False) for node in reversed(list(nodes))],
+        )
         while stack:
             node, ready = stack.pop()
             if ready:
@@ -121,7 +144,11 @@ class Scalars:
             elif node not in seen:
                 seen.add(node)
                 stack.append((node, True))
-                stack += [(operand, False) for operand in reversed(self.operands(node)) if operand not in seen]
+                stack += [
+                    (operand, False)
+                    for operand in reversed(self.operands(node))
+                    if operand not in seen
+                ]
         return order
 
     def operands(self, node: int) -> tuple[int, ...]:
@@ -134,7 +161,11 @@ class Scalars:
         for node in self.reached(nodes):
             if node not in new:
                 operands = self.operands(node)
-                new[node] = self.made(self.operations[node][0], [new[o] for o in operands]) if operands else node
+                new[node] = (
+                    self.made(self.operations[node][0], [new[o] for o in operands])
+                    if operands
+                    else node
+                )
         return [new[node] for node in nodes]
 
     def made(self, name: str, operands: Sequence[int]) -> int:
@@ -150,7 +181,9 @@ class Scalars:
 
     # --- from UFL -----------------------------------------------------------------------------
 
-    def components(self, expression: Expr, fields: Sequence[Any], constants: Sequence[Any]) -> Nodes:
+    def components(
+        self, expression: Expr, fields: Sequence[Any], constants: Sequence[Any]
+    ) -> Nodes:
         """The nodes of an expression's components, in the shape of the expression.
 
         Parameters
@@ -201,11 +234,17 @@ class Scalars:
             return np.stack(operands)
         if isinstance(e, classes.IndexSum):
             a, label = e.ufl_operands
-            summed = np.moveaxis(operands[0], len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count()), -1)
+            summed = np.moveaxis(
+                operands[0], len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count()), -1
+            )
             sums = [self.sum(flat(row)) for row in summed.reshape(-1, summed.shape[-1])]
             return np.array(sums).reshape(summed.shape[:-1])
         operation = self._of_numbers(e)
-        aligned = [_aligned(v, o, e) for v, o in zip(operands, e.ufl_operands, strict=True) if v is not None]
+        aligned = [
+            _aligned(v, o, e)
+            for v, o in zip(operands, e.ufl_operands, strict=True)
+            if v is not None
+        ]
         together = np.broadcast_arrays(*aligned)
         rows = np.stack([values.ravel() for values in together], axis=1).tolist()
         return np.array([operation(*row) for row in rows]).reshape(together[0].shape)
@@ -241,15 +280,19 @@ class Scalars:
         if isinstance(e, classes.BesselJ | classes.BesselY):
             name = "jn" if isinstance(e, classes.BesselJ) else "yn"
             return lambda order, x: self.node(name, order, x)
-        raise NotImplementedError(f"an energy at points has {type(e).__name__}, which is no function of numbers")
+        raise NotImplementedError(
+            f"an energy at points has {type(e).__name__}, which is no function of numbers"
+        )
 
     # --- derivatives --------------------------------------------------------------------------
 
     def derivatives(self, f: int, inputs: Sequence[int], *, second: bool) -> tuple[First, Second]:
-        """The first derivatives of a node by some inputs, and the second ones; what is missing is zero.
+        """The first derivatives of a node by some inputs, and the second ones; what is missing is
+        zero.
 
-        Nodes are eliminated from f down to the inputs, with the derivatives of f by those that are left: R. M. Gower
-        and M. P. Mello, *A new framework for the computation of Hessians*, Optimization Methods and Software 27 (2012).
+        Nodes are eliminated from f down to the inputs, with the derivatives of f by those that are
+        left: R. M. Gower and M. P. Mello, *A new framework for the computation of Hessians*,
+        Optimization Methods and Software 27 (2012).
         """
         ends = set(inputs)
         reached = sorted(self.reached([f]))
@@ -276,7 +319,13 @@ class Scalars:
             for other, value in others.items():
                 pairs[other].pop(node)
                 for j, slope in by.items():
-                    couple(j, other, self.times(self.number(2.0 if j == other else 1.0), self.times(slope, value)))
+                    couple(
+                        j,
+                        other,
+                        self.times(
+                            self.number(2.0 if j == other else 1.0), self.times(slope, value)
+                        ),
+                    )
             for j, k in combinations_with_replacement(by, 2) if second else ():
                 bent = self.times(bar, twice.get((min(j, k), max(j, k)), self.zero))
                 couple(j, k, self.add(self.times(by[j], self.times(by[k], itself)), bent))
@@ -285,15 +334,20 @@ class Scalars:
         kept = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
         return {node: value for node, value in first.items() if node in ends}, kept
 
-    def _local(self, node: int, active: set[int], ends: set[int], *, second: bool) -> tuple[First, Second]:
-        """The derivatives of an operation by its operands; of a choice by the inputs, for each side on its own.
+    def _local(
+        self, node: int, active: set[int], ends: set[int], *, second: bool
+    ) -> tuple[First, Second]:
+        """The derivatives of an operation by its operands; of a choice by the inputs, for each side
+        on its own.
 
         What is not picked may have no value, and then it must be multiplied by nothing.
         """
         name, *operands = self.operations[node]
         if name == "pick":
             condition, *sides = operands
-            (f1, f2), (g1, g2) = (self.derivatives(side, list(ends), second=second) for side in sides)
+            (f1, f2), (g1, g2) = (
+                self.derivatives(side, list(ends), second=second) for side in sides
+            )
             zero = self.zero
             return (
                 {i: self.pick(condition, f1.get(i, zero), g1.get(i, zero)) for i in f1 | g1},
@@ -311,7 +365,9 @@ class Scalars:
                         twice[pair] = self.add(twice.get(pair, self.zero), bends[i][k])
         return by, twice
 
-    def _rules(self, node: int, name: str, operands: list[int]) -> tuple[list[int], list[list[int]]]:
+    def _rules(
+        self, node: int, name: str, operands: list[int]
+    ) -> tuple[list[int], list[list[int]]]:
         """First and second derivatives of an operation by its operands."""
         zero, one, number, times, over = self.zero, self.one, self.number, self.times, self.over
         a, b = operands[0], operands[-1]
@@ -322,7 +378,10 @@ class Scalars:
         if name == "/":
             inverse, slope = over(one, b), self.minus(over(node, b))
             mixed = self.minus(times(inverse, inverse))
-            return [inverse, slope], [[zero, mixed], [mixed, times(number(-2.0), times(slope, inverse))]]
+            return [inverse, slope], [
+                [zero, mixed],
+                [mixed, times(number(-2.0), times(slope, inverse))],
+            ]
         if name == "pow":
             lower = self.power(a, self.add(b, number(-1.0)))
             lowest = self.power(a, self.add(b, number(-2.0)))
@@ -403,9 +462,14 @@ def flat(nodes: Nodes) -> list[int]:
 
 
 def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], ...]:
-    """The fields, constants, ... in some expressions, each kind in the order in which they were made."""
+    """The fields, constants, ... in some expressions, each kind in the order in which they were
+    made.
+    """
     terminals = {terminal for e in expressions for terminal in traverse_unique_terminals(e)}
-    return tuple(sorted((t for t in terminals if isinstance(t, kind)), key=lambda t: t.count()) for kind in kinds)
+    return tuple(
+        sorted((t for t in terminals if isinstance(t, kind)), key=lambda t: t.count())
+        for kind in kinds
+    )
 
 
 def _indexed(value: Nodes, e: Expr) -> Nodes:

@@ -24,17 +24,18 @@ Longs = NDArray[np.int64]
 class Pattern:
     """The blocks of this rank, in an order that suits PETSc and communication.
 
-    First come the blocks that couple this rank's n own nodes, row by row; then those that couple own nodes with nodes
-    of other ranks; then those in the rows of ghosts, which are added on the owning ranks. These 2 n + ghosts rows of
-    blocks form one matrix in compressed sparse rows, the three rows of a block one after the other. The constructor is
-    collective.
+    First come the blocks that couple this rank's n own nodes, row by row; then those that couple
+    own nodes with nodes of other ranks; then those in the rows of ghosts, which are added on the
+    owning ranks. These 2 n + ghosts rows of blocks form one matrix in compressed sparse rows, the
+    three rows of a block one after the other. The constructor is collective.
 
     Parameters
     ----------
     nodes
         The index map of the nodes.
     coupled
-        Rows and columns of blocks: local nodes, ghosts included. The diagonal blocks are always there.
+        Rows and columns of blocks: local nodes, ghosts included. The diagonal blocks are always
+        there.
 
     Attributes
     ----------
@@ -48,7 +49,9 @@ class Pattern:
         Global numbers, ascending, of the others' nodes.
     """
 
-    def __init__(self, nodes: IndexMap, coupled: Iterable[tuple[Ints, Ints]], comm: MPI.Comm) -> None:
+    def __init__(
+        self, nodes: IndexMap, coupled: Iterable[tuple[Ints, Ints]], comm: MPI.Comm
+    ) -> None:
         n, ghosts, first = nodes.size_local, nodes.num_ghosts, nodes.local_range[0]
         self.owned, self._comm = n, comm
         own = np.arange(n, dtype=np.int32)
@@ -64,23 +67,35 @@ class Pattern:
         arriving = tuple(self._exchange(numbers[x], 1) for x in leaving)
         foreign = (arriving[1] < first) | (arriving[1] >= first + n)
         self.others = np.unique(np.concatenate([numbers[n:], arriving[1][foreign]]))
-        places = np.where(foreign, n + np.searchsorted(self.others, arriving[1]), arriving[1] - first)
-        self._places = np.concatenate([own, n + np.searchsorted(self.others, numbers[n:])]).astype(np.int32)
+        places = np.where(
+            foreign, n + np.searchsorted(self.others, arriving[1]), arriving[1] - first
+        )
+        self._places = np.concatenate([own, n + np.searchsorted(self.others, numbers[n:])]).astype(
+            np.int32
+        )
         self._width = n + len(self.others)
         came = self._row(arriving[0] - first, places), places
-        rows, columns = (np.concatenate(part, dtype=np.int32) for part in zip(self._at(i, j), came, strict=True))
+        rows, columns = (
+            np.concatenate(part, dtype=np.int32) for part in zip(self._at(i, j), came, strict=True)
+        )
         del i, j
         blocks = _blocks(rows, columns, (2 * n + ghosts, self._width))
         self.starts, self.columns = blocks.indptr, blocks.indices
-        self._keys = np.repeat(np.arange(2 * n + ghosts) * self._width, np.diff(self.starts)) + self.columns
-        self._leave, self._arrive = (self._entries(*at).ravel() for at in (self._at(*leaving), came))
+        self._keys = (
+            np.repeat(np.arange(2 * n + ghosts) * self._width, np.diff(self.starts)) + self.columns
+        )
+        self._leave, self._arrive = (
+            self._entries(*at).ravel() for at in (self._at(*leaving), came)
+        )
 
     def blocks(self, i: Ints, j: Ints) -> Ints:
         """Numbers of the blocks of pairs of local nodes; -1 for a missing block."""
         return self._find(*self._at(i, j))
 
     def entries(self, i: Ints, j: Ints) -> Longs:
-        """Indices (pairs, 3, 3) of the entries of the blocks of pairs of local nodes in the array of values."""
+        """Indices (pairs, 3, 3) of the entries of the blocks of pairs of local nodes in the array
+        of values.
+        """
         return self._entries(*self._at(i, j))
 
     def add_ghosts(self, values: NDArray[np.float64]) -> None:
@@ -110,7 +125,10 @@ class Pattern:
         return np.where(self._keys[places] == keys, places, -1).astype(np.int32)
 
     def _entries(self, rows: Any, columns: Any) -> Longs:
-        start, width = self.starts[rows].astype(np.int64), 3 * (self.starts[rows + 1] - self.starts[rows])
+        start, width = (
+            self.starts[rows].astype(np.int64),
+            3 * (self.starts[rows + 1] - self.starts[rows]),
+        )
         c = np.arange(3)
         first = 6 * start + 3 * self._find(rows, columns)
         return np.asarray(first[:, None, None] + c[:, None] * width[:, None, None] + c)
@@ -125,7 +143,9 @@ class Pattern:
 
 def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> "scipy.sparse.csr_array":
     """A matrix with each position once, sorted; its values have no meaning."""
-    positions = scipy.sparse.coo_array((np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape).tocsr()
+    positions = scipy.sparse.coo_array(
+        (np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape
+    ).tocsr()
     positions.sum_duplicates()
     return positions
 
@@ -147,13 +167,17 @@ class BlockMatrix:
     Parameters
     ----------
     coupled
-        Batches of pairs of local cells, (n,) on one side and on the other, with blocks that couple them.
+        Batches of pairs of local cells, (n,) on one side and on the other, with blocks that couple
+        them.
     clamped
         Homogeneous Dirichlet conditions.
     """
 
     def __init__(
-        self, V: fem.FunctionSpace, coupled: Sequence[tuple[Ints, ...]], clamped: list[fem.DirichletBC]
+        self,
+        V: fem.FunctionSpace,
+        coupled: Sequence[tuple[Ints, ...]],
+        clamped: list[fem.DirichletBC],
     ) -> None:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         self._ffi, self._lib = native(Path(__file__).with_name("scatter.c"), FUNCTIONS, comm)
@@ -166,7 +190,10 @@ class BlockMatrix:
         self._pattern = pattern = Pattern(nodes, self._free_pairs(), comm)
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
         self._coupling_blocks = [
-            np.stack([pattern.blocks(*_pairs(rows, columns)), pattern.blocks(*_pairs(columns, rows))], axis=1)
+            np.stack(
+                [pattern.blocks(*_pairs(rows, columns)), pattern.blocks(*_pairs(columns, rows))],
+                axis=1,
+            )
             for rows, columns in self._coupled
         ]
         self._zeros, self._ones = self._held_entries(held)
@@ -180,7 +207,9 @@ class BlockMatrix:
             numbers = (3 * pattern.others[oj // 3] + oj % 3).astype(PETSc.IntType)
             parts.append((oi, numbers, self._values[len(j) : len(j) + len(oj)]))
         size = ((3 * n, None), (3 * n, None))
-        self._K = PETSc.Mat().createAIJWithArrays(size, parts[0] if comm.size == 1 else tuple(parts), comm=comm)
+        self._K = PETSc.Mat().createAIJWithArrays(
+            size, parts[0] if comm.size == 1 else tuple(parts), comm=comm
+        )
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
             self._K.setOption(option, True)
 
@@ -194,8 +223,9 @@ class BlockMatrix:
         Parameters
         ----------
         K
-            (cells, 9, pairs a <= b of functions): the symmetric parts of the blocks at a, b, components in the
-            order of `point_kernels.COMPONENTS`, then their skew parts in that of `point_kernels.SKEW`.
+            (cells, 9, pairs a <= b of functions): the symmetric parts of the blocks at a, b,
+            components in the order of `point_kernels.COMPONENTS`, then their skew parts in that of
+            `point_kernels.SKEW`.
         """
         self._scatter("same", self._cells, self._blocks, K)
 
@@ -248,8 +278,17 @@ class BlockMatrix:
             touched = some[i] | some[j]
             keys.append(np.unique(i[touched] * np.int64(len(held)) + j[touched]))
         i, j = (x.astype(np.int32) for x in np.divmod(np.unique(np.concatenate(keys)), len(held)))
-        entries, rows, columns = self._pattern.entries(i, j), held[i][:, :, None], held[j][:, None, :]
-        diagonal = (i == j)[:, None, None] & rows & np.eye(3, dtype=bool) & (i < self._pattern.owned)[:, None, None]
+        entries, rows, columns = (
+            self._pattern.entries(i, j),
+            held[i][:, :, None],
+            held[j][:, None, :],
+        )
+        diagonal = (
+            (i == j)[:, None, None]
+            & rows
+            & np.eye(3, dtype=bool)
+            & (i < self._pattern.owned)[:, None, None]
+        )
         return entries[rows | columns], entries[diagonal]
 
 

@@ -49,7 +49,9 @@ class Table:
         return np.asarray(jets.reshape(len(nodal), points, parts, 3))
 
     def symmetric(self, w: Array, pairs: tuple[Pair, ...]) -> Array:
-        """w (D_i D_j + D_j D_i) of functions a <= b, (points * pairs, functions (functions + 1)/2); once if i = j."""
+        """w (D_i D_j + D_j D_i) of functions a <= b, (points * pairs, functions (functions + 1)/2);
+        once if i = j.
+        """
         a, b = self.triangle
         D = self.values
         products = [D[:, i, a] * D[:, j, b] + (i < j) * D[:, j, a] * D[:, i, b] for i, j in pairs]
@@ -79,7 +81,9 @@ def cell_rule(degree: int) -> tuple[Array, Array]:
 
 
 def edge_rule(degree: int, edge: int, backwards: bool) -> tuple[Array, Array]:
-    """Points (q, 2) on an edge, from its first corner or from its last, and weights that sum to one."""
+    """Points (q, 2) on an edge, from its first corner or from its last, and weights that sum to
+    one.
+    """
     x, weights = basix.make_quadrature(basix.CellType.interval, degree)
     start, end = CORNERS[list(EDGES[edge][:: -1 if backwards else 1])]
     return start + np.asarray(x) * (end - start), np.asarray(weights)
@@ -96,7 +100,8 @@ def edge_covector(edge: int) -> Array:
 def cell_frames(domain: mesh.Mesh) -> Array:
     """(local cells, 4): p, q, s and the Jacobian determinant of each triangle in space.
 
-    With X, Y the reference coordinates and x along the first edge, d/dx = p d/dX and d/dy = q d/dX + s d/dY.
+    With X, Y the reference coordinates and x along the first edge, d/dx = p d/dX and d/dy = q d/dX
+    + s d/dY.
     """
     corners = domain.geometry.x[compat.corner_numbers(domain)]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -108,9 +113,11 @@ def cell_frames(domain: mesh.Mesh) -> Array:
 
 
 class Sheet:
-    """Some of a field's derivatives at points of every cell, in the order (cell; point, part, component).
+    """Some of a field's derivatives at points of every cell, in the order (cell; point, part,
+    component).
 
-    The table of shape functions is expanded to vectors. This triples the arithmetic but avoids sorting.
+    The table of shape functions is expanded to vectors. This triples the arithmetic but avoids
+    sorting.
 
     Parameters
     ----------
@@ -125,7 +132,9 @@ class Sheet:
         self._back = np.einsum("q,qpf,cd->qpdfc", weights, D, one).reshape(-1, size)
 
     def at_points(self, nodal: Array, out: Array) -> None:
-        """Write the values at the points to `out`, in any shape, from nodal vectors (cells, functions * 3)."""
+        """Write the values at the points to `out`, in any shape, from nodal vectors (cells,
+        functions * 3).
+        """
         np.matmul(nodal, self._there, out=out.reshape(-1, self._there.shape[1]))
 
     def at_nodes(self, gradients: Array) -> Array:

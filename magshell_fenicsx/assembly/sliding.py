@@ -1,7 +1,8 @@
 """Supports in any direction, imposed by a projection.
 
-With the projector P of every such node, u is replaced by P u. The residual becomes P b and the tangent
-P K P + (I - P), whose number of negative eigenvalues is that of K for admissible displacements.
+With the projector P of every such node, u is replaced by P u. The residual becomes P b and the
+tangent P K P + (I - P), whose number of negative eigenvalues is that of K for admissible
+displacements.
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,9 @@ class Sliding:
 Constraint: TypeAlias = fem.DirichletBC | Sliding
 
 
-def held_along(V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], normal: Array) -> Constraint:
+def held_along(
+    V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], normal: Array
+) -> Constraint:
     """u . normal = 0 on some edges (`dim` 1) or faces (2)."""
     axis = int(np.argmax(np.abs(normal)))
     if np.delete(normal, axis).any():
@@ -46,7 +49,9 @@ class Projection:
         Conditions on components, possibly at the same nodes.
     """
 
-    def __init__(self, V: fem.FunctionSpace, sliding: Sequence[Sliding], clamped: Sequence[fem.DirichletBC]) -> None:
+    def __init__(
+        self, V: fem.FunctionSpace, sliding: Sequence[Sliding], clamped: Sequence[fem.DirichletBC]
+    ) -> None:
         index = V.dofmap.index_map
         held = np.zeros((index.size_local + index.num_ghosts, 3), dtype=bool)
         for bc in clamped:
@@ -76,9 +81,15 @@ class Projection:
         return np.asarray(u - inside)
 
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
-        """P K P + (I - P); the same object while K is the same, which contact makes another. Collective."""
+        """P K P + (I - P); the same object while K is the same, which contact makes another.
+
+        Collective.
+        """
         if self._by_node is None:
-            self._by_node, self._rest = self._blocks(self._P, 1.0), self._blocks(np.eye(3) - self._P, 0.0)
+            self._by_node, self._rest = (
+                self._blocks(self._P, 1.0),
+                self._blocks(np.eye(3) - self._P, 0.0),
+            )
         same = self._of is not None and self._of.handle == K.handle
         self._K = K.ptap(self._by_node, self._K if same else None)
         self._of = K
@@ -98,7 +109,9 @@ class Projection:
         return product
 
     def _blocks(self, blocks: Array, elsewhere: float) -> PETSc.Mat:
-        """The block-diagonal matrix with blocks at these nodes and a number on the diagonal elsewhere."""
+        """The block-diagonal matrix with blocks at these nodes and a number on the diagonal
+        elsewhere.
+        """
         n, first = 3 * self._owned, 3 * self._first
         mat = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
         owned = self._nodes < self._owned

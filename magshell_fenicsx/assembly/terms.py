@@ -58,11 +58,11 @@ def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
 class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
-    `linear` says that the energy is linear in u, so that it has no tangent; `over` is an integral that a linear one has
-    been divided by.
+    `linear` says that the energy is linear in u, so that it has no tangent; `over` is an integral
+    that a linear one has been divided by.
 
-    A load may have no potential. Then `work`, its virtual work, takes the place of the energy's gradient, and the
-    energy is only reported. The derivative of the work is no symmetric form.
+    A load may have no potential. Then `work`, its virtual work, takes the place of the energy's
+    gradient, and the energy is only reported. The derivative of the work is no symmetric form.
 
     Attributes
     ----------
@@ -121,7 +121,9 @@ class FormTerm:
 
     @cached_property
     def _tangent(self) -> Callable[[], fem.Form] | None:
-        return None if self.linear else self._begin("tangent", lambda: self._factor * self._symmetric)
+        return (
+            None if self.linear else self._begin("tangent", lambda: self._factor * self._symmetric)
+        )
 
     @cached_property
     def skew_form(self) -> fem.Form | None:
@@ -137,7 +139,9 @@ class FormTerm:
     def _begin(self, what: str, make: Callable[[], ufl.Form]) -> Callable[[], fem.Form]:
         of = self.form if self._work is None else self._work
         how = what if self._work is None else f"{what} of work"
-        return self._log.begin(f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,)))
+        return self._log.begin(
+            f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,))
+        )
 
     @property
     def _symmetric(self) -> ufl.Form:
@@ -180,7 +184,9 @@ class FormTerm:
             compat.add_matrix(K, self.tangent_form, clamped)
 
     def add_skew(self, N: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """Add factor times the skew part of the derivative of the work, of a load without potential."""
+        """Add factor times the skew part of the derivative of the work, of a load without
+        potential.
+        """
         self.renew()
         self._factor.value = factor
         compat.add_matrix(N, self.skew_form, clamped)
@@ -189,8 +195,8 @@ class FormTerm:
 class Counted(FormTerm):
     """-Pi = intensity times the angle of an edge, integrated; the angle goes on beyond half a turn.
 
-    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that stands in the state, so
-    that it is a function of the state.
+    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that
+    stands in the state, so that it is a function of the state.
     """
 
     def count_from(self, past: fem.Constant, whole: float) -> None:
@@ -213,7 +219,9 @@ class Counted(FormTerm):
 
     @property
     def value(self) -> float:
-        """The angle (rad) that turns are counted from; the mean angle of the edge is within pi of it."""
+        """The angle (rad) that turns are counted from; the mean angle of the edge is within pi of
+        it.
+        """
         return self._turned
 
     @value.setter
@@ -295,7 +303,9 @@ class TangentAssembler(Protocol):
         """
 
     def times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
-        """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
+        """This rank's part of the matrix without supports times a vector with ghosts, exact where
+        nodes move.
+        """
 
 
 class ResidualAssembler(Protocol):

@@ -1,10 +1,12 @@
-"""The tangent of a system in which all unknowns act on each other: the sparse matrix and what stands beside it.
+"""The tangent of a system in which all unknowns act on each other: the sparse matrix and what
+stands beside it.
 
-What a term adds is stored between nodes that are near each other, and known by its products with vectors between
-others. Of what is stored, the entries that the sparse matrix has too are added to it: the rest is then small beside
-it, and factors of the sparse one mostly serve (`continuation.beside`). The sum is a matrix of PETSc with all entries,
-of which factors, inertia, folds and modes are those of any system. Its memory and its factors grow with the square
-and the cube of the number of unknowns.
+What a term adds is stored between nodes that are near each other, and known by its products with
+vectors between others. Of what is stored, the entries that the sparse matrix has too are added to
+it: the rest is then small beside it, and factors of the sparse one mostly serve
+(`continuation.beside`). The sum is a matrix of PETSc with all entries, of which factors, inertia,
+folds and modes are those of any system. Its memory and its factors grow with the square and the
+cube of the number of unknowns.
 """
 
 from collections.abc import Sequence
@@ -40,14 +42,17 @@ class Acting(Protocol):
     Attributes
     ----------
     stored
-        (3 local nodes with ghosts, 3 all nodes) the blocks between nodes near each other, each row's columns in order.
+        (3 local nodes with ghosts, 3 all nodes) the blocks between nodes near each other, each
+        row's columns in order.
     """
 
     @property
     def stored(self) -> bsr_array: ...
 
     def times_others(self, v: Array) -> Array:
-        """The product (3 local nodes, n) of all other entries with the same changes (3 all nodes, n) on every rank."""
+        """The product (3 local nodes, n) of all other entries with the same changes (3 all nodes,
+        n) on every rank.
+        """
 
 
 @runtime_checkable
@@ -61,12 +66,15 @@ class WholeTerm(Term, Protocol):
         """As `add_residual`, by what is known of states near by; collective."""
 
     def knows_along(self, step: Array) -> bool:
-        """Whether what is known of states near by is right along a change of all unknowns; collective."""
+        """Whether what is known of states near by is right along a change of all unknowns;
+        collective.
+        """
 
 
 @dataclass(frozen=True)
 class Singles:
-    """A matrix of (3, 3) blocks in single precision; of a symmetric one only the blocks on and above the diagonal.
+    """A matrix of (3, 3) blocks in single precision; of a symmetric one only the blocks on and
+    above the diagonal.
 
     Attributes
     ----------
@@ -150,7 +158,9 @@ class Rows:
 
     def scaled(self, factor: float) -> "Rows":
         """See `Rest`."""
-        return Rows(self.matrix, [replace(part, factor=factor * part.factor) for part in self.parts])
+        return Rows(
+            self.matrix, [replace(part, factor=factor * part.factor) for part in self.parts]
+        )
 
     def over(self, other: Rest) -> float:
         """See `Rest`."""
@@ -158,7 +168,11 @@ class Rows:
             return 0.0
         pairs = list(zip(self.parts, other.parts, strict=True))
         factors = {mine.factor / theirs.factor for mine, theirs in pairs}
-        return factors.pop() if len(factors) == 1 and all(a.acting is b.acting for a, b in pairs) else 0.0
+        return (
+            factors.pop()
+            if len(factors) == 1 and all(a.acting is b.acting for a, b in pairs)
+            else 0.0
+        )
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         """See `Rest`."""
@@ -166,7 +180,8 @@ class Rows:
 
 
 class WholeMatrix:
-    """A symmetric matrix with all entries, always the same object; clamped unknowns as in `scatter.BlockMatrix`.
+    """A symmetric matrix with all entries, always the same object; clamped unknowns as in
+    `scatter.BlockMatrix`.
 
     Parameters
     ----------
@@ -178,7 +193,9 @@ class WholeMatrix:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         self._owned, self._ghosts = nodes.size_local, nodes.num_ghosts
         self._first, self._count = nodes.local_range[0], nodes.size_global
-        self._numbers = nodes.local_to_global(np.arange(self._owned, self._owned + self._ghosts, dtype=np.int32))
+        self._numbers = nodes.local_to_global(
+            np.arange(self._owned, self._owned + self._ghosts, dtype=np.int32)
+        )
         self._owners = nodes.owners
         n = 3 * self._owned
         held = np.zeros(n, dtype=bool)
@@ -197,20 +214,29 @@ class WholeMatrix:
         kind = PETSc.IntType
         inner, outer = np.zeros((n, n)), np.zeros((n, whole - n))
         outside = np.delete(np.arange(whole, dtype=kind), np.s_[first : first + n])
-        starts = [np.arange(0, n * width + 1, width or 1, dtype=kind)[: n + 1] for width in (n, whole - n)]
+        starts = [
+            np.arange(0, n * width + 1, width or 1, dtype=kind)[: n + 1] for width in (n, whole - n)
+        ]
         starts[1] = starts[1] if whole > n else np.zeros(n + 1, dtype=kind)
         parts = [(starts[0], np.tile(np.arange(n, dtype=kind), n), inner.reshape(-1))]
         if self.comm.size > 1:
             parts.append((starts[1], np.tile(outside, n), outer.reshape(-1)))
         size = ((n, None), (n, None))
-        K = PETSc.Mat().createAIJWithArrays(size, parts[0] if len(parts) == 1 else tuple(parts), comm=self.comm)
+        K = PETSc.Mat().createAIJWithArrays(
+            size, parts[0] if len(parts) == 1 else tuple(parts), comm=self.comm
+        )
         self._kept = parts  # the arrays that PETSc shares
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
             K.setOption(option, True)
         return inner, outer, K
 
-    def beside(self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]], *, rough: bool = False) -> Beside:
-        """A sparse matrix, to which its own entries of terms times factors are added, and the rest. Collective."""
+    def beside(
+        self, K: PETSc.Mat, terms: Sequence[tuple[float, WholeTerm]], *, rough: bool = False
+    ) -> Beside:
+        """A sparse matrix, to which its own entries of terms times factors are added, and the rest.
+
+        Collective.
+        """
         starts, columns, values = K.getValuesCSR()
         whole = [self.of_term(factor, term, rough=rough) for factor, term in terms]
         kept = list[OfTerm]()
@@ -223,9 +249,15 @@ class WholeMatrix:
         return Beside(K, Rows(self, kept), Rows(self, whole))
 
     def _in(self, starts: NDArray[np.intp], columns: NDArray[np.intp], part: OfTerm) -> csr_array:
-        """What a sparse matrix has entries for, of a term without its factor; found once for each pattern."""
+        """What a sparse matrix has entries for, of a term without its factor; found once for each
+        pattern.
+        """
         found = self._found
-        same = found is not None and found[0] is part.stored and np.array_equal(found[1].indices, columns)
+        same = (
+            found is not None
+            and found[0] is part.stored
+            and np.array_equal(found[1].indices, columns)
+        )
         if found is None or not same or not np.array_equal(found[1].indptr, starts):
             rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
             free = ~(self.held[0][rows] | self.held[1][columns])
@@ -256,7 +288,11 @@ class WholeMatrix:
         acting, known = term.acting(rough=rough), self._stored.get(term.name)
         if known is None or known[0] is not acting:
             stored = self._own_blocks(acting.stored)
-            known = self._stored[term.name] = acting, stored, Singles.of(stored, upper=self.comm.size == 1)
+            known = self._stored[term.name] = (
+                acting,
+                stored,
+                Singles.of(stored, upper=self.comm.size == 1),
+            )
         return OfTerm(factor, *known[1:], acting)
 
     def rows(self, term: WholeTerm) -> Array:
@@ -264,7 +300,10 @@ class WholeMatrix:
         return self._all(self.of_term(1.0, term))
 
     def product(self, parts: Sequence[OfTerm], whole: Array, *, singles: bool = False) -> Array:
-        """Terms times factors, supports too, with changes of all unknowns; of own unknowns. Collective."""
+        """Terms times factors, supports too, with changes of all unknowns; of own unknowns.
+
+        Collective.
+        """
         product = np.zeros(3 * self._owned)
         for part in parts:
             others = part.acting.times_others(whole[:, None]).reshape(-1, 3)
@@ -275,9 +314,14 @@ class WholeMatrix:
         return product
 
     def times(self, terms: Sequence[tuple[float, WholeTerm]], v: Array) -> Array:
-        """The terms' product with a vector, both with ghosts, which are zero in the product. Collective."""
+        """The terms' product with a vector, both with ghosts, which are zero in the product.
+
+        Collective.
+        """
         whole, product = np.concatenate(self.comm.allgather(v[: 3 * self._owned])), np.zeros_like(v)
-        product[: 3 * self._owned] = self.product([self.of_term(factor, term) for factor, term in terms], whole)
+        product[: 3 * self._owned] = self.product(
+            [self.of_term(factor, term) for factor, term in terms], whole
+        )
         return product
 
     def _all(self, part: OfTerm) -> Array:
@@ -286,7 +330,9 @@ class WholeMatrix:
         for first in range(0, 3 * self._count, COLUMNS):
             some = np.eye(3 * self._count, min(COLUMNS, 3 * self._count - first), -first)
             others = part.acting.times_others(some)
-            rows[:, first : first + COLUMNS] += self._own(others.reshape(-1, 3, some.shape[1])).reshape(len(rows), -1)
+            rows[:, first : first + COLUMNS] += self._own(
+                others.reshape(-1, 3, some.shape[1])
+            ).reshape(len(rows), -1)
         return np.asarray(rows)
 
     def _own(self, rows: Array) -> Array:
@@ -294,7 +340,9 @@ class WholeMatrix:
         if self.comm.size == 1:
             return rows
         own, ghosts = rows[: self._owned].copy(), rows[self._owned :]
-        for numbers, part in self.comm.alltoall([(self._numbers[i], ghosts[i]) for i in self._leaving]):
+        for numbers, part in self.comm.alltoall(
+            [(self._numbers[i], ghosts[i]) for i in self._leaving]
+        ):
             np.add.at(own, numbers - self._first, part)
         return own
 
@@ -303,7 +351,11 @@ class WholeMatrix:
         if self.comm.size == 1:
             return rows
         n = 3 * self._owned
-        own, ghosts, sent = rows.tocsr()[:n], rows.tocsr()[n:].tocoo(), list[tuple[NDArray[np.generic], ...]]()
+        own, ghosts, sent = (
+            rows.tocsr()[:n],
+            rows.tocsr()[n:].tocoo(),
+            list[tuple[NDArray[np.generic], ...]](),
+        )
         for nodes in self._leaving:
             leaves = np.isin(ghosts.row // 3, nodes)
             row = 3 * self._numbers[ghosts.row[leaves] // 3] + ghosts.row[leaves] % 3
@@ -323,7 +375,9 @@ class WholeMatrix:
 def _entries(stored: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
     """Entries of a matrix of blocks whose columns are in order; zero where there is no block."""
     width, count = stored.shape[1] // 3, len(stored.indptr) - 1
-    keys = np.repeat(np.arange(count, dtype=np.int64), np.diff(stored.indptr)) * width + stored.indices
+    keys = (
+        np.repeat(np.arange(count, dtype=np.int64), np.diff(stored.indptr)) * width + stored.indices
+    )
     wanted = rows.astype(np.int64) // 3 * width + columns // 3
     if not len(keys):
         return np.zeros(len(wanted))

@@ -18,11 +18,24 @@ from pydantic import (
     model_validator,
 )
 
-from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_strange, refuse_unfit_steps
+from magshell_fenicsx.case.loading import (
+    Loading,
+    listed,
+    programme,
+    refuse_strange,
+    refuse_unfit_steps,
+)
 from magshell_fenicsx.case.merged import expanded, written
 from magshell_fenicsx.case.shells import Part, Several, Shells, in_words_of_shells
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, Later, digests, numbers_with_units
+from magshell_fenicsx.input.section import (
+    NOTED,
+    Chosen,
+    FileKeys,
+    Later,
+    digests,
+    numbers_with_units,
+)
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.press import approaches
@@ -41,7 +54,12 @@ from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.parts.touching.section import Pairs
 from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
-from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
+from magshell_fenicsx.problem.wanted import (
+    FrequenciesSection,
+    GradientsSection,
+    OutputSection,
+    StabilitySection,
+)
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface
 from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
@@ -52,7 +70,17 @@ if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
 Waves = Annotated[int, Field(ge=1, le=200)]
-LIKE_THE_SHELL = ("mesh", "points", "sensors", "field_maps", "natural", "bodies", "joints", "loading", *PARTS)
+LIKE_THE_SHELL = (
+    "mesh",
+    "points",
+    "sensors",
+    "field_maps",
+    "natural",
+    "bodies",
+    "joints",
+    "loading",
+    *PARTS,
+)
 """Sections whose numbers have units where the shell's lengths have."""
 
 
@@ -130,7 +158,9 @@ class Case(WithParts):
         several = Several(parts, self.several.joints, self.several.pairs)
         shell = self.shell.model_copy(update={"file": several.file})
         assert isinstance(shell, MeshSurface)
-        copied = self.model_copy(update={"shell": shell, "shells": {part.name: part.section for part in parts}})
+        copied = self.model_copy(
+            update={"shell": shell, "shells": {part.name: part.section for part in parts}}
+        )
         copied._several = several
         shell.files.given[shell.path] = several.assembly
         return copied
@@ -151,7 +181,9 @@ class Case(WithParts):
             section.shell.files.given[section.shell.path] = several.assembly
         if isinstance(data, dict) and not section.shell.with_units:
             for key in section._with_units(data):
-                raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
+                raise ValueError(
+                    f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none"
+                )
         return section
 
     def _with_units(self, data: Mapping[str, Any]) -> Iterator[str]:
@@ -161,7 +193,9 @@ class Case(WithParts):
         shell = data.get("shell")
         if isinstance(shell, Mapping):
             for key in ("imperfections", "defect"):
-                yield from numbers_with_units(getattr(self.shell, key, None), shell.get(key), f"shell.{key}")
+                yield from numbers_with_units(
+                    getattr(self.shell, key, None), shell.get(key), f"shell.{key}"
+                )
 
     @model_validator(mode="after")
     def _abilities_fit(self) -> Self:
@@ -173,7 +207,8 @@ class Case(WithParts):
         return self
 
     def problem(self, smooth: Collection[str] = ()) -> "Problem":
-        """What will be computed; `smooth` are keys whose formulas are known to have no details between samples.
+        """What will be computed; `smooth` are keys whose formulas are known to have no details
+        between samples.
 
         Raises
         ------
@@ -187,20 +222,30 @@ class Case(WithParts):
     @property
     def patches(self) -> dict[str, Iterable[str]]:
         """Keys with values by patch -> the names of these."""
-        return {key: names for ability in self.context.abilities for key, names in ability.patches().items()}
+        return {
+            key: names
+            for ability in self.context.abilities
+            for key, names in ability.patches().items()
+        }
 
     @model_validator(mode="after")
     def _model_fits(self) -> Self:
         read = isinstance(self.shell, MeshSurface)
-        for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}) if read else []:
+        for key in (
+            sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}) if read else []
+        ):
             if not self.several:
-                raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
+                raise ValueError(
+                    f"mesh.{key}: not with geometry: mesh, whose elements are those of the file"
+                )
         if self.model == "shell":
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
         if isinstance(self.thickness_factor, dict | GivenField):
-            raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
+            raise ValueError(
+                "shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body"
+            )
         self.mesh.refuse_unfit_solid(read=read)
         if self.symmetry not in ("auto", "none", "half"):
             raise ValueError(f"symmetry: {self.symmetry}: a solid is whole or half")
@@ -237,7 +282,11 @@ class Case(WithParts):
     def imperfections(self) -> dict[str, ImperfectionSection]:
         """Key of each imperfection below `shell` -> section; `defect` is one of them."""
         shell = self.shell
-        defect = shell.defect if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) else None
+        defect = (
+            shell.defect
+            if isinstance(shell, ShellSection | CapSurface | RevolutionSurface)
+            else None
+        )
         listed = dict[str, ImperfectionSection]()
         for i, section in enumerate(shell.imperfections):
             listed |= {f"imperfections.{i}{key}": each for key, each in section.listed().items()}
@@ -281,9 +330,15 @@ class Case(WithParts):
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """Hashes of what is solved besides its own keys: mesh file, other files, user-defined energies."""
+        """Hashes of what is solved besides its own keys: mesh file, other files, user-defined
+        energies.
+        """
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        return mesh | digests({key: s for key, s in self.readers.items() if s is not self.shell}) | self.term_digests
+        return (
+            mesh
+            | digests({key: s for key, s in self.readers.items() if s is not self.shell})
+            | self.term_digests
+        )
 
     @property
     def readers(self) -> dict[str, FileKeys]:
@@ -292,7 +347,9 @@ class Case(WithParts):
             "shell": self.shell,
             "magnetic.remanent": self.remanent,
         }
-        sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        sections |= self.imperfections | {
+            f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)
+        }
         sections |= self.several.readers if self.several else {}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
@@ -326,4 +383,6 @@ class Case(WithParts):
             case = cls.model_validate(source.data, context=context)
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
-            raise InvalidCase(e.errors(), source, cls, partial(in_words_of_shells, data=source.data)) from None
+            raise InvalidCase(
+                e.errors(), source, cls, partial(in_words_of_shells, data=source.data)
+            ) from None

@@ -40,10 +40,14 @@ def describe(case: Case, problem: Problem | None = None) -> str:
 
 def _described(case: Case, problem: Problem) -> str:
     too_large = None if case.mesh.tolerance else refuse_beyond_memory(problem)
-    unsupported = all(condition in ("free", "symmetry") for condition in problem.conditions.values())
+    unsupported = all(
+        condition in ("free", "symmetry") for condition in problem.conditions.values()
+    )
     springs_may_hold = bool(problem.loads.own)  # a run asks its tangent
     if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
-        raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
+        raise CaseError(
+            "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
+        )
     numbers = {
         "R/h": 1 / problem.material.h,
         "nu": problem.material.nu,
@@ -65,13 +69,17 @@ def _described(case: Case, problem: Problem) -> str:
         patch = None if problem.axisymmetric else problem.triangulated()
         cells, unknowns = _count(problem, patch)
         refuse_overlap(problem, cells)
-        lines.append(f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns")
+        lines.append(
+            f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"
+        )
         if patch and not problem.body and (sliver := problem.flat_triangle(patch)):
             lines.append(f"mesh: may be unstable: {sliver}")
         if patch and isinstance(problem.shape, MeshFile):
             lines += _surface(patch)
     else:
-        lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
+        lines.append(
+            f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}"
+        )
     left_out = list(problem.left_out)
     if problem.loads.pressure and (open_at := _open(problem, patch)):
         left_out.append(no_potential(open_at))
@@ -80,13 +88,23 @@ def _described(case: Case, problem: Problem) -> str:
     if case.design:
         left_out.append("design: what varies (magshell design alone varies it)")
     if case.identify:
-        left_out.append("identify: numbers that are looked for (magshell identify alone varies them)")
+        left_out.append(
+            "identify: numbers that are looked for (magshell identify alone varies them)"
+        )
     left_out = left_out or ["nothing"]
-    lines += ["built:", *(f"  {item}" for item in problem.included), "left out:", *(f"  {item}" for item in left_out)]
+    lines += [
+        "built:",
+        *(f"  {item}" for item in problem.included),
+        "left out:",
+        *(f"  {item}" for item in left_out),
+    ]
     missed: list[str] = []
     if patch and (formulas := written(problem.context)):
         missed = unshown(
-            formulas, cells_of_patch(patch, degree_of(problem.context)), problem.azimuth, problem.material.h
+            formulas,
+            cells_of_patch(patch, degree_of(problem.context)),
+            problem.azimuth,
+            problem.material.h,
         )
     lines += [f"warning: {said}" for said in (*problem.warnings, too_large, *missed) if said]
     return "\n".join(lines)
@@ -95,17 +113,29 @@ def _described(case: Case, problem: Problem) -> str:
 def _in_units(case: Case, without: str) -> list[str]:
     """The sizes of a case with units, but for one scale."""
     sizes = sizes_of(case.context)
-    named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", sizes.field)}
+    named = {
+        "h": ("h", "mm"),
+        "p_c": ("p_c", "Pa"),
+        "2πD/R": ("2 pi D/R", "N"),
+        "λ_m": ("applied field", sizes.field),
+    }
     factor = {"λ_m": case.lambda_m}
-    shown = {scale: words for scale, words in named.items() if scale in sizes.of and scale != without}
-    return [f"{name} = {sizes.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in shown.items()]
+    shown = {
+        scale: words for scale, words in named.items() if scale in sizes.of and scale != without
+    }
+    return [
+        f"{name} = {sizes.of[scale] * factor.get(scale, 1.0):.6g} {unit}"
+        for scale, (name, unit) in shown.items()
+    ]
 
 
 def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
     """The edges at which a live pressure has no potential."""
     span = problem.meridian
     if span is None:
-        return open_edges(patch or problem.triangulated(), problem.conditions, problem.loads.pressed)
+        return open_edges(
+            patch or problem.triangulated(), problem.conditions, problem.loads.pressed
+        )
     return ring_openings(span.ends(), problem.conditions, problem.loads.pressed)[1]
 
 

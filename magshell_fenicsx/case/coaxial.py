@@ -1,4 +1,6 @@
-"""The meridians of several shells of revolution with one axis, one after the other along one parameter."""
+"""The meridians of several shells of revolution with one axis, one after the other along one
+parameter.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +51,9 @@ class Turned:
 
     @property
     def upright(self) -> bool:
-        """Whether its own e3 is that of all; else it is walked from its end, for its normal to stay outside."""
+        """Whether its own e3 is that of all; else it is walked from its end, for its normal to stay
+        outside.
+        """
         return bool(self.place.Q[2, 2] > 0)
 
     @property
@@ -70,7 +74,10 @@ class Turned:
     def at(self, s: Array) -> Array:
         """Places (n, 3) in the plane of e1 and e3."""
         own = self.own(s)
-        return self._turned(self.place.scale * self.span.embedding(np.column_stack([own, 0 * own]))) + self._moved
+        return (
+            self._turned(self.place.scale * self.span.embedding(np.column_stack([own, 0 * own])))
+            + self._moved
+        )
 
     def normal(self, s: Array) -> Array:
         """Outward normals (n, 3) there."""
@@ -91,7 +98,9 @@ class Turned:
     def vertices(self, pressed: Sequence[tuple[float, float]]) -> Array:
         """See `Piece`."""
         own = tuple((size / self.place.scale, reach / self.place.scale) for size, reach in pressed)
-        s = self.parameter(meridian_vertices(replace(self.problem, pressed=(*self.problem.pressed, *own))))
+        s = self.parameter(
+            meridian_vertices(replace(self.problem, pressed=(*self.problem.pressed, *own)))
+        )
         return np.asarray(s if self.upright else s[::-1])
 
     @property
@@ -103,7 +112,10 @@ class Turned:
     @property
     def places(self) -> list[tuple[str | None, Array]]:
         """Their names and places."""
-        return [(name, self.at(np.array([s]))[0]) for name, s in zip(self.names, (self.start, self.end), strict=True)]
+        return [
+            (name, self.at(np.array([s]))[0])
+            for name, s in zip(self.names, (self.start, self.end), strict=True)
+        ]
 
     @property
     def piece(self) -> Piece:
@@ -120,7 +132,9 @@ class Turned:
 
 @dataclass(frozen=True)
 class Joined:
-    """Charts (n, 2) of the meridians of all -> places (n, 3); the parameters of each follow its begin."""
+    """Charts (n, 2) of the meridians of all -> places (n, 3); the parameters of each follow its
+    begin.
+    """
 
     shells: Sequence[Turned]
     begins: Array
@@ -170,9 +184,16 @@ def meridians(several: "Several") -> Span | str:
     if isinstance(after, str):
         return after
     places = dict(of for shell in shells for of in shell.places)
-    marked = [_marked(shell, [places[foot] for foot, on in several.joints if on == shell.name]) for shell in shells]
+    marked = [
+        _marked(shell, [places[foot] for foot, on in several.joints if on == shell.name])
+        for shell in shells
+    ]
     ordered = _in_chains(marked, after)
-    return "joints: shells are joined in a ring" if len(ordered) < len(shells) else _joined(ordered, several)
+    return (
+        "joints: shells are joined in a ring"
+        if len(ordered) < len(shells)
+        else _joined(ordered, several)
+    )
 
 
 def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[str, str] | str:
@@ -187,7 +208,9 @@ def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[
             continue  # of a T-junction
         if any(name not in ends for name in names):
             return f"{key}: there is no such edge"
-        (begin, x, after_it), (end, y, before_it) = sorted((ends[name] for name in names), key=lambda end: end[0])
+        (begin, x, after_it), (end, y, before_it) = sorted(
+            (ends[name] for name in names), key=lambda end: end[0]
+        )
         if (begin, end) != (0, 1):
             return f"{key}: the normals of {both} point to opposite sides"
         if np.linalg.norm(x - y) > MEET * extent:
@@ -217,7 +240,9 @@ def _in_chains(shells: Sequence[Turned], after: Mapping[str, str]) -> list[Turne
 
 def _alone(part: "Part") -> Problem | str:
     """The meridian of a shell alone; or why there is none."""
-    from magshell_fenicsx.case.planner import make_problem  # which finds the outlines of several shells
+    from magshell_fenicsx.case.planner import (
+        make_problem,
+    )  # which finds the outlines of several shells
 
     try:
         return make_problem(part.case.model_copy(update={"symmetry": "axisymmetric"}))
@@ -240,10 +265,17 @@ def _joined(shells: Sequence[Turned], several: "Several") -> Span:
             return by_name[names[round(float(x[-1]))]].foot(x)
         at = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
         feet = [shell.foot(x) for shell in shells]
-        away = [np.linalg.norm(shell.at(np.array([s]))[0] - at) for shell, (s, _) in zip(shells, feet, strict=True)]
+        away = [
+            np.linalg.norm(shell.at(np.array([s]))[0] - at)
+            for shell, (s, _) in zip(shells, feet, strict=True)
+        ]
         return feet[int(np.argmin(away))]
 
-    at = {name: s for shell in shells for name, s in zip(shell.names, (shell.start, shell.end), strict=True)}
+    at = {
+        name: s
+        for shell in shells
+        for name, s in zip(shell.names, (shell.start, shell.end), strict=True)
+    }
     places = dict(of for shell in shells for of in shell.places)
     span = Span(
         shells[-1].end,
@@ -254,7 +286,8 @@ def _joined(shells: Sequence[Turned], several: "Several") -> Span:
         place,
         pieces=tuple(shell.piece for shell in shells),
         joints=tuple(
-            (at[one], at[other] if other in at else by_name[other].foot(places[one])[0]) for one, other in joints
+            (at[one], at[other] if other in at else by_name[other].foot(places[one])[0])
+            for one, other in joints
         ),
     )
     reach, h = max(1.0, float(span.sample()[:, 0].max())), shells[0].problem.material.h

@@ -1,4 +1,6 @@
-"""The example cases, which stand beside the package in the repository and inside it where it is installed."""
+"""The example cases, which stand beside the package in the repository and inside it where it is
+installed.
+"""
 
 from pathlib import Path
 
@@ -7,7 +9,9 @@ from magshell_fenicsx.input.source import CaseError, read_source
 PACKAGE = Path(__file__).parents[1]
 INSTALLED = PACKAGE / "examples"  # made by setup.py
 CASES = (INSTALLED if INSTALLED.is_dir() else PACKAGE.parent) / "cases"
-FOR_EDITORS = "# yaml-language-server:"  # its path leads to the schema from the folder of cases alone
+FOR_EDITORS = (
+    "# yaml-language-server:"  # its path leads to the schema from the folder of cases alone
+)
 
 
 def examples() -> dict[str, Path]:
@@ -23,7 +27,8 @@ def title(file: Path) -> str:
 
 
 def write_example(name: str, file: Path | None = None) -> list[Path]:
-    """Write an example to a file, by default NAME.yaml, and its mesh beside it; which files these are.
+    """Write an example to a file, by default NAME.yaml, and its mesh beside it; which files these
+    are.
 
     Raises
     ------
@@ -47,7 +52,8 @@ def _text(file: Path) -> str:
 
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
-    """The case, and the mesh file that it names or the data of its name, which come to stand beside it.
+    """The case, and the mesh file that it names or the data of its name, which come to stand beside
+    it.
 
     So do the cases and data that it predicts.
     """
@@ -68,7 +74,9 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
 
 
 def _written(contents: dict[Path, bytes], target: Path) -> list[Path]:
-    """Write the files if none is in the way; the mesh of another copy of the case serves this one too."""
+    """Write the files if none is in the way; the mesh of another copy of the case serves this one
+    too.
+    """
     for path, content in contents.items():
         if path.exists() and (path == target or path.read_bytes() != content):
             raise CaseError(f"{path}: is there already, and is kept; name a file elsewhere")

@@ -1,4 +1,6 @@
-"""The programme of a case: its steps with their numbers and amplitudes, what all must have in common, and patches."""
+"""The programme of a case: its steps with their numbers and amplitudes, what all must have in
+common, and patches.
+"""
 
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
@@ -18,7 +20,8 @@ else:
     OneStep = Annotated[Union[tuple(STEPS.values())], Chosen("kind")]  # noqa: UP007
 PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[
-    Annotated[OneStep, Tag("one")] | Annotated[list[OneStep], Tag(PROGRAMME), Field(min_length=1, max_length=1000)],
+    Annotated[OneStep, Tag("one")]
+    | Annotated[list[OneStep], Tag(PROGRAMME), Field(min_length=1, max_length=1000)],
     Discriminator(lambda data: PROGRAMME if isinstance(data, list) else "one"),
 ]
 
@@ -70,7 +73,9 @@ def refuse_unfit_steps(context: Context) -> None:
         before = context.before(step.number)
         if before and not before[-1].load.rests and not load.in_time:
             kind = before[-1].kind
-            raise ValueError(f"{key}: begins in equilibrium: the step of kind: {kind} before it needs until: rest")
+            raise ValueError(
+                f"{key}: begins in equilibrium: the step of kind: {kind} before it needs until: rest"
+            )
         _refuse_unfit_hold(step, context.steps)
 
 
@@ -84,21 +89,38 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
     for name, how in step.load.hold.items():
         key = f"{step.key}.hold.{name}"
         if name == step.name and not (limit and how == "conjugate"):
-            raise ValueError(f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}")
+            raise ValueError(
+                f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}"
+            )
         if name == step.name and step.load.bound:
-            raise ValueError(f"{key}: conjugate: the way to the instability has no end: leave out the target")
+            raise ValueError(
+                f"{key}: conjugate: the way to the instability has no end: leave out the target"
+            )
         if name not in loads:
-            raise ValueError(f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}")
+            raise ValueError(
+                f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}"
+            )
         load = loads[name]
         if isinstance(how, Gas) and name != "pressure":
-            raise ValueError(f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate")
+            raise ValueError(
+                f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate"
+            )
         if how == "conjugate" and load is not None and not load.held_conjugate:
-            raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")
-        if how == "conjugate" and load is not None and load.released and (step.load.in_time or step.load.released_by):
+            raise ValueError(
+                f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
+            )
+        if (
+            how == "conjugate"
+            and load is not None
+            and load.released
+            and (step.load.in_time or step.load.released_by)
+        ):
             raise ValueError(f"{key}: conjugate: {load.released}")
 
 
-def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
+def refuse_strange(
+    key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]
+) -> None:
     """See that a shell has the patches of a key; a mesh file knows its own later.
 
     Parameters
@@ -114,7 +136,11 @@ def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surfa
     if isinstance(shell, MeshSurface):
         return
     if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
-        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
+        raise ValueError(
+            f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file"
+        )
     allowed = [*(dimples or ["dimple"]), "rest"]
     if unknown := set(patches) - set(allowed):
-        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(allowed[:-1])} and rest")
+        raise ValueError(
+            f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(allowed[:-1])} and rest"
+        )

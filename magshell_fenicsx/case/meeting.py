@@ -1,4 +1,6 @@
-"""Where shells that may touch are nearest to each other undeformed: their elements are smaller there."""
+"""Where shells that may touch are nearest to each other undeformed: their elements are smaller
+there.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +17,10 @@ from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
 FINE = 0.5  # of sqrt(R h): cells where shells meet
-AROUND, APART = 1.0, 2.0  # of sqrt(R h): how far from there, and how far from each other places are one
+AROUND, APART = (
+    1.0,
+    2.0,
+)  # of sqrt(R h): how far from there, and how far from each other places are one
 ALIKE = 0.5  # of the thickness: places that are so much farther from each other may meet as well
 FAR = 20.0  # thicknesses: shells that are farther from each other may meet anywhere, or nowhere
 EXACT = 1e-12  # change of the square of the distance at which a search ends
@@ -41,7 +46,8 @@ def meetings(
     apart: Mapping[str, float],
     charted: "Mapping[str, Charted]",
 ) -> dict[str, list[Array]]:
-    """Name of a shell -> places (3,) where others that it may touch are nearest, if that is one place and no area.
+    """Name of a shell -> places (3,) where others that it may touch are nearest, if that is one
+    place and no area.
 
     Parameters
     ----------
@@ -50,19 +56,24 @@ def meetings(
     places
         Name -> places (n, 3) all over it.
     thickness, apart
-        Name -> its thickness, at all places or everywhere, and how far from each other places are one; of all in the
-        same length.
+        Name -> its thickness, at all places or everywhere, and how far from each other places are
+        one; of all in the same length.
     charted
         Name -> its chart; without one its places are those that are given.
     """
     names = list(places)
     every = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     found: dict[str, list[Array]] = {name: [] for name in names}
-    half = {name: np.broadcast_to(np.asarray(thickness[name]) / 2, len(places[name])) for name in names}
+    half = {
+        name: np.broadcast_to(np.asarray(thickness[name]) / 2, len(places[name])) for name in names
+    }
     for a, b in every if [WHOLE, WHOLE] in [[*pair] for pair in pairs] else pairs:
         if a == b or a not in places or b not in places:
             continue
-        away = {one: _gaps(places[one], places[other], half[one], half[other]) for one, other in ((a, b), (b, a))}
+        away = {
+            one: _gaps(places[one], places[other], half[one], half[other])
+            for one, other in ((a, b), (b, a))
+        }
         gaps, number = away[a]
         nearest = int(np.argmin(gaps))
         ends, alone = {a: places[a][nearest], b: places[b][number[nearest]]}, list[str]()
@@ -72,7 +83,9 @@ def meetings(
             if np.linalg.norm(alike - ends[name], axis=1).max() < apart[name]:
                 alone.append(name)
         if alone and a in charted and b in charted:
-            ends = dict(zip((a, b), _nearest(ends[a], ends[b], charted[a], charted[b]), strict=True))
+            ends = dict(
+                zip((a, b), _nearest(ends[a], ends[b], charted[a], charted[b]), strict=True)
+            )
         for name in alone:
             if np.linalg.norm(ends[a] - ends[b]) < FAR * h[name]:
                 found[name].append(ends[name])
@@ -80,8 +93,12 @@ def meetings(
 
 
 def _gaps(x: Array, y: Array, of_x: Array, of_y: Array) -> tuple[Array, NDArray[np.int64]]:
-    """How far faces of places x (n, 3) are from those of places y (m, 3), and the numbers of the nearest of these."""
-    away, near = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + min(NEAREST if np.ptp(of_y) else 1, len(y))))
+    """How far faces of places x (n, 3) are from those of places y (m, 3), and the numbers of the
+    nearest of these.
+    """
+    away, near = scipy.spatial.KDTree(y).query(
+        x, k=range(1, 1 + min(NEAREST if np.ptp(of_y) else 1, len(y)))
+    )
     gaps = away - of_y[near] - of_x[:, None]
     least = np.arange(len(x)), gaps.argmin(axis=1)
     return gaps[least], near[least]
@@ -91,7 +108,8 @@ def _gaps(x: Array, y: Array, of_x: Array, of_y: Array) -> tuple[Array, NDArray[
 class Charted:
     """A shell in the frame of all: charts (2,) of places (3,), and the other way round.
 
-    `half` is half the thickness at its own places (n, 3), over the length of all; None where it is the same everywhere.
+    `half` is half the thickness at its own places (n, 3), over the length of all; None where it is
+    the same everywhere.
     """
 
     outline: Outline

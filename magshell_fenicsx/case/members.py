@@ -1,4 +1,6 @@
-"""The meshes of several shells, whole or halved by a plane in which each of them is its own mirror image."""
+"""The meshes of several shells, whole or halved by a plane in which each of them is its own mirror
+image.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -35,7 +37,9 @@ class Members:
         return [self._member(part, None) for part in self._several.parts]
 
     def half(self, plane: Mirror) -> Assembly:
-        """The halves of all shells on the one side of a plane, which is one of `mirrors`, or their sectors."""
+        """The halves of all shells on the one side of a plane, which is one of `mirrors`, or their
+        sectors.
+        """
         whole, parts = self._several.assembly, self._several.parts
 
         def halves() -> list[Member]:
@@ -44,10 +48,16 @@ class Members:
             return [self._member(part, self._own(part, plane)) for part in parts]
 
         waves = f" {plane.waves}" if isinstance(plane, Sector) else ""
-        return replace(whole, digest=f"{whole.digest} {plane.plane.tolist()}{waves}", members=halves, halved=True)
+        return replace(
+            whole,
+            digest=f"{whole.digest} {plane.plane.tolist()}{waves}",
+            members=halves,
+            halved=True,
+        )
 
     def mirrors(self, vectors: Vectors, loosely: bool) -> list[Mirror]:
-        """The planes in which each shell is its own image, as those of the halves on both of their sides.
+        """The planes in which each shell is its own image, as those of the halves on both of their
+        sides.
 
         Parameters
         ----------
@@ -62,7 +72,12 @@ class Members:
                 kept = [self._kept(part, side, loosely) for part in self._several.parts]
                 if all(kept) and not any(side.is_plane_of(other) for other in mirrors):
                     named = zip(self._several.parts, kept, strict=True)
-                    lost = {f"{p.name}_{a}": f"{p.name}_{b}" for p, own in named if own for a, b in own.lost.items()}
+                    lost = {
+                        f"{p.name}_{a}": f"{p.name}_{b}"
+                        for p, own in named
+                        if own
+                        for a, b in own.lost.items()
+                    }
                     mirrors.append(replace(side, lost=lost))
         return mirrors
 
@@ -79,7 +94,10 @@ class Members:
         return min(found, key=lambda each: each[0])[1]
 
     def _member(self, part: "Part", plane: Mirror | None) -> Member:
-        """A shell, or its half at a plane in the frame of the shell. The frame of its mesh is turned about e3."""
+        """A shell, or its half at a plane in the frame of the shell.
+
+        The frame of its mesh is turned about e3.
+        """
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
         with part.naming():
@@ -92,13 +110,24 @@ class Members:
     def _sector(self, part: "Part", sector: Sector) -> Member:
         """The sector of a shell; one that is upside down has the two planes the other way round."""
         first, second = (self._own(part, side) for side in sector.sides.values())
-        closed = ground_of(part.case.shell).perfect.round or isinstance(part.case.shell, MeshSurface)
+        closed = ground_of(part.case.shell).perfect.round or isinstance(
+            part.case.shell, MeshSurface
+        )
         for begin, end in ((first, second), (second, first)):
             own = Sector.at(begin.azimuth, sector.waves)
-            if closed and begin.through_e3 and own.is_plane_of(begin) and own.second.is_plane_of(end):
+            if (
+                closed
+                and begin.through_e3
+                and own.is_plane_of(begin)
+                and own.second.is_plane_of(end)
+            ):
                 break
         else:
-            raise CaseError(part.refused(f"place: symmetry: {sector.waves} needs shells that are closed around e3"))
+            raise CaseError(
+                part.refused(
+                    f"place: symmetry: {sector.waves} needs shells that are closed around e3"
+                )
+            )
         member = self._member(part, own)
         if begin is first:
             return member
@@ -111,7 +140,11 @@ class Members:
         place, start = self._several.place(part), f"{part.name}_"
         offset = float(plane.offset - plane.normal @ place.position) / place.scale
         own = Mirror.of(place.Q.T @ plane.normal, offset)
-        lost = {a.removeprefix(start): b.removeprefix(start) for a, b in plane.lost.items() if a.startswith(start)}
+        lost = {
+            a.removeprefix(start): b.removeprefix(start)
+            for a, b in plane.lost.items()
+            if a.startswith(start)
+        }
         return replace(own, offset=_rounded(own.offset), lost=lost)
 
     def _kept(self, part: "Part", plane: Mirror, loosely: bool) -> Mirror | None:
@@ -122,10 +155,14 @@ class Members:
             return kept(part.case, self._own(part, plane), loosely=loosely)
 
     def _candidates(self, vectors: Vectors, loosely: bool) -> Iterator[Mirror]:
-        """Planes that some shell has: upright ones through axes of revolution, and those of its outline."""
+        """Planes that some shell has: upright ones through axes of revolution, and those of its
+        outline.
+        """
         places = [self._several.place(part) for part in self._several.parts]
         grounds = zip(places, self._grounds, strict=True)
-        axes = [(place.position, place.Q[:, 2]) for place, ground in grounds if ground.perfect.round]
+        axes = [
+            (place.position, place.Q[:, 2]) for place, ground in grounds if ground.perfect.round
+        ]
         for at, axis in axes:
             apart = [other - at for other, _ in axes]
             for along in (*vectors, *apart, np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]):
@@ -136,7 +173,9 @@ class Members:
         for place, ground in zip(places, self._grounds, strict=True):
             for own in ground.perfect.mirrors([place.Q.T @ v for v in vectors], loosely):
                 normal = Mirror.of(place.Q @ own.normal).normal
-                yield Mirror(normal, _rounded(place.scale * own.offset + float(normal @ place.position)))
+                yield Mirror(
+                    normal, _rounded(place.scale * own.offset + float(normal @ place.position))
+                )
 
     @cached_property
     def _grounds(self) -> Sequence[Ground]:
@@ -144,7 +183,9 @@ class Members:
 
     @cached_property
     def _met(self) -> Mapping[str, Sequence[Array]]:
-        """Name of a shell -> places (3,) in its own frame where others that it may touch are nearest."""
+        """Name of a shell -> places (3,) in its own frame where others that it may touch are
+        nearest.
+        """
         several, places, near = self._several, dict[str, Array](), dict[str, Charted]()
         thickness, apart = dict[str, Array | float](), dict[str, float]()
         if not several.pairs:
@@ -162,11 +203,16 @@ class Members:
             if ground.perfect.charts() is not None:
                 near[part.name] = Charted(ground.perfect, place, place.own, varies)
         found = meetings(several.pairs, places, thickness, apart, near)
-        return {part.name: [several.place(part).own(x) for x in found[part.name]] for part in several.parts}
+        return {
+            part.name: [several.place(part).own(x) for x in found[part.name]]
+            for part in several.parts
+        }
 
     @property
     def _held(self) -> bool:
-        """Whether each shell, or one that is joined to it, is held: halves do not see motions across their plane."""
+        """Whether each shell, or one that is joined to it, is held: halves do not see motions
+        across their plane.
+        """
         held = {part.name: part.section.boundary.fixes for part in self._several.parts}
         pairs = [tuple(self._several.of(name) for name in edges) for edges in self._several.joints]
         for _ in pairs:

@@ -1,4 +1,6 @@
-"""How a case with several shells becomes one of a mesh file, with the names of their edges, points and patches."""
+"""How a case with several shells becomes one of a mesh file, with the names of their edges, points
+and patches.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,7 +22,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Keys = dict[str, Any]
 INSTEAD_OF = ("shell", "boundary", "points")
-OF_NAMES = ("loading", "contact", "joints", "natural", "magnetic")  # sections that name edges, points and patches
+OF_NAMES = (
+    "loading",
+    "contact",
+    "joints",
+    "natural",
+    "magnetic",
+)  # sections that name edges, points and patches
 FILES = ("file", "program")  # their values are no such names
 IN_COMMON = ("viscosity", "relaxation")
 OF_FIRST = ("law", "mooney", "mu", "alpha", *IN_COMMON)
@@ -35,8 +43,11 @@ class _Given(Section):
     shells: Shells
 
 
-def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -> "tuple[Any, Several | None]":
-    """The data of a case with its shells as one, which is a mesh file in the words of a case; None without shells.
+def expanded(
+    data: Any, context: Mapping[str, Any] | None, case: "type[Case]"
+) -> "tuple[Any, Several | None]":
+    """The data of a case with its shells as one, which is a mesh file in the words of a case; None
+    without shells.
 
     Raises
     ------
@@ -53,11 +64,16 @@ def expanded(data: Any, context: Mapping[str, Any] | None, case: "type[Case]") -
     for name in sections:
         _refuse_name(name, sections)
     parts = [
-        Part(name, section, _case(name, section, data, {**around}, case)) for name, section in sections.items()
+        Part(name, section, _case(name, section, data, {**around}, case))
+        for name, section in sections.items()
     ]  # in the order of the file
-    several = Several(parts, _joined(_renamed(data.get("joints"), sections)), _pairs(data.get("contact")))
+    several = Several(
+        parts, _joined(_renamed(data.get("joints"), sections)), _pairs(data.get("contact"))
+    )
     first = _merged(parts)
-    whole = {key: _renamed(value, sections) if key in OF_NAMES else value for key, value in data.items()}
+    whole = {
+        key: _renamed(value, sections) if key in OF_NAMES else value for key, value in data.items()
+    }
     whole |= {
         "shells": sections,
         "shell": {"geometry": "mesh", "file": several.file, **first},
@@ -79,22 +95,33 @@ def written(data: Keys, shells: Mapping[str, OneOfShells] | None) -> Keys:
         return data
     magnetic = data.get("magnetic")
     if isinstance(magnetic, dict) and any(section.remanent for section in shells.values()):
-        data = {**data, "magnetic": {key: value for key, value in magnetic.items() if key != "remanent"}}
+        data = {
+            **data,
+            "magnetic": {key: value for key, value in magnetic.items() if key != "remanent"},
+        }
     return {key: value for key, value in data.items() if key not in INSTEAD_OF}
 
 
 def _refuse_name(name: str, names: Mapping[str, OneOfShells]) -> None:
     if not NAME.fullmatch(name) or name == "shell":
-        raise ValueError(f"shells: {name!r}: a name is a word of letters, digits and _, and not shell, which is all")
+        raise ValueError(
+            f"shells: {name!r}: a name is a word of letters, digits and _, and not shell, which is all"
+        )
     if other := next((other for other in names if other.startswith(f"{name}_")), None):
-        raise ValueError(f"shells: {other}: begins as {name}_ does, by which edges of {name} are named: rename one")
+        raise ValueError(
+            f"shells: {other}: begins as {name}_ does, by which edges of {name} are named: rename one"
+        )
 
 
 def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "type[Case]") -> "Case":
     """That of one shell alone."""
     given, mesh = data["shells"][name], data.get("mesh") or {}
     given = given.model_dump(exclude_unset=True) if isinstance(given, BaseModel) else given
-    own = {"shell": given["shell"], "boundary": given.get("boundary") or {}, "points": given.get("points") or {}}
+    own = {
+        "shell": given["shell"],
+        "boundary": given.get("boundary") or {},
+        "points": given.get("points") or {},
+    }
     sizes = {key: mesh[key] for key in ("degree", "size", "refinement") if key in mesh}
     for key, value in (given.get("mesh") or {}).items():
         sizes[key] = value * sizes.get(key, 1.0) if key == "refinement" else value
@@ -104,28 +131,43 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         | {key: load[key] for key in SHOWN if key in load}
         | {"at": {"point": at.split(".", 1)[1] if "." in at else at.removeprefix(f"{name}_")}}
         for load in (loading if isinstance(loading, list) else [loading])
-        if isinstance(load, dict) and load.get("kind") == "indentation" and isinstance(load.get("at"), dict)
-        if isinstance(at := load["at"].get("point"), str) and at.startswith((f"{name}.", f"{name}_"))
+        if isinstance(load, dict)
+        and load.get("kind") == "indentation"
+        and isinstance(load.get("at"), dict)
+        if isinstance(at := load["at"].get("point"), str)
+        and at.startswith((f"{name}.", f"{name}_"))
     ]
     own_points = own["points"] if isinstance(own["points"], dict) else {}
     forces = [force for force in forces if force["at"]["point"] in own_points]  # type: ignore[index]
-    steps = [*forces, *([{"kind": "pressure"}] if _presses(loading, name) else [])]  # what mesh sizes follow
+    steps = [
+        *forces,
+        *([{"kind": "pressure"}] if _presses(loading, name) else []),
+    ]  # what mesh sizes follow
     try:
         made = case.model_validate(
-            {**own, "mesh": sizes, "symmetry": "none", **({"loading": steps} if steps else {})}, context=context
+            {**own, "mesh": sizes, "symmetry": "none", **({"loading": steps} if steps else {})},
+            context=context,
         )
     except ValidationError as e:
         error = e.errors()[0]
         said, key = error["msg"].removeprefix("Value error, "), ".".join(map(str, error["loc"]))
         raise ValueError(f"shells.{name}.{f'{key}: ' if key else ''}{said}") from None
-    if not made.shell.with_units and [*numbers_with_units(section.place, given.get("place"), "place")]:
-        raise ValueError(f"shells.{name}.place: has a unit, but the shell's lengths have none: give all one, or none")
+    if not made.shell.with_units and [
+        *numbers_with_units(section.place, given.get("place"), "place")
+    ]:
+        raise ValueError(
+            f"shells.{name}.place: has a unit, but the shell's lengths have none: give all one, or none"
+        )
     return made
 
 
 def _joined(joints: Any) -> list[tuple[str, str]]:
     """The edges of joints, as far as these are such."""
-    edges = [each.get("edges") for each in joints if isinstance(each, dict)] if isinstance(joints, list) else []
+    edges = (
+        [each.get("edges") for each in joints if isinstance(each, dict)]
+        if isinstance(joints, list)
+        else []
+    )
     return [(each[0], each[1]) for each in edges if isinstance(each, list) and len(each) == 2]
 
 
@@ -133,13 +175,17 @@ def _presses(loading: Any, name: str) -> bool:
     """Whether a step presses on a shell."""
     steps = loading if isinstance(loading, list) else [loading]
     return any(
-        isinstance(load, dict) and load.get("kind") == "pressure" and name in (load.get("on") or (name,))
+        isinstance(load, dict)
+        and load.get("kind") == "pressure"
+        and name in (load.get("on") or (name,))
         for load in steps
     )
 
 
 def _merged(parts: Sequence[Part]) -> Keys:
-    """Keys of the shell that stands for all: with lengths and material of the first, which results are over."""
+    """Keys of the shell that stands for all: with lengths and material of the first, which results
+    are over.
+    """
     first, shell = parts[0], parts[0].case.shell
     for part in parts:
         other = part.case.shell
@@ -152,8 +198,14 @@ def _merged(parts: Sequence[Part]) -> Keys:
             )
         if isinstance(other.thickness_factor, GivenField):
             raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
-        if isinstance(other, ShellSection) and not other.with_units and other.youngs_modulus is not None:
-            raise ValueError(part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs"))
+        if (
+            isinstance(other, ShellSection)
+            and not other.with_units
+            and other.youngs_modulus is not None
+        ):
+            raise ValueError(
+                part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs")
+            )
         for key in IN_COMMON:
             if getattr(other, key) != getattr(shell, key):
                 raise ValueError(
@@ -210,31 +262,47 @@ def _magnetised(magnetic: Any, several: Several) -> Any:
         return magnetic
     given = magnetic or {}
     if "remanent" in given:
-        raise ValueError("magnetic.remanent: shells have a remanence of their own: give it here, or there")
-    sizes = {part.name: part.section.remanent.flux_density for part in several.parts if part.section.remanent}
+        raise ValueError(
+            "magnetic.remanent: shells have a remanence of their own: give it here, or there"
+        )
+    sizes = {
+        part.name: part.section.remanent.flux_density
+        for part in several.parts
+        if part.section.remanent
+    }
     if len({size is None for size in sizes.values()}) > 1:
         bare = next(name for name, size in sizes.items() if size is None)
         raise ValueError(f"shells.{bare}.remanent.flux_density: is missing; other shells have one")
     size = next(iter(sizes.values()))
     if 0 in sizes.values():
-        raise ValueError("shells: a remanence of length zero is no magnetisation: leave remanent out")
+        raise ValueError(
+            "shells: a remanence of length zero is no magnetisation: leave remanent out"
+        )
     patches: dict[str, Any] = {}
     for part in several.parts:
         remanent = part.section.remanent
         if remanent is None:
             continue
         if remanent.kind == "patches" and part.case.shell.geometry != "mesh":
-            raise ValueError(part.refused("remanent.patches: of several shells those of a mesh file alone"))
-        factor = 1.0 if size is None or remanent.flux_density is None else remanent.flux_density / size
+            raise ValueError(
+                part.refused("remanent.patches: of several shells those of a mesh file alone")
+            )
+        factor = (
+            1.0 if size is None or remanent.flux_density is None else remanent.flux_density / size
+        )
         for name, own in {"": remanent, **(remanent.patches or {})}.items():
             if own is remanent and remanent.patches:
                 continue
-            section = own if isinstance(own, RemanentSection) else RemanentSection(**own.model_dump())
+            section = (
+                own if isinstance(own, RemanentSection) else RemanentSection(**own.model_dump())
+            )
             patches[part.name if name in ("", "rest") else f"{part.name}_{name}"] = section.placed(
                 several.place(part), factor
             )
     density = {} if size is None else {"flux_density": f"{size!r} T"}
-    whole = {part.name for part in several.parts}  # before those of their parts, which take their place
+    whole = {
+        part.name for part in several.parts
+    }  # before those of their parts, which take their place
     ordered = dict(sorted(patches.items(), key=lambda item: item[0] not in whole))
     return {**given, "remanent": {"kind": "patches", "patches": ordered, **density}}
 
@@ -244,7 +312,9 @@ def _pairs(given: Any) -> list[list[str]]:
     parts = given if isinstance(given, list | tuple) else []
     entries = [part.get("between") if isinstance(part, dict) else part for part in parts]
     pairs = [pair for pair in entries if isinstance(pair, list | tuple)]
-    return [[*pair] for pair in pairs if len(pair) == 2 and all(isinstance(name, str) for name in pair)]
+    return [
+        [*pair] for pair in pairs if len(pair) == 2 and all(isinstance(name, str) for name in pair)
+    ]
 
 
 def _renamed(part: Any, shells: Mapping[str, Any]) -> Any:
@@ -252,11 +322,17 @@ def _renamed(part: Any, shells: Mapping[str, Any]) -> Any:
     pattern = re.compile(rf"({'|'.join(map(re.escape, shells))})\.(\w+)")
 
     def name(text: Any) -> Any:
-        return pattern.sub(r"\1_\2", text) if isinstance(text, str) and pattern.fullmatch(text) else text
+        return (
+            pattern.sub(r"\1_\2", text)
+            if isinstance(text, str) and pattern.fullmatch(text)
+            else text
+        )
 
     def walk(part: Any) -> Any:
         if isinstance(part, dict):
-            return {name(key): value if key in FILES else walk(value) for key, value in part.items()}
+            return {
+                name(key): value if key in FILES else walk(value) for key, value in part.items()
+            }
         return [walk(each) for each in part] if isinstance(part, list) else name(part)
 
     return walk(part)

@@ -1,4 +1,5 @@
-"""A case, or what it is made from, as programs give it; the same case with other values, and as the perfect shell.
+"""A case, or what it is made from, as programs give it; the same case with other values, and as the
+perfect shell.
 
 On several ranks a file is as rank 0 reads it. A run writes down what its case says.
 """
@@ -25,13 +26,17 @@ if TYPE_CHECKING:
 OF_SHELLS = ("shells", "shell", "boundary", "points")  # what the data of several shells make
 
 
-def opened(case: Case | Mapping[str, Any] | str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Case:
-    """The case itself, or that of a mapping or of a file, with the same files on all ranks; collective.
+def opened(
+    case: Case | Mapping[str, Any] | str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()
+) -> Case:
+    """The case itself, or that of a mapping or of a file, with the same files on all ranks;
+    collective.
 
     Raises
     ------
     CaseError
-        On every rank, if it is neither, the file is no valid case, or the ranks have different cases.
+        On every rank, if it is neither, the file is no valid case, or the ranks have different
+        cases.
     """
     if isinstance(case, str | Path):
         case = Case.from_source(read_together(case, comm, settings))
@@ -62,9 +67,13 @@ def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
     if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
         return case
     own = case.model_dump_json()
-    first, contents = from_first(comm, lambda: (own, {key: _content(reader) for key, reader in readers.items()}))
+    first, contents = from_first(
+        comm, lambda: (own, {key: _content(reader) for key, reader in readers.items()})
+    )
     if sum(comm.allgather(first != own)):
-        raise CaseError("the ranks were given different cases: give the same on each, or the path of a file")
+        raise CaseError(
+            "the ranks were given different cases: give the same on each, or the path of a file"
+        )
     for key, reader in readers.items():
         reader.files.contents[reader.path] = contents[key]
     for reader in readers.values():
@@ -80,7 +89,8 @@ def _content(reader: FileKeys) -> bytes | OSError:
 
 
 def changed(case: Case, values: Mapping[str, Any]) -> Case:
-    """The case whose file has other values, by keys such as "mesh.degree"; they are not looked at again.
+    """The case whose file has other values, by keys such as "mesh.degree"; they are not looked at
+    again.
 
     Raises
     ------
@@ -109,10 +119,14 @@ def _changed(case: Case, key: str, value: Any) -> Case:
 def _of_data(case: Case, key: str, value: Any) -> Case:
     """A case of several shells with another value, from its data."""
     if case.origin.data is None:
-        raise CaseError(f"{key}: needs a case that was read from a file or a mapping: see Case.from_source")
+        raise CaseError(
+            f"{key}: needs a case that was read from a file or a mapping: see Case.from_source"
+        )
     data = _written(case, case.origin.data, key, value)
     tolerance = case.mesh.tolerance
-    bare = _written(case, data, "mesh.tolerance", None) if tolerance else data  # what it chooses is no mistake
+    bare = (
+        _written(case, data, "mesh.tolerance", None) if tolerance else data
+    )  # what it chooses is no mistake
     made = _validated(bare, case, key).with_terms(case.own_terms)
     kept = {name: getattr(case, name) for name in type(case).model_fields if name not in OF_SHELLS}
     kept["mesh"] = made.mesh.model_copy(update={"tolerance": tolerance})
@@ -171,9 +185,14 @@ def _replaced(part: Any, key: str, value: Any) -> Any:
         return value
     first, _, rest = key.partition(".")
     if isinstance(part, list):
-        return [_replaced(item, rest, value) if i == int(first) else item for i, item in enumerate(part)]
+        return [
+            _replaced(item, rest, value) if i == int(first) else item for i, item in enumerate(part)
+        ]
     if isinstance(part, dict):
-        return {name: _replaced(item, rest, value) if name == first else item for name, item in part.items()}
+        return {
+            name: _replaced(item, rest, value) if name == first else item
+            for name, item in part.items()
+        }
     within = getattr(part, first)
     if within is None and rest:  # a section that the case leaves out
         within = get_args(type(part).model_fields[first].annotation)[0]()
@@ -181,10 +200,11 @@ def _replaced(part: Any, key: str, value: Any) -> Any:
 
 
 def perfect_case(case: Case) -> Case:
-    """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
+    """The case without imperfections, as a shell on the smallest model and the default mesh,
+    whatever its own.
 
-    Several shells keep their meshes, whose vertices meet at joints. A pressure at its end goes on to the first
-    instability.
+    Several shells keep their meshes, whose vertices meet at joints. A pressure at its end goes on
+    to the first instability.
 
     Raises
     ------
@@ -192,7 +212,9 @@ def perfect_case(case: Case) -> Case:
         If the case has values for the patch of a dimple.
     """
     if case.dimples and case.patches:
-        raise CaseError("shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named")
+        raise CaseError(
+            "shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named"
+        )
     mesh = case.mesh.model_copy(update={"tolerance": None}) if case.several else MeshSection()
     bare = case.model_copy(
         update={
@@ -211,7 +233,9 @@ def perfect_case(case: Case) -> Case:
         [
             Part(
                 part.name,
-                part.section.model_copy(update={"shell": _without_imperfections(part.section.shell)}),
+                part.section.model_copy(
+                    update={"shell": _without_imperfections(part.section.shell)}
+                ),
                 part.case.model_copy(update={"shell": _without_imperfections(part.case.shell)}),
             )
             for part in case.several.parts

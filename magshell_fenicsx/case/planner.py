@@ -50,11 +50,22 @@ from magshell_fenicsx.problem.problem import Awaited, Document, Problem, body_of
 from magshell_fenicsx.problem.sizes import Loaded, Shown, grading
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, sector, unit, unmirrored
+from magshell_fenicsx.shape.symmetry import (
+    Leaves,
+    askew,
+    mirror,
+    of_points,
+    of_shape,
+    sector,
+    unit,
+    unmirrored,
+)
 
 Array = NDArray[np.float64]
 SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
-FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
+FAR_FROM_ONE = (
+    50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
+)
 
 
 def make_problem(
@@ -64,10 +75,11 @@ def make_problem(
     smooth: Collection[str] = (),
     met: Sequence[Array] = (),
 ) -> Problem:
-    """The problem of a case, with its user-defined energies and `terms`; its half at a plane that is `kept`, if given.
+    """The problem of a case, with its user-defined energies and `terms`; its half at a plane that
+    is `kept`, if given.
 
-    Formulas of the keys in `smooth` are known to have no details that samples do not show. Other shells touch it at the
-    places `met` (3,), over R.
+    Formulas of the keys in `smooth` are known to have no details that samples do not show. Other
+    shells touch it at the places `met` (3,), over R.
 
     Raises
     ------
@@ -80,23 +92,35 @@ def make_problem(
     terms = case.own_terms
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
     if several := case.several:
-        material = replace(material, shells=several.materials, laws=several.laws, laminates=several.laminates)
+        material = replace(
+            material, shells=several.materials, laws=several.laws, laminates=several.laminates
+        )
     ground = ground_of(case.shell)
     perfect = ground.perfect
     imperfections = flaws(case.imperfections, ground)
     context, last = case.context, {step.name: step for step in case.programme}
-    still = {*imperfections} - {key for step in last.values() for key in step.load.multiplies(step, context)}
+    still = {*imperfections} - {
+        key for step in last.values() for key in step.load.multiplies(step, context)
+    }
     drawn = imperfect(perfect, imperfections, 0.0, still)
     ground = replace(ground, drawn=drawn)
     standing = case.bodies, case.approaches, {step.name for step in case.programme}
-    at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
+    at_place = {
+        name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()
+    }
     places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     for section in context.abilities:
         section.refuse_unfit_values(context, sample)
     formulas = written(context)
-    narrow = [None if each.given.key in smooth else looked_at(each.formulas, drawn) for each in formulas]
-    drawn = drawn.looked_at(narrow_places([leaves for leaves in narrow if leaves])) if formulas else drawn
+    narrow = [
+        None if each.given.key in smooth else looked_at(each.formulas, drawn) for each in formulas
+    ]
+    drawn = (
+        drawn.looked_at(narrow_places([leaves for leaves in narrow if leaves]))
+        if formulas
+        else drawn
+    )
     refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     energies = surface_terms(context, terms)
     parts = _left(case, drawn, energies)
@@ -106,7 +130,10 @@ def make_problem(
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
-        turn, beyond = plane.azimuth, Sector.at(0.0, plane.waves) if isinstance(plane, Sector) else Y0
+        turn, beyond = (
+            plane.azimuth,
+            Sector.at(0.0, plane.waves) if isinstance(plane, Sector) else Y0,
+        )
     points = named_points(case, drawn, turn, beyond)
     under = dict[str, str]()
     for name, (step, place) in places.items():
@@ -118,36 +145,53 @@ def make_problem(
     for step in case.programme:
         if step.name in under:
             step.load.refuse_unfit_place(step, context, drawn, points[under[step.name]])
-    loaded: list[Loaded] = [(points[at], [step.load]) for step in case.programme for at in step.load.named_points()]
+    loaded: list[Loaded] = [
+        (points[at], [step.load]) for step in case.programme for at in step.load.named_points()
+    ]
     for point in dict.fromkeys(under.values()):
-        loaded.append((points[point], [step.load for step in case.programme if under.get(step.name) == point]))
-    local = [] if isinstance(case.shell, MeshSurface) else spots(imperfections.items(), perfect, turn)
+        loaded.append(
+            (points[point], [step.load for step in case.programme if under.get(step.name) == point])
+        )
+    local = (
+        [] if isinstance(case.shell, MeshSurface) else spots(imperfections.items(), perfect, turn)
+    )
     wide = [flaw for flaw in imperfections.values() if flaw.centre is None]
     everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
     bodies = contacts(*standing, replace(ground, turn=turn))
     stood = replace(ground, drawn=drawn)
-    touched = [Pressed.by(c, (step.load for step in case.programme if step.name == c.amplitude), stood) for c in bodies]
+    touched = [
+        Pressed.by(c, (step.load for step in case.programme if step.name == c.amplitude), stood)
+        for c in bodies
+    ]
     if not (axisymmetric or case.mesh.size):
         varying, everywhere = of_imperfections(wide, perfect, turn, material.h)
         varying += refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
     facing = [Meeting(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
     shown: list[Shown] = [*local, *touched, *facing]
-    size = grading(context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local))
+    size = grading(
+        context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local)
+    )
     drawn = imperfect(perfect, imperfections, turn, still)
     shape = drawn.chart(beyond, size)
     if isinstance(beyond, Sector) and not isinstance(shape, Grid):  # a ring has no tip
         size = towards_tip(size, beyond)
         shape = drawn.chart(beyond, size)
-    if isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector):  # what a point needs, its image needs too
+    if (
+        isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector)
+    ):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.movable[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, movable=(x, y))
     rims = different(local)
-    if isinstance(beyond, Sector) and any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
+    if isinstance(beyond, Sector) and any(
+        joint.edges[1] in (case.shells or ()) for joint in case.joints
+    ):
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims and isinstance(beyond, Sector):
-        raise CaseError(f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half")
+        raise CaseError(
+            f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half"
+        )
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else (), size)
     span = drawn.span if axisymmetric else None
     if not axisymmetric:
@@ -160,7 +204,9 @@ def make_problem(
     within = {name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in imperfections.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
-    all_loads = replace(_loads(case, modelled), own=tuple(term.turned(turn) for term in energies), contacts=bodies)
+    all_loads = replace(
+        _loads(case, modelled), own=tuple(term.turned(turn) for term in energies), contacts=bodies
+    )
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"
@@ -218,7 +264,9 @@ def document_of(case: Case) -> Document:
 
 
 def _awaited(case: Case) -> Awaited | None:
-    """The modes of the perfect shell, or of several perfect ones together, that are still to be computed."""
+    """The modes of the perfect shell, or of several perfect ones together, that are still to be
+    computed.
+    """
     several = case.several
     parts = list(several.parts) if several else []
     awaiting = [
@@ -231,7 +279,9 @@ def _awaited(case: Case) -> Awaited | None:
     def given(modes: tuple[Mode, ...]) -> Problem:
         for i, key, section in awaiting:
             try:
-                section.become(modes, *((parts[i].name, several.place(parts[i])) if several else ()))
+                section.become(
+                    modes, *((parts[i].name, several.place(parts[i])) if several else ())
+                )
             except ValueError as e:
                 raise CaseError(parts[i].refused(f"shell.{key}.{e}")) from None
         made = make_problem(case.with_shells(several.parts) if several else case)
@@ -261,7 +311,10 @@ def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leave
 def _loads(case: Case, modelled: Modelled) -> Loads:
     """What the parts of a case add to the loads of its model."""
     context, last = case.context, {step.name: step for step in case.programme}
-    named = {*last, *(name for step in case.programme for name in (*step.load.drives, *step.load.hold))}
+    named = {
+        *last,
+        *(name for step in case.programme for name in (*step.load.drives, *step.load.hold)),
+    }
     fields: dict[str, Any] = {}
     for added in (
         *(kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in named),
@@ -273,7 +326,9 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
             if isinstance(value, dict):
                 fields[name] = {**(before or {}), **value}
             else:
-                fields[name] = (*(before or ()), *value) if isinstance(value, tuple) else before or value
+                fields[name] = (
+                    (*(before or ()), *value) if isinstance(value, tuple) else before or value
+                )
     return Loads(**fields)
 
 
@@ -310,18 +365,30 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
     }
 
 
-def imperfect(perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
-    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have their cells."""
+def imperfect(
+    perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, still: Collection[str]
+) -> Outline:
+    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have
+    their cells.
+    """
     if not imperfections:
         return perfect
-    circles = tuple(flaw.reach for flaw in imperfections.values() if flaw.rim) if perfect.disc else ()
+    circles = (
+        tuple(flaw.reach for flaw in imperfections.values() if flaw.rim) if perfect.disc else ()
+    )
     shown = min((flaw.size for flaw in imperfections.values()), default=inf)
     return perfect.deviated(
-        tuple(in_frame(imperfections[key].deviation, turn) for key in imperfections if key in still), circles, shown
+        tuple(
+            in_frame(imperfections[key].deviation, turn) for key in imperfections if key in still
+        ),
+        circles,
+        shown,
     )
 
 
-def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size: Grading) -> Chart | RimmedGrid:
+def _matched(
+    shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size: Grading
+) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
     if isinstance(shape, Grid):
@@ -333,8 +400,8 @@ def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size:
 
 
 def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
-    """A plane in which the mid-surface with its thickness, plies and imperfections is its own image, with the edges
-    that are lost; else None.
+    """A plane in which the mid-surface with its thickness, plies and imperfections is its own
+    image, with the edges that are lost; else None.
 
     Parameters
     ----------
@@ -349,7 +416,9 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
         *(plies.leaves(case.context, perfect) if (plies := Laminated.of(case.context)) else ()),
     ]
     vectors = [unit(v) for part in parts for v in part.vectors]
-    planes = [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
+    planes = (
+        [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
+    )
     for one in planes:
         along = all(abs(one.normal @ v) < ROUNDING for v in vectors)
         if one.is_plane_of(plane) and along and all(part.mirrors(one) for part in parts):
@@ -365,7 +434,9 @@ def part_of(plane: Mirror | None) -> str:
 
 
 def towards_tip(size: Grading, sector: Sector) -> Grading:
-    """Sizes at most as large as a sector is wide, so that triangles are not thin beside the axis of a disc."""
+    """Sizes at most as large as a sector is wide, so that triangles are not thin beside the axis of
+    a disc.
+    """
     tip = Disc((0.0, 0.0), 0.0, SHORTEST * size.largest, sector.angle)
     return replace(size, features=[*size.features, tip])
 
@@ -385,7 +456,9 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         if case.several:
             hint = "; each shell is held, and its own image in both"
         elif isinstance(case.shell, MeshSurface):
-            hint = "; the mesh file must be its own image in both, with each of its edges and patches"
+            hint = (
+                "; the mesh file must be its own image in both, with each of its edges and patches"
+            )
         raise CaseError(
             f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
             f"angle of {180 / case.symmetry:g} degrees with all named points between them{hint}"
@@ -399,7 +472,9 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
         hint = made if isinstance(case.shell, MeshSurface) else ""
         hint = "; each shell is held, and its own image in it" if case.several else hint
-        raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
+        raise CaseError(
+            f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}"
+        )
     return False, plane
 
 

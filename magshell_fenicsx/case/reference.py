@@ -19,7 +19,14 @@ from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import AMPLITUDES, IN_TIME, OF_EVERY_RUN, QUANTITIES
 
-_NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text
+_NOISE = {
+    "title",
+    "discriminator",
+    "gt",
+    "ge",
+    "lt",
+    "le",
+}  # the last are bounds of quantities, which are text
 Schema = dict[str, Any]
 WHOLE = "The whole case"
 TAGS = ("geometry", "kind")
@@ -72,7 +79,9 @@ class _WithMeanings(GenerateJsonSchema):
         return schema_of_model
 
     def encode_default(self, dft: Any) -> Any:
-        return super().encode_default(dft.model_dump(mode="json") if isinstance(dft, BaseModel) else dft)
+        return super().encode_default(
+            dft.model_dump(mode="json") if isinstance(dft, BaseModel) else dft
+        )
 
 
 def schema() -> dict[str, Any]:
@@ -92,7 +101,11 @@ def schema_text() -> str:
 
 def _apart(whole: Schema) -> Schema:
     """With every section as a definition: pydantic 2.14 writes some in full where they stand."""
-    titles = {f"#/$defs/{name}": section["title"] for name, section in whole["$defs"].items() if "title" in section}
+    titles = {
+        f"#/$defs/{name}": section["title"]
+        for name, section in whole["$defs"].items()
+        if "title" in section
+    }
     sections: dict[str, Schema] = {}
 
     def named(part: Any) -> Any:
@@ -100,7 +113,10 @@ def _apart(whole: Schema) -> Schema:
             return [named(each) for each in part]
         if not isinstance(part, dict):
             return part
-        inner = {key: value if key in ("default", "$defs") else named(value) for key, value in part.items()}
+        inner = {
+            key: value if key in ("default", "$defs") else named(value)
+            for key, value in part.items()
+        }
         if "$ref" in part:
             inner["$ref"] = titles.get(part["$ref"], part["$ref"])
         if "properties" not in part or part is whole or not isinstance(part.get("title"), str):
@@ -113,7 +129,8 @@ def _apart(whole: Schema) -> Schema:
     others = {name: section for name, section in lifted.items() if f"#/$defs/{name}" not in titles}
     short = Counter(title.rsplit(".", 1)[-1] for title in sections)
     names = {
-        title: last if short[last := title.rsplit(".", 1)[-1]] == 1 else title.replace(".", "__") for title in sections
+        title: last if short[last := title.rsplit(".", 1)[-1]] == 1 else title.replace(".", "__")
+        for title in sections
     }
 
     def shortened(part: Any) -> Any:
@@ -131,14 +148,18 @@ def _apart(whole: Schema) -> Schema:
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
-    """Without what pydantic adds and JSON Schema does not know; `names`: keys are those of the case, not its words."""
+    """Without what pydantic adds and JSON Schema does not know; `names`: keys are those of the
+    case, not its words.
+    """
     if isinstance(part, list):
         return [_without_noise(item) for item in part]
     if not isinstance(part, dict):
         return part
     kept = part if names else {key: value for key, value in part.items() if key not in _NOISE}
     return {
-        key: value if key == "default" else _without_noise(value, names=key in ("properties", "$defs"))
+        key: value
+        if key == "default"
+        else _without_noise(value, names=key in ("properties", "$defs"))
         for key, value in kept.items()
     }
 
@@ -147,7 +168,9 @@ def reference() -> str:
     """The whole page."""
     whole = schema()
     sections = whole["$defs"]
-    titles = {name: _title(paths, sections[name]) for name, paths in _places(whole, sections).items()}
+    titles = {
+        name: _title(paths, sections[name]) for name, paths in _places(whole, sections).items()
+    }
     parts = [HEAD, _section(WHOLE, whole, titles)]
     parts += [_section(title, sections[name], titles) for name, title in titles.items()]
     return "\n".join([*parts, columns_page()])
@@ -172,7 +195,11 @@ def _places(whole: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
 
 def _references(part: Any) -> Iterator[str]:
     """Names of the sections in a part of the schema."""
-    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
+    for key, value in (
+        part.items()
+        if isinstance(part, dict)
+        else enumerate(part if isinstance(part, list) else [])
+    ):
         if key == "$ref":
             yield value.rsplit("/", 1)[-1]
         else:
@@ -193,7 +220,9 @@ def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
     if section["properties"]:
         lines += ["| key | allowed | unit | default | meaning |", "| --- | --- | --- | --- | --- |"]
         required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
-        keys = sorted(section["properties"].items(), key=lambda item: item[0] not in TAGS)  # what tells it apart first
+        keys = sorted(
+            section["properties"].items(), key=lambda item: item[0] not in TAGS
+        )  # what tells it apart first
         lines += [_row(key, value, key in required, titles) for key, value in keys]
     else:
         lines += [f"Allowed: {_allowed(section, titles)}."]
@@ -204,7 +233,13 @@ def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
     told = re.fullmatch(r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split()))
     assert told
     value = part.get("default")
-    default = "**required**" if required else "" if isinstance(value, dict) or value is None else f"`{_plain(value)}`"
+    default = (
+        "**required**"
+        if required
+        else ""
+        if isinstance(value, dict) or value is None
+        else f"`{_plain(value)}`"
+    )
     cells = (f"`{key}`", _allowed(part, titles), told[2] or "", default, told[1])
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
@@ -256,13 +291,24 @@ def anchor(title: str) -> str:
 
 
 def columns_page() -> str:
-    """Both tables in Markdown; the order of the parts' columns does not depend on what is imported first."""
+    """Both tables in Markdown; the order of the parts' columns does not depend on what is imported
+    first.
+    """
     of_parts = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
     columns = [
-        (f"`{q.name}`", f"{q.html} {q.note}".strip() if q.symbol else q.words, q.unit, q.si, _in_units(q), q.meaning)
+        (
+            f"`{q.name}`",
+            f"{q.html} {q.note}".strip() if q.symbol else q.words,
+            q.unit,
+            q.si,
+            _in_units(q),
+            q.meaning,
+        )
         for q in (*OF_EVERY_RUN, *IN_TIME, *sorted(of_parts, key=lambda q: q.name))
     ]
-    amplitudes = [(f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for _, a in sorted(AMPLITUDES.items())]
+    amplitudes = [
+        (f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for _, a in sorted(AMPLITUDES.items())
+    ]
     return "\n".join(
         [
             COLUMNS_HEAD,

@@ -1,7 +1,9 @@
-"""The section `shells`: several shells in place of one, each as a case of its own, and one mesh of them all.
+"""The section `shells`: several shells in place of one, each as a case of its own, and one mesh of
+them all.
 
-Each shell is planned and meshed by its own case. Together they stand where a mesh file stands, so that all else sees
-one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is `upper_rim` there.
+Each shell is planned and meshed by its own case. Together they stand where a mesh file stands, so
+that all else sees one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is
+`upper_rim` there.
 """
 
 import hashlib
@@ -37,15 +39,28 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Keys = dict[str, Any]
 EDGE_NAMES = (  # of all geometries but mesh files
-    *("equator", "rim", "hole", "inner", "outer", "left", "right", "bottom", "top", "root", "tip", "sides"),
+    *(
+        "equator",
+        "rim",
+        "hole",
+        "inner",
+        "outer",
+        "left",
+        "right",
+        "bottom",
+        "top",
+        "root",
+        "tip",
+        "sides",
+    ),
 )
 
 
 class PlaceSection(Section):
     """Where a shell is: it is turned about its own origin, then moved.
 
-    It turns by `turn` about e3, then by `axis.polar` about e2, then by `axis.azimuth` about e3: its own e3 then has the
-    direction `axis`.
+    It turns by `turn` about e3, then by `axis.polar` about e2, then by `axis.azimuth` about e3: its
+    own e3 then has the direction `axis`.
     """
 
     position: Coordinates = Field(default=[0.0, 0.0, 0.0])
@@ -73,7 +88,10 @@ class ShellMeshSection(Section):
 
 
 class OneOfShells(Section):
-    """One shell of several. What is its own is in its own frame; conditions and forces are in that of the case."""
+    """One shell of several.
+
+    What is its own is in its own frame; conditions and forces are in that of the case.
+    """
 
     shell: Annotated[ShellSection | Surface, Chosen("geometry")]
     """Mid-surface, thickness and material"""
@@ -112,10 +130,18 @@ def in_words_of_shells(message: str, data: Any) -> str:
         return message
     texts = {*_texts(data)}
     for name in map(str, shells):
-        named = {text.removeprefix(f"{name}.") for text in texts if re.fullmatch(rf"{re.escape(name)}\.\w+", text)}
-        members = "|".join(sorted({*EDGE_NAMES, *named, *filter(str.isidentifier, _texts(shells[name]))}))
+        named = {
+            text.removeprefix(f"{name}.")
+            for text in texts
+            if re.fullmatch(rf"{re.escape(name)}\.\w+", text)
+        }
+        members = "|".join(
+            sorted({*EDGE_NAMES, *named, *filter(str.isidentifier, _texts(shells[name]))})
+        )
         shell = re.escape(name)
-        message = re.sub(rf"\b(boundary|points)\.({shell})_({members})\b", r"shells.\2.\1.\3", message)
+        message = re.sub(
+            rf"\b(boundary|points)\.({shell})_({members})\b", r"shells.\2.\1.\3", message
+        )
         message = re.sub(rf"(?<![\w./])({shell})_({members})\b(?!\.\w)", r"\1.\2", message)
     return message
 
@@ -156,7 +182,10 @@ class Several:
     """The shells of a case; an `Assembly` is made of them where a mesh is needed."""
 
     def __init__(
-        self, parts: Sequence[Part], joints: Sequence[tuple[str, str]] = (), pairs: Sequence[Sequence[str]] = ()
+        self,
+        parts: Sequence[Part],
+        joints: Sequence[tuple[str, str]] = (),
+        pairs: Sequence[Sequence[str]] = (),
     ) -> None:
         self.parts, self.joints, self.pairs = parts, joints, pairs
 
@@ -167,11 +196,18 @@ class Several:
     def digest(self) -> str:
         """A hash of all from which they are made."""
         told = [
-            [part.name, part.case.model_dump_json(), part.section.place.model_dump_json(), part.case.outside]
+            [
+                part.name,
+                part.case.model_dump_json(),
+                part.section.place.model_dump_json(),
+                part.case.outside,
+            ]
             + [section.awaited for section in part.case.imperfections.values()]
             for part in self.parts
         ]
-        return hashlib.sha256(json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()
+        ).hexdigest()
 
     @property
     def file(self) -> str:
@@ -190,15 +226,22 @@ class Several:
         from magshell_fenicsx.case.members import Members
 
         materials = self.materials or {}
-        moduli = {part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts}
-        laws = {part.name: "laminate" if part.case.shell.laminate else part.case.shell.law for part in self.parts}
+        moduli = {
+            part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts
+        }
+        laws = {
+            part.name: "laminate" if part.case.shell.laminate else part.case.shell.law
+            for part in self.parts
+        }
         members = Members(self)
         of_members = members.mirrors, partial(meridians, self), members.normal, members.half
         return Assembly(self.digest, members.whole, self.joints, moduli, laws, *of_members)
 
     def of(self, name: str) -> str:
         """The shell of an edge, or itself."""
-        return next((part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name)
+        return next(
+            (part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name
+        )
 
     @cached_property
     def thickness(self) -> "Thickness | None":
@@ -216,7 +259,11 @@ class Several:
             for name, factor in ((own and own.patches) or {}).items():
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
                 factors[f"{part.name}_{name}"] = ratio * factor
-        return None if all(factor == 1.0 for factor in factors.values()) else Thickness(patches=factors)
+        return (
+            None
+            if all(factor == 1.0 for factor in factors.values())
+            else Thickness(patches=factors)
+        )
 
     @cached_property
     def materials(self) -> "dict[str, OwnMaterial] | None":
@@ -242,7 +289,9 @@ class Several:
 
         first = self.parts[0].case.shell
         laminate = self.laminates.get(part.name)
-        return Material(first.poisson_ratio, 1 / first.R_over_h, part.case.shell.rubber, laminate).law
+        return Material(
+            first.poisson_ratio, 1 / first.R_over_h, part.case.shell.rubber, laminate
+        ).law
 
     @cached_property
     def laminates(self) -> "dict[str, Laminate]":
@@ -262,7 +311,9 @@ class Several:
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
         words = self.assembly.laws
         for part in self.parts[1:]:
-            said = f"h {self.ratio(part):.4g} times" + ("" if part.case.thickness_factor is None else " its factor")
+            said = f"h {self.ratio(part):.4g} times" + (
+                "" if part.case.thickness_factor is None else " its factor"
+            )
             if own := (self.materials or {}).get(part.name):
                 said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}"
                 said += f", density {own.density:.4g} times" if has_density else ""

@@ -154,10 +154,18 @@ class Vertices:
     named: Collection[str]
 
     @classmethod
-    def of(cls, case: "Case", points: Mapping[str, Array], drawn: Outline, size: Grading, turn: float) -> "Vertices":
+    def of(
+        cls, case: "Case", points: Mapping[str, Array], drawn: Outline, size: Grading, turn: float
+    ) -> "Vertices":
         """Return those of a case."""
-        R, unit = (1e3 * case.shell.reference, " mm") if case.shell.with_units else (case.shell.reference, "")
-        order = sorted(points, key=lambda name: name not in case.points)  # "pole" may be one of them
+        R, unit = (
+            (1e3 * case.shell.reference, " mm")
+            if case.shell.with_units
+            else (case.shell.reference, "")
+        )
+        order = sorted(
+            points, key=lambda name: name not in case.points
+        )  # "pole" may be one of them
         return cls({name: points[name] for name in order}, drawn, size, turn, R, unit, case.points)
 
     def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
@@ -176,7 +184,11 @@ class Vertices:
         vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
         for (i, one), (j, other) in combinations(enumerate(self.points), 2):
             apart = float(np.hypot(*(places[i] - places[j])))
-            near = (vertices[i] == vertices[j]).all() if vertices is not None else apart < NEAR * self.size(places[i])
+            near = (
+                (vertices[i] == vertices[j]).all()
+                if vertices is not None
+                else apart < NEAR * self.size(places[i])
+            )
             if near and not np.array_equal(places[i], places[j]):
                 self._refuse(
                     one,
@@ -186,7 +198,9 @@ class Vertices:
                     NEAR,
                 )
 
-    def _refuse_beside_edges(self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
+    def _refuse_beside_edges(
+        self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None
+    ) -> None:
         """See that a point is not beside an edge or a plane of symmetry, but on it or away from
         it."""
         chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
@@ -204,13 +218,17 @@ class Vertices:
                 self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
         for edge, on in edges_near(chart, self.drawn).items():
             if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:
-                self._refuse(name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor)
+                self._refuse(
+                    name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
+                )
 
     def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which stands in `what`."""
         chart = self.points[name]
         one, two = self._place(chart), other
-        here, there = (", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in told_apart(one, two))
+        here, there = (
+            ", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in told_apart(one, two)
+        )
         apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
         raise CaseError(
             f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, too near for elements "

@@ -1,1 +1,3 @@
-"""Equilibrium paths of Pi(u; mu): Newton on bordered systems, steps, folds, branches; no finite elements."""
+"""Equilibrium paths of Pi(u; mu): Newton on bordered systems, steps, folds, branches; no finite
+elements.
+"""

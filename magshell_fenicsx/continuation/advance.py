@@ -21,17 +21,18 @@ class TimeSteps:
     Attributes
     ----------
     fixed
-        The longest step, which is halved where Newton's method fails, and doubled again after two steps that
-        succeed; None: steps for the tolerance.
+        The longest step, which is halved where Newton's method fails, and doubled again after two
+        steps that succeed; None: steps for the tolerance.
     tolerance
-        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
-        Engineering and Structural Dynamics 20, 1991).
+        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M.
+        Xie, Earthquake Engineering and Structural Dynamics 20, 1991).
     first
         First step without `fixed`.
     balance
         Beside a body: what the balance of energy may lack, over its turnover.
     longest, fastest
-        The longest step for the tolerance up to a time, as a rule that at which a motion is fastest.
+        The longest step for the tolerance up to a time, as a rule that at which a motion is
+        fastest.
     """
 
     fixed: float | None
@@ -42,8 +43,12 @@ class TimeSteps:
     fastest: float = -np.inf
 
     def refined(self, part: float) -> "TimeSteps":
-        """Steps that are shorter by this factor; below `FINEST` estimated errors are of the iterations."""
-        return replace(self, tolerance=max(part**3 * self.tolerance, FINEST), longest=part * self.longest)
+        """Steps that are shorter by this factor; below `FINEST` estimated errors are of the
+        iterations.
+        """
+        return replace(
+            self, tolerance=max(part**3 * self.tolerance, FINEST), longest=part * self.longest
+        )
 
     def share(self, now: Motion) -> float:
         """What the last step may have added to the imbalance."""
@@ -97,14 +102,20 @@ def advance(
             if trial.error > steps.tolerance and length > SMALLEST * steps.first:
                 dt = max(0.3, change) * length
                 continue
-            leak = abs(trial.imbalance - now.imbalance) / steps.share(trial)  # nan where it is not checked
+            leak = abs(trial.imbalance - now.imbalance) / steps.share(
+                trial
+            )  # nan where it is not checked
             if leak > 1 and abs(trial.imbalance) > abs(now.imbalance):
                 if length <= SMALLEST * steps.first:
                     raise TimeStopped(unbalanced(now, trial), now)
                 dt = max(0.3, 0.8 / leak**0.5) * length
                 continue
             change = min(change, 1.0) if leak > SPENT else change
-            dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
+            dt = (
+                length * min(change, 2.0)
+                if change > 1.3
+                else max(length, dt if change > 1 else 0.0)
+            )
         elif not failed:
             dt = max(dt, 2 * length)
         failed = False

@@ -1,8 +1,10 @@
-"""Factors of the sparse part of a tangent where the rest is small beside it: eigenvalues far from zero, solutions.
+"""Factors of the sparse part of a tangent where the rest is small beside it: eigenvalues far from
+zero, solutions.
 
-With K = K0 + D the matrix A = K0^-1 D has an eigenvalue -1 where K is singular. On the way K0 + t D, t from 0 to 1,
-an eigenvalue nu < -1 of A makes it singular once, at t = -1/nu, with the vector x of nu: one more negative eigenvalue
-where x . D x < 0, else one less. So the inertia of K is that of K0 and what the few eigenvalues of A below -1 add.
+With K = K0 + D the matrix A = K0^-1 D has an eigenvalue -1 where K is singular. On the way K0 + t
+D, t from 0 to 1, an eigenvalue nu < -1 of A makes it singular once, at t = -1/nu, with the vector x
+of nu: one more negative eigenvalue where x . D x < 0, else one less. So the inertia of K is that of
+K0 and what the few eigenvalues of A below -1 add.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,13 +17,22 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import Beside, Rest, Vector, dot
 
 SMALL = 0.1  # eigenvalues of A within this size are not looked at one by one
-LEAST, MOST = 4, 30  # products with A for them: as many as show that there are none beyond, and before it is given up
+LEAST, MOST = (
+    4,
+    30,
+)  # products with A for them: as many as show that there are none beyond, and before it is given up
 RUNS = 6  # with what was found before left out: eigenvalues may be multiple
 SURE = 0.1  # error of an eigenvalue over its distance from -1
-TOLERANCE, ACCEPTED = 1e-12, 1e-7  # of a solution's rest, over the first one; the second where rounding hides more
+TOLERANCE, ACCEPTED = (
+    1e-12,
+    1e-7,
+)  # of a solution's rest, over the first one; the second where rounding hides more
 ROUGH = 3e-2  # the first of these of a step of Newton's method
-SURELY = 0.5  # of the tangent: less that is foreseen to lack changes no sign, were its error as large
-CORRECTED = 1.0  # a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
+SURELY = (
+    0.5  # of the tangent: less that is foreseen to lack changes no sign, were its error as large
+)
+# a larger doubt is looked into: what is older is corrected along the vectors of large eigenvalues,
+CORRECTED = 1.0
 FEW = 3  # if they are not more
 KEPT = 40  # products with D that are remembered
 DEPENDENT = 1e-12  # square of the part of a vector that others do not have
@@ -30,7 +41,9 @@ Map = Callable[[Vector], Vector]
 
 
 class Krylov:
-    """A basis of the vectors that a matrix makes of one, orthonormal, one more with each `grow`: Arnoldi's method."""
+    """A basis of the vectors that a matrix makes of one, orthonormal, one more with each `grow`:
+    Arnoldi's method.
+    """
 
     def __init__(self, times: Map, first: Vector, comm: MPI.Comm, most: int) -> None:
         self._times, self._comm = times, comm
@@ -39,7 +52,10 @@ class Krylov:
         self.H = np.zeros((most + 1, most))
 
     def grow(self) -> int:
-        """Add a vector; the number of columns of H that are made. What is left of an invariant space is zero."""
+        """Add a vector; the number of columns of H that are made.
+
+        What is left of an invariant space is zero.
+        """
         j, w = len(self.basis) - 1, np.array(self._times(self.basis[-1]))
         for _ in range(2):
             for i, q in enumerate(self.basis):
@@ -79,10 +95,12 @@ class Remembered:
 
 
 class Solver:
-    """Solves (I + A) x = b, A = K^-1 D, by generalised conjugate residuals that begin with all products so far.
+    """Solves (I + A) x = b, A = K^-1 D, by generalised conjugate residuals that begin with all
+    products so far.
 
-    So a solution needs few products, or none: D has few large eigenvalues over K, and earlier vectors hold their
-    directions (M. L. Parks, E. de Sturler, G. Mackey, D. D. Johnson, S. Maiti, SIAM J. Sci. Comput. 28, 2006, 1651).
+    So a solution needs few products, or none: D has few large eigenvalues over K, and earlier
+    vectors hold their directions (M. L. Parks, E. de Sturler, G. Mackey, D. D. Johnson, S. Maiti,
+    SIAM J. Sci. Comput. 28, 2006, 1651).
 
     Parameters
     ----------
@@ -126,7 +144,9 @@ class Solver:
             return np.full_like(b, np.nan)
         return x + r if rest <= tolerance else x
 
-    def _without(self, u: Vector, c: Vector, sign: float, count: int | None = None) -> tuple[Vector, Vector]:
+    def _without(
+        self, u: Vector, c: Vector, sign: float, count: int | None = None
+    ) -> tuple[Vector, Vector]:
         """What is left of c beside the columns, and u less their sum or, with the sign -1, plus it."""
         m = self._count if count is None else count
         for _ in range(2):  # the second time for what rounding has left
@@ -142,7 +162,8 @@ class Crossings:
     Attributes
     ----------
     doubt
-        The largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is the same.
+        The largest |nu|/|1 + nu|: with errors of D below its inverse, relative to D, the number is
+        the same.
     large
         Vectors of the eigenvalues beyond `SMALL`.
     """
@@ -173,8 +194,9 @@ class Apart:
 class Corrected:
     """D where it is of an earlier state, with what it lacks along some vectors X, and symmetric.
 
-    With F X = Y, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C with C X = 1, here
-    C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates from X.
+    With F X = Y, D + F has (Powell's symmetric update, of several) F = Y C + C^T Y^T - C^T X^T Y C
+    with C X = 1, here C = (X^T K X)^-1 X^T K: nothing is added between vectors that K separates
+    from X.
 
     Parameters
     ----------
@@ -183,9 +205,19 @@ class Corrected:
     """
 
     def __init__(
-        self, D: Rest, X: Sequence[Vector], lacks: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm
+        self,
+        D: Rest,
+        X: Sequence[Vector],
+        lacks: Sequence[Vector],
+        KX: Sequence[Vector],
+        comm: MPI.Comm,
     ) -> None:
-        self._D, self._comm, self._apart, self._Y = D, comm, Apart(X, KX, comm), np.column_stack(lacks)
+        self._D, self._comm, self._apart, self._Y = (
+            D,
+            comm,
+            Apart(X, KX, comm),
+            np.column_stack(lacks),
+        )
         between = comm.allreduce(self._apart.X.T @ self._Y)
         self._between = (between + between.T) / 2
 
@@ -222,7 +254,9 @@ def crossings(D: Map, back: Map, first: Vector, comm: MPI.Comm) -> Crossings | N
             values, vectors = np.linalg.eig(krylov.H[:size, :size])
             errors = abs(krylov.H[size, size - 1] * vectors[-1])
             far = np.flatnonzero(np.abs(values) > SMALL)
-            if size >= LEAST and np.all(errors[far] < SURE * np.minimum(abs(1 + values[far]), abs(values[far]))):
+            if size >= LEAST and np.all(
+                errors[far] < SURE * np.minimum(abs(1 + values[far]), abs(values[far]))
+            ):
                 break
             if size == MOST:
                 return None
@@ -230,7 +264,11 @@ def crossings(D: Map, back: Map, first: Vector, comm: MPI.Comm) -> Crossings | N
         if not len(far):
             return Crossings(more, doubt, out)
         for i in far[values[far].imag >= 0]:  # of a conjugate pair one
-            parts = [vectors[:, i].real, vectors[:, i].imag] if values[i].imag > 0 else [vectors[:, i].real]
+            parts = (
+                [vectors[:, i].real, vectors[:, i].imag]
+                if values[i].imag > 0
+                else [vectors[:, i].real]
+            )
             vectors_of_value = [krylov.combined(part) for part in parts]
             if values[i].imag == 0 and values[i].real < -1:
                 x = vectors_of_value[0]
@@ -241,11 +279,15 @@ def crossings(D: Map, back: Map, first: Vector, comm: MPI.Comm) -> Crossings | N
     return None
 
 
-def doubted(tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vector, comm: MPI.Comm) -> Crossings:
-    """A count with the doubt that what may be of an earlier state makes; a large one is met with what is present.
+def doubted(
+    tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vector, comm: MPI.Comm
+) -> Crossings:
+    """A count with the doubt that what may be of an earlier state makes; a large one is met with
+    what is present.
 
-    What is older, with an error as large as itself, changes the sign along a vector x where x . changing x is larger
-    than x . (K + D) x. Of vectors that K separates from those of large eigenvalues, only the largest is looked at.
+    What is older, with an error as large as itself, changes the sign along a vector x where x .
+    changing x is larger than x . (K + D) x. Of vectors that K separates from those of large
+    eigenvalues, only the largest is looked at.
     """
     changing = tangent.changing
     if changing is None:
@@ -257,7 +299,9 @@ def doubted(tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vecto
         for x, y in zip(X, KX, strict=True)
     ]
     apart, change = Apart(X, KX, comm), tangent.change
-    rest = max(least, largest(lambda v: apart.of(back(changing.times(apart.of(v)))), apart.of(first), comm))
+    rest = max(
+        least, largest(lambda v: apart.of(back(changing.times(apart.of(v)))), apart.of(first), comm)
+    )
     if tangent.foreseen:  # the older part may be small where the present one is not
         missed = largest(lambda v: apart.of(back(change(apart.of(v)))), apart.of(first), comm)
         rest = max(rest, missed / SURELY)
@@ -266,7 +310,9 @@ def doubted(tangent: Beside, counted: Crossings, back: Map, K: Map, first: Vecto
         X, KX = ([each[i] for i in large] for each in (X, KX))
         D = Corrected(tangent.D, X, [tangent.present(x) - changing.times(x) for x in X], KX, comm)
         if again := crossings(D.times, back, first, comm):
-            return replace(again, doubt=max([rest, *(doubt for doubt in doubts if doubt <= CORRECTED)]))
+            return replace(
+                again, doubt=max([rest, *(doubt for doubt in doubts if doubt <= CORRECTED)])
+            )
     return replace(counted, doubt=max([rest, *doubts]))
 
 
@@ -276,6 +322,8 @@ def largest(times: Map, first: Vector, comm: MPI.Comm) -> float:
     while (size := krylov.grow()) < MOST:
         values, vectors = np.linalg.eig(krylov.H[:size, :size])
         i = int(np.argmax(np.abs(values)))
-        if size >= LEAST and abs(krylov.H[size, size - 1] * vectors[-1, i]) <= SURE * abs(values[i]):
+        if size >= LEAST and abs(krylov.H[size, size - 1] * vectors[-1, i]) <= SURE * abs(
+            values[i]
+        ):
             return float(abs(values[i]))
     return np.inf

@@ -1,11 +1,12 @@
-"""Simple bifurcations: a tangent that is singular while the load does no work along its null vector v.
+"""Simple bifurcations: a tangent that is singular while the load does no work along its null vector
+v.
 
     R(u, mu) + beta b = 0,    g(u, mu) = 0,    v . R_mu = 0
 
-for (u, mu, beta), with g and v of `fold.AugmentedTangent`. This system is regular at a simple bifurcation. A small
-imperfection, from the mesh or from rounding, splits the bifurcation; beta is the force along v that restores it
-(Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4 and 6). From there the branches
-that cross the path are entered.
+for (u, mu, beta), with g and v of `fold.AugmentedTangent`. This system is regular at a simple
+bifurcation. A small imperfection, from the mesh or from rounding, splits the bifurcation; beta is
+the force along v that restores it (Govaerts, Numerical methods for bifurcations of dynamical
+equilibria, SIAM 2000, ch. 4 and 6). From there the branches that cross the path are entered.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,19 +22,35 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.system import (
+    State,
+    System,
+    Vector,
+    Weighted,
+    dot,
+    followed,
+    max_abs,
+)
 
 TOLERANCE = 1e-9  # of u, in lengths of the system
 MOST_ITERATIONS = 10
 LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
 SCATTER = 3.0  # load error in units of the last corrections, which are rounding
-NEAR = 1e-5  # in lengths: after a longer step the state is brought back into equilibrium, except for the force along v
+# in lengths: after a longer step the state is brought back into equilibrium, except for the force
+# along v
+NEAR = 1e-5
 DIFFERENCE = 1e-4  # relative, of an amplitude
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in lengths of the system
-SMALLER = 0.2, 0.08, 0.03  # if the first of these fails, as where the tangent is nearly singular in another direction
+SMALLER = (
+    0.2,
+    0.08,
+    0.03,
+)  # if the first of these fails, as where the tangent is nearly singular in another direction
 SEEN = 1e-4  # a larger relative change of the amplitude is no rounding error
-ODD = 0.1  # a branch is asymmetric if the changes of the amplitude in both directions differ by more than this part
+# a branch is asymmetric if the changes of the amplitude in both directions differ by more than this
+# part
+ODD = 0.1
 
 
 class BifurcationLost(RuntimeError):
@@ -49,8 +66,8 @@ class Bifurcation:
     phi
         Null vector of K, of length one.
     response
-        Change of u per unit of -mu, without phi. The tangents of both branches are combinations of (phi, 0)
-        and (-response, 1).
+        Change of u per unit of -mu, without phi. The tangents of both branches are combinations of
+        (phi, 0) and (-response, 1).
     unstable
         Number of unstable directions besides `phi`.
     error
@@ -119,15 +136,21 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
     )
 
 
-def _settled(newton: BorderedNewton, state: State, v: Vector, stress: Sequence[Weighted] = ()) -> tuple[State, float]:
+def _settled(
+    newton: BorderedNewton, state: State, v: Vector, stress: Sequence[Weighted] = ()
+) -> tuple[State, float]:
     mode = held_along(newton, state, v, stress)
     if mode is None:
         raise BifurcationLost
     return mode
 
 
-def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float, Vector]:
-    """Newton's step (du, dmu) and w_mu: du = alpha v - w_R - dmu w_mu, alpha and dmu from the rows g and v . R_mu."""
+def _step(
+    system: System, state: State, name: str, tangent: AugmentedTangent
+) -> tuple[Vector, float, Vector]:
+    """Newton's step (du, dmu) and w_mu: du = alpha v - w_R - dmu w_mu, alpha and dmu from the rows
+    g and v . R_mu.
+    """
     comm, u, v = system.comm, state.u, tangent.v
     w_R, _ = tangent.solve(system.residual(u, state.mu))
     w_mu, pull = tangent.solve(system.load(u, state.mu, name))  # pull = v . R_mu
@@ -135,7 +158,10 @@ def _step(system: System, state: State, name: str, tangent: AugmentedTangent) ->
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     both = mixed(system, state, v, w_mu) - K_mu_v
     turn, bend = dot(comm, both, v), dot(comm, v, _load_rate(system, state, name))
-    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, both, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn]]
+    rows = [
+        [turn, -dot(comm, cubic, v)],
+        [dot(comm, both, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn],
+    ]
     rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, both, w_R)]
     dmu, alpha = np.linalg.solve(rows, rest)
     return alpha * v - w_R - dmu * w_mu, float(dmu), w_mu
@@ -148,7 +174,9 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
     return np.asarray((ahead - back) / (2 * d))
 
 
-def mixed(system: System, state: State, v: Vector, w: Vector, residual: Vector | None = None) -> Vector:
+def mixed(
+    system: System, state: State, v: Vector, w: Vector, residual: Vector | None = None
+) -> Vector:
     """Pi'''(v, w, .), by polarisation; the residual at the state may be known."""
     comm = system.comm
     size = max_abs(comm, w) / max_abs(comm, v)
@@ -166,8 +194,12 @@ def _done(sizes: Sequence[float]) -> bool:
 
 
 def _kept(changes: Sequence[float], mu: float) -> bool:
-    """Whether the last change of the amplitude is below the tolerance, or as small as rounding allows."""
-    stalled = len(changes) > 1 and changes[-1] > changes[-2] / 2 and changes[-1] <= ROUNDING * abs(mu)
+    """Whether the last change of the amplitude is below the tolerance, or as small as rounding
+    allows.
+    """
+    stalled = (
+        len(changes) > 1 and changes[-1] > changes[-2] / 2 and changes[-1] <= ROUNDING * abs(mu)
+    )
     return stalled or changes[-1] <= TOLERANCE * abs(mu)
 
 
@@ -188,16 +220,20 @@ class Branching:
 
 
 def branching(
-    path: Path, bifurcation: Point, refused: Callable[[Point, Point], bool] = lambda low, high: False
+    path: Path,
+    bifurcation: Point,
+    refused: Callable[[Point, Point], bool] = lambda low, high: False,
 ) -> Branching | None:
-    """Leave a path at a located bifurcation along the null vector; None if that or the first points are not found.
+    """Leave a path at a located bifurcation along the null vector; None if that or the first points
+    are not found.
 
     Parameters
     ----------
     path
         Controlled by arc length.
     refused
-        Whether the straight way from the bifurcation to a first point must not be gone; a nearer one is tried then.
+        Whether the straight way from the bifurcation to a first point must not be gone; a nearer
+        one is tried then.
     """
     name, state = path.name, bifurcation.state
     try:
@@ -233,11 +269,13 @@ def largest(comm: MPI.Comm, v: Vector) -> float:
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
     """The point of the branch at a distance along the null vector, with a tangent that leads away.
 
-    First a force along the null vector pushes the system there at the same amplitude. Then the force is removed
-    and the amplitude is unknown.
+    First a force along the null vector pushes the system there at the same amplitude. Then the
+    force is removed and the amplitude is unknown.
     """
     metric, name, newton = path.metric, path.name, path.newton
-    row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))
+    row = Hyperplane(
+        metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0))
+    )
     try:
         pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
     except np.linalg.LinAlgError:  # singular in another direction too

@@ -1,8 +1,10 @@
-"""The boundary of stability: a fold or a bifurcation followed in a second number p, through turning points.
+"""The boundary of stability: a fold or a bifurcation followed in a second number p, through turning
+points.
 
-Both are curves in (u, mu, p), see `augmented` and, of modes that the model excludes, `excluded`. They are followed by
-arc length; cubics predict. Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes
-along v alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a bifurcation.
+Both are curves in (u, mu, p), see `augmented` and, of modes that the model excludes, `excluded`.
+They are followed by arc length; cubics predict. Along folds v . (R_mu dmu + R_p dp) = 0. So where p
+turns, mu turns too and the curve goes along v alone, a cusp, at which v . Pi'''(v, v) is zero; or v
+. R_mu is zero: two folds meet at a bifurcation.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,21 +22,33 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
 Label = Literal["start", "point", "cusp", "turn", "meeting", "crossing", "end"]
-TOLERANCE = 1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
+TOLERANCE = (
+    1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
+)
 LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
 MOST_ITERATIONS = 8
 LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
 EASY = 2  # iterations after which a step grows
-MOST_TURN, STRAIGHT = 0.6, 0.95  # cosines of successive tangents: less is refused; with more, steps grow
+MOST_TURN, STRAIGHT = (
+    0.6,
+    0.95,
+)  # cosines of successive tangents: less is refused; with more, steps grow
 GAP = 0.5  # of a step: a larger correction of its prediction counts as a jump
 ALIKE = 0.5  # cosine of successive null vectors
 SMALLEST = 1e-4  # of the first step
 STEEP = 0.2  # part of p in the tangent from which costly systems are taken at a given p
 SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
 MOST_TRIALS, MOST_POINTS = 12, 400
-MOST_LOOKS, LOOKED, CLOSE = 8, 4, 1e-3  # points near a meeting, those that are interpolated, and their distance
+MOST_LOOKS, LOOKED, CLOSE = (
+    8,
+    4,
+    1e-3,
+)  # points near a meeting, those that are interpolated, and their distance
 ROUNDING = 1e-12  # relative, of an amplitude
-LAST, APART = 3, 1e-3  # points whose systems give a slope by p, and their distance at least, over the range
+LAST, APART = (
+    3,
+    1e-3,
+)  # points whose systems give a slope by p, and their distance at least, over the range
 
 
 class BoundaryLost(RuntimeError):
@@ -53,7 +67,8 @@ class Boundary:
     recorded
         Gets each solve, and gives its result or that of an interrupted boundary at this place.
     m
-        The family of modes that the model excludes in which the bifurcation is; 0: it is one of the model itself.
+        The family of modes that the model excludes in which the bifurcation is; 0: it is one of the
+        model itself.
     watched
         Whether the modes that the model excludes are counted along its own.
     """
@@ -77,7 +92,9 @@ class Boundary:
     def inner(self, a: Way, b: Way) -> float:
         """<a, b>: root mean square of u over the length, and the numbers over their scales."""
         mu, p = self.scales
-        return self._weight * dot(self._comm, a.du, b.du) + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
+        return (
+            self._weight * dot(self._comm, a.du, b.du) + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
+        )
 
     def start(self, p: float, state: State, phi: Vector) -> Locus:
         """The point at p near an instability that a path has located.
@@ -91,7 +108,9 @@ class Boundary:
         self._comm, self._length = system.comm, system.length
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
         if self.family.at(p).factor_at(state).skewed:
-            raise BoundaryLost("a load without potential: its tangent is not symmetric, and no boundary is followed")
+            raise BoundaryLost(
+                "a load without potential: its tangent is not symmetric, and no boundary is followed"
+            )
         again = self._solved(p, state, phi, _at(p), None)
         if isinstance(again, str):
             raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {again}")
@@ -132,7 +151,9 @@ class Boundary:
             if isinstance(tried, str):
                 length /= 2
                 if length < SMALLEST * first:
-                    raise BoundaryLost(f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {tried}")
+                    raise BoundaryLost(
+                        f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {tried}"
+                    )
                 continue
             step = self._distance(here, tried, length)
             yield from self._between(here, tried, step)
@@ -156,14 +177,21 @@ class Boundary:
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
             yield "cusp" if is_cusp else "turn", turn
         if not self._watched:
-            if low.unstable != high.unstable and (met := self._meeting(low, high, length, lambda one: one.unstable)):
+            if low.unstable != high.unstable and (
+                met := self._meeting(low, high, length, lambda one: one.unstable)
+            ):
                 yield "meeting", met
             return
         families = range(max(len(low.counts), len(high.counts)))
         changed = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
-        met_by = {i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i) for i in changed}
+        met_by = {
+            i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i)
+            for i in changed
+        }
         counts = [low.unstable_of(i) for i in families]
-        for i, met in sorted(met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0):
+        for i, met in sorted(
+            met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0
+        ):
             if met is None:
                 continue
             if i == self.m == 0:
@@ -213,30 +241,55 @@ class Boundary:
         if not self._at_given_p(here):
             return length
         name = self.name
-        off = Way(there.state.u - here.state.u, there.state.mu[name] - here.state.mu[name], there.p - here.p)
+        off = Way(
+            there.state.u - here.state.u,
+            there.state.mu[name] - here.state.mu[name],
+            there.p - here.p,
+        )
         return self.inner(here.way, off)
 
-    def _at_distance(self, base: Locus, guess: Way, length: float, *, look: int | None = None) -> Locus | str:
+    def _at_distance(
+        self, base: Locus, guess: Way, length: float, *, look: int | None = None
+    ) -> Locus | str:
         """The point at a distance along the tangent of another one."""
         way, (mu, p), name = base.way, self.scales, self.name
 
         def value(u: Vector, m: float, q: float) -> float:
-            return self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
+            return (
+                self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
+            )
 
         row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
         return self._tried(base, guess, length, row, look=look)
 
     def _looked_at(self, base: Locus, guess: Way, s: float, family: int) -> Locus | str:
-        """A point with the eigenvalue of a family; where families do not couple, at a given p if that is cheaper."""
+        """A point with the eigenvalue of a family; where families do not couple, at a given p if
+        that is cheaper.
+        """
         if not (self.m and self._at_given_p(base)):
             return self._at_distance(base, guess, s, look=family)
         return self._tried(base, guess, s, _at(guess.dp), look=family, rough=True)
 
     def _tried(
-        self, base: Locus, guess: Way, length: float, row: Row, *, look: int | None = None, rough: bool = False
+        self,
+        base: Locus,
+        guess: Way,
+        length: float,
+        row: Row,
+        *,
+        look: int | None = None,
+        rough: bool = False,
     ) -> Locus | str:
         name = self.name
-        point = self._solved(guess.dp, State(guess.du, {name: guess.dmu}), base.phi, row, base, look=look, rough=rough)
+        point = self._solved(
+            guess.dp,
+            State(guess.du, {name: guess.dmu}),
+            base.phi,
+            row,
+            base,
+            look=look,
+            rough=rough,
+        )
         if isinstance(point, str):
             return point
         off = Way(point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp)
@@ -247,9 +300,15 @@ class Boundary:
         return point
 
     def _last(
-        self, before: tuple[Locus, float] | None, here: Locus, length: float, ends: tuple[float, float]
+        self,
+        before: tuple[Locus, float] | None,
+        here: Locus,
+        length: float,
+        ends: tuple[float, float],
     ) -> tuple[Locus, float] | None:
-        """The point at the end of the range, and its distance; None if the boundary does not go there at once."""
+        """The point at the end of the range, and its distance; None if the boundary does not go
+        there at once.
+        """
         low, high = 0.0, length
         for _ in range(50):  # where the prediction leaves the range
             middle = (low + high) / 2
@@ -260,18 +319,26 @@ class Boundary:
         row = _at(end)
         guessed, rough = State(guess.du, {self.name: guess.dmu}), self._at_given_p(here)
         last = self._solved(end, guessed, here.phi, row, here, rough=rough)
-        if isinstance(last, str) or last.way.dp * here.way.dp < 0 or self.inner(last.way, here.way) < MOST_TURN:
+        if (
+            isinstance(last, str)
+            or last.way.dp * here.way.dp < 0
+            or self.inner(last.way, here.way) < MOST_TURN
+        ):
             return None
         off = Way(last.state.u - guess.du, last.state.mu[self.name] - guess.dmu, 0.0)
         return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(last, p=end), high)
 
     def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
-        """Where p turns between two points: the stationary point of the cubic through both, repeated."""
+        """Where p turns between two points: the stationary point of the cubic through both,
+        repeated.
+        """
         base, a, b = low, 0.0, length  # distances along the tangent of the base
         best = min(low, high, key=lambda one: abs(one.way.dp))
         for _ in range(MOST_TRIALS):
             s = _zero_of_slope(a, low, b, high, base, self)
-            guess = self._hermite(low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a))
+            guess = self._hermite(
+                low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a)
+            )
             middle = self._at_distance(base, guess, s)
             if isinstance(middle, str):  # rounding: the cubic is as good
                 state = best.state.with_(guess.du, self.name, float(guess.dmu))
@@ -282,16 +349,19 @@ class Boundary:
             rest = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
             if rest <= SPECIAL * self.scales[1] or min(s - a, b - s) < 1e-9 * length:
                 break
-            low, high, a, b = (middle, high, s, b) if middle.way.dp * low.way.dp > 0 else (low, middle, a, s)
+            low, high, a, b = (
+                (middle, high, s, b) if middle.way.dp * low.way.dp > 0 else (low, middle, a, s)
+            )
         return best
 
     def _meeting(
         self, low: Locus, high: Locus, length: float, count: Callable[[Locus], int], family: int = 0
     ) -> Locus | None:
-        """Where a second eigenvalue, of a family, is zero between two points, by inverse interpolation.
+        """Where a second eigenvalue, of a family, is zero between two points, by inverse
+        interpolation.
 
-        The bordered tangent may be singular there, so the point itself is interpolated between others close by; where
-        families do not couple it is not, and these may be closer.
+        The bordered tangent may be singular there, so the point itself is interpolated between
+        others close by; where families do not couple it is not, and these may be closer.
         """
         close = CLOSE if family in (0, self.m) else CLOSE**2
         looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
@@ -299,13 +369,19 @@ class Boundary:
         for _ in range(MOST_LOOKS):
             guess = self._hermite(low, high, length, s / length)
             tried = self._looked_at(low, guess, s, family)
-            if isinstance(tried, str) or any(s == place or tried.second == second for place, second, _ in looked_at):
+            if isinstance(tried, str) or any(
+                s == place or tried.second == second for place, second, _ in looked_at
+            ):
                 break
-            looked_at = sorted([*looked_at, (s, tried.second, tried)], key=lambda each: abs(each[1]))[:LOOKED]
+            looked_at = sorted(
+                [*looked_at, (s, tried.second, tried)], key=lambda each: abs(each[1])
+            )[:LOOKED]
             a, b = (s, b) if count(tried) == count(low) else (a, s)
             s = (a + b) / 2
             if len(looked_at) > 1:
-                ahead = interpolated([each[1] for each in looked_at], [each[0] for each in looked_at], 0.0)
+                ahead = interpolated(
+                    [each[1] for each in looked_at], [each[0] for each in looked_at], 0.0
+                )
                 nearest_place = looked_at[0][0]
                 by_rounding = not a < ahead < b and abs(ahead - nearest_place) < CLOSE * length
                 if by_rounding or abs(ahead - nearest_place) < close * length:
@@ -316,18 +392,32 @@ class Boundary:
             return looked_at[0][2] if looked_at else None
         places, mu = [each[0] for each in looked_at], self.name
         nearest, loads = looked_at[0][2], [each[2].state.mu[mu] for each in looked_at]
-        p, load = interpolated(places, [each[2].p for each in looked_at], s), interpolated(places, loads, s)
+        p, load = (
+            interpolated(places, [each[2].p for each in looked_at], s),
+            interpolated(places, loads, s),
+        )
         error = abs(load - interpolated(places[:-1], loads[:-1], s)) + nearest.load_error
-        return replace(nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error)
+        return replace(
+            nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error
+        )
 
     def _lines(
-        self, newton: BorderedNewton, state: State, b: Vector, p: float, beside: Sequence[tuple[float, float]]
+        self,
+        newton: BorderedNewton,
+        state: State,
+        b: Vector,
+        p: float,
+        beside: Sequence[tuple[float, float]],
     ) -> Lines | ExcludedLines:
         """The rows of Newton's step at a state."""
         if self.m:
-            return ExcludedLines(newton, state, self.name, b, self.m, cast(Excluding, self.family), p, beside)
+            return ExcludedLines(
+                newton, state, self.name, b, self.m, cast(Excluding, self.family), p, beside
+            )
         tangent = AugmentedTangent(newton, state, b)
-        return Lines(self.kind, newton.system, state, self.name, tangent, self.family, p, beside, self.scales)
+        return Lines(
+            self.kind, newton.system, state, self.name, tangent, self.family, p, beside, self.scales
+        )
 
     def _counts(self, lines: Lines | ExcludedLines, p: float, state: State) -> Sequence[int]:
         """See `Locus`."""
@@ -336,10 +426,14 @@ class Boundary:
         excluded = cast(Excluding, self.family).counts(p, state) if self._watched else ()
         return [lines.unstable, *excluded]
 
-    def _eigenvalue(self, lines: Lines | ExcludedLines, family: int, p: float, state: State) -> float:
+    def _eigenvalue(
+        self, lines: Lines | ExcludedLines, family: int, p: float, state: State
+    ) -> float:
         """The second one of a family."""
         if family and not self.m:
-            return nearest_eigenvalue(cast(Excluding, self.family).factored(p, state, family), self._comm)
+            return nearest_eigenvalue(
+                cast(Excluding, self.family).factored(p, state, family), self._comm
+            )
         return lines.eigenvalue(family, p, state)
 
     def _solved(
@@ -372,15 +466,28 @@ class Boundary:
         return found
 
     def _beside(self, p: float, *, rough: bool) -> Sequence[tuple[float, float]]:
-        """Weights and values of p of a difference by p; a rough one from the last points, which have their systems."""
+        """Weights and values of p of a difference by p; a rough one from the last points, which
+        have their systems.
+        """
         places = [p]
         for q in reversed(self._solved_at):
-            if min(abs(q - place) for place in places) > APART * self.scales[1] and len(places) <= LAST:
+            if (
+                min(abs(q - place) for place in places) > APART * self.scales[1]
+                and len(places) <= LAST
+            ):
                 places.append(q)
         return slope(places) if rough and len(places) > LAST else self.family.beside(p, rough=rough)
 
     def _iterated(
-        self, p: float, state: State, b: Vector, row: Row, near: Locus | None, *, look: int | None, rough: bool
+        self,
+        p: float,
+        state: State,
+        b: Vector,
+        row: Row,
+        near: Locus | None,
+        *,
+        look: int | None,
+        rough: bool,
     ) -> Locus | str:
         u, mu, name = state.u, float(state.mu[self.name]), self.name
         beside = self._beside(p, rough=rough)
@@ -451,7 +558,9 @@ def _turned(locus: Locus) -> Locus:
     return replace(locus, way=Way(-locus.way.du, -locus.way.dmu, -locus.way.dp))
 
 
-def _zero_of_slope(a: float, low: Locus, b: float, high: Locus, base: Locus, boundary: Boundary) -> float:
+def _zero_of_slope(
+    a: float, low: Locus, b: float, high: Locus, base: Locus, boundary: Boundary
+) -> float:
     """Where the Hermite cubic of p over the distance along the base's tangent is stationary."""
     d0, d1 = (one.way.dp / boundary.inner(base.way, one.way) for one in (low, high))
     return a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)

@@ -1,6 +1,8 @@
-"""The quantity that is prescribed along a path, as the last row of the system for (u, mu), and the matrix with it.
+"""The quantity that is prescribed along a path, as the last row of the system for (u, mu), and the
+matrix with it.
 
-The bordered matrix is inverted by block elimination; Broyden's update goes on with it at later iterates.
+The bordered matrix is inverted by block elimination; Broyden's update goes on with it at later
+iterates.
 """
 
 from collections.abc import Callable, Sequence
@@ -83,7 +85,8 @@ class GivenConjugate:
 
 @dataclass(frozen=True)
 class Metric:
-    """Lengths along a path of (u, mu): from the root mean square of u over the system's length, and mu over `scale`.
+    """Lengths along a path of (u, mu): from the root mean square of u over the system's length, and
+    mu over `scale`.
 
     So a step length means the same for a thick and a thin shell, and on any mesh.
     """
@@ -153,11 +156,19 @@ class Bordered:
     column
         R_mu.
     rough
-        Whether a small part of K is that of an earlier state, so that its solutions need not be better.
+        Whether a small part of K is that of an earlier state, so that its solutions need not be
+        better.
     """
 
     def __init__(
-        self, system: System, factors: Factorisation, state: State, name: str, row: Row, *, rough: bool = False
+        self,
+        system: System,
+        factors: Factorisation,
+        state: State,
+        name: str,
+        row: Row,
+        *,
+        rough: bool = False,
     ) -> None:
         self.state, self.row, self.rough, self._mu = state, row, rough, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
@@ -165,7 +176,9 @@ class Bordered:
         self.column = system.load(state.u, state.mu, name)
         self._x2 = factors.solve(self.column, rough=rough)
         self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
-        self._weight = dot(self._comm, self._x2, self._x2)  # dmu counts as the displacement that it causes
+        self._weight = dot(
+            self._comm, self._x2, self._x2
+        )  # dmu counts as the displacement that it causes
 
     def size(self, step: Direction) -> float:
         """The size of a step: the larger of du, in lengths of the system, and dmu.
@@ -177,7 +190,9 @@ class Bordered:
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
 
     def solve(self, f: Vector, g: float, *, rough: bool = False) -> Direction:
-        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g; `rough` as in `Factorisation.solve`."""
+        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g; `rough` as in
+        `Factorisation.solve`.
+        """
         x1 = self._factors.solve(f, rough=rough)
         dmu = (g - slope(self._comm, self._gradient, (x1, 0.0))) / self._schur
         return x1 - dmu * self._x2, dmu
@@ -193,7 +208,9 @@ class Bordered:
 
     def times(self, du: Vector, dmu: float) -> Direction:
         """The matrix times a direction."""
-        return self._factors.times(du) + dmu * self.column, slope(self._comm, self._gradient, (du, dmu))
+        return self._factors.times(du) + dmu * self.column, slope(
+            self._comm, self._gradient, (du, dmu)
+        )
 
 
 class Chord(Generic[V]):
@@ -211,7 +228,10 @@ class Chord(Generic[V]):
     """
 
     def __init__(
-        self, solve: Callable[[V], V], inner: Callable[[V, V], float], plus: Callable[[V, float, V], V]
+        self,
+        solve: Callable[[V], V],
+        inner: Callable[[V, V], float],
+        plus: Callable[[V, float, V], V],
     ) -> None:
         self._solve, self._inner, self._plus = solve, inner, plus
         self._steps = list[V]()  # those taken since the matrix was made
@@ -232,7 +252,9 @@ class Chord(Generic[V]):
         return step
 
     def solve(self, f: V, step: V) -> V:
-        """The solution for any right side at the present iterate, from which `step` is the next one."""
+        """The solution for any right side at the present iterate, from which `step` is the next
+        one.
+        """
         return self._updated(f, [*self._steps, step])
 
     def _updated(self, f: V, steps: Sequence[V]) -> V:
@@ -243,12 +265,20 @@ class Chord(Generic[V]):
 
 
 def refined_tangent(
-    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row, *, foreseeing: bool = False
+    system: System,
+    matrix: Bordered,
+    t: Direction,
+    state: State,
+    load: Vector,
+    row: Row,
+    *,
+    foreseeing: bool = False,
 ) -> Direction | None:
-    """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
+    """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate
+    residuals.
 
-    If `foreseeing`, with forces that are foreseen, and computed along the tangent itself. None if the matrix is too far
-    away.
+    If `foreseeing`, with forces that are foreseen, and computed along the tangent itself. None if
+    the matrix is too far away.
     """
     near = _Near(system, matrix, state, load, row)
     if not foreseeing:
@@ -275,17 +305,27 @@ class _Near:
     row: Row
 
     def refined(self, residual: Residual, t: Direction) -> tuple[Direction, int] | None:
-        """The tangent with some residual, from one that is nearly as good, and how often this was improved."""
+        """The tangent with some residual, from one that is nearly as good, and how often this was
+        improved.
+        """
         comm, gradient = self.system.comm, self.row.gradient(self.state)
         R = residual(self.state.u, self.state.mu)
 
         def times(t: Direction, right: float = 0.0) -> Direction:
-            rest = self.stiffness(residual, t[0], R) + t[1] * self.load, slope(comm, gradient, t) - right
+            rest = (
+                self.stiffness(residual, t[0], R) + t[1] * self.load,
+                slope(comm, gradient, t) - right,
+            )
             return self.matrix.solve(*rest, rough=self.matrix.rough)
 
-        z, directions = plus((0.0 * t[0], 0.0), -1.0, times(t, 1.0)), list[tuple[Direction, Direction, float]]()
+        z, directions = (
+            plus((0.0 * t[0], 0.0), -1.0, times(t, 1.0)),
+            list[tuple[Direction, Direction, float]](),
+        )
         for _ in range(MOST_REFINEMENTS):
-            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
+            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(
+                t[1]
+            ):
                 t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
                 return t, len(directions)
             p, q = z, times(z)

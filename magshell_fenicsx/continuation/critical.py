@@ -1,4 +1,6 @@
-"""The first instability: a boundary that goes on with another mode where that becomes critical before its own."""
+"""The first instability: a boundary that goes on with another mode where that becomes critical
+before its own.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +37,8 @@ def critical(
     curve
         The boundary of a family (0: of the model's own modes) that goes on from a crossing.
     null_vector
-        Of a crossing, the family there, and that of the boundary before: the mode that becomes critical.
+        Of a crossing, the family there, and that of the boundary before: the mode that becomes
+        critical.
     mode, start, sense, ends, steps
         The first boundary, and as of `Boundary.followed`.
 
@@ -46,7 +49,9 @@ def critical(
         are unstable first, and none of them is found.
     """
     search = _Search(curve, null_vector, ends)
-    begun_by: int | None = None  # the family of the boundary before, where this one begins at their crossing
+    begun_by: int | None = (
+        None  # the family of the boundary before, where this one begins at their crossing
+    )
     while True:
         last, successor = start, None
         for label, locus in mode.followed(start, sense, ends, steps):
@@ -77,7 +82,9 @@ def critical(
         mode, start, begun_by = successor.mode, successor.start, successor.begun_by
 
 
-def first_mode(curve: Curve, null_vector: NullVector, mode: Boundary, start: Locus) -> tuple[Boundary, Locus]:
+def first_mode(
+    curve: Curve, null_vector: NullVector, mode: Boundary, start: Locus
+) -> tuple[Boundary, Locus]:
     """Return the boundary that a start belongs to, and its point: another mode's where that comes
     just before.
 
@@ -199,7 +206,9 @@ class _Search:
                         return successor
                     unstable_there = _unstable_families(successor.mode, successor.start)
                     families_asked += [
-                        other for other in unstable_there if other not in families_asked and other != mode.m
+                        other
+                        for other in unstable_there
+                        if other not in families_asked and other != mode.m
                     ]
             except (BoundaryLost, NoSystem) as e:
                 why = str(e)
@@ -217,7 +226,9 @@ def _unstable_families(mode: Boundary, locus: Locus) -> list[int]:
     return [i for i, count in enumerate(locus.counts) if count and not i == mode.m == 0]
 
 
-def _beyond(mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]) -> Locus:
+def _beyond(
+    mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]
+) -> Locus:
     """Return a point of a boundary near its crossing, where its equations are singular: if possible
     the first instability."""
     room = (ends[1] if sense > 0 else ends[0]) - crossing.p

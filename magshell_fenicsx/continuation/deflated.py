@@ -1,8 +1,8 @@
 """Newton's method with known solutions deflated: it finds others.
 
-The residual R is multiplied by M, which grows without bound at each known solution u_i. Newton's step
-for M R is a multiple of that for R, so it needs neither another matrix nor another solve (P. E. Farrell, A. Birkisson,
-S. W. Funke, SIAM Journal on Scientific Computing 37, 2015, A2026):
+The residual R is multiplied by M, which grows without bound at each known solution u_i. Newton's
+step for M R is a multiple of that for R, so it needs neither another matrix nor another solve (P.
+E. Farrell, A. Birkisson, S. W. Funke, SIAM Journal on Scientific Computing 37, 2015, A2026):
 
     M(u) = prod_i (|u - u_i|^-p + sigma),    du = tau d,    K d = -R,    tau = 1/(1 - d . grad M/M)
 """
@@ -44,7 +44,9 @@ class Deflation:
             away = (u - v, 0.0)
             size = self.metric.norm(*away)
             total -= (
-                POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
+                POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER))
+                if size
+                else np.inf
             )
         return total
 
@@ -54,10 +56,13 @@ class Deflation:
         return 1 / rest if rest else np.inf
 
 
-def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: Sequence[Vector] = ()) -> State | None:
+def deflated(
+    newton: BorderedNewton, guess: State, name: str, row: Row, known: Sequence[Vector] = ()
+) -> State | None:
     """A state near a solution that is not known and on which a row holds; None if none is found.
 
-    Steps are shortened until the residual changes as the tangent says. Newton's method must confirm the result.
+    Steps are shortened until the residual changes as the tangent says. Newton's method must confirm
+    the result.
 
     Parameters
     ----------
@@ -83,12 +88,19 @@ def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: S
             if leaps > MOST_LEAPS:
                 return None
             part = LEAP / (abs(tau) * size) if leap else part
-            ahead = state.with_(state.u + part * tau * d[0], name, state.mu[name] + part * tau * d[1])
+            ahead = state.with_(
+                state.u + part * tau * d[0], name, state.mu[name] + part * tau * d[1]
+            )
             residual = system.residual(ahead.u, ahead.mu), row.residual(ahead)
             left = matrix.solve(-residual[0], -residual[1])
-            left = plus(left, tau * deflation.slope(state.u, left[0]), d)  # the next step with the same matrix, over M
+            left = plus(
+                left, tau * deflation.slope(state.u, left[0]), d
+            )  # the next step with the same matrix, over M
             ratio = deflation.value(ahead.u) / M
-            rest = ratio * left[0] + (part - 1) * tau * d[0], ratio * left[1] + (part - 1) * tau * d[1]
+            rest = (
+                ratio * left[0] + (part - 1) * tau * d[0],
+                ratio * left[1] + (part - 1) * tau * d[1],
+            )
             bent = np.sqrt(matrix.inner(rest, rest) / matrix.inner(d, d)) / abs(part * tau)
             if leap:
                 break

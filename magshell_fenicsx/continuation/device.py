@@ -1,13 +1,16 @@
-"""Systems made of a system: a loading device that holds conjugates, amplitudes as functions of one, a holding force.
+"""Systems made of a system: a loading device that holds conjugates, amplitudes as functions of one,
+a holding force.
 
-A device holds the conjugates of some amplitudes, so these amplitudes are unknowns. For example, a sealed volume has an
-unknown pressure, and a body pressed on with a given force an unknown position. The Legendre transform
+A device holds the conjugates of some amplitudes, so these amplitudes are unknowns. For example, a
+sealed volume has an unknown pressure, and a body pressed on with a given force an unknown position.
+The Legendre transform
 
     L(u, mu_f; mu) = Pi(u; mu_f, mu) + sum_f int q_f dmu_f
 
-is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f(mu_f). A constant q_f
-holds the conjugate; a q_f that falls with mu_f is a spring or a gas. So a device is a system like any other, with the
-unknowns u and y_f = mu_f length/scale_f. Its inertia is that of the shell in the device.
+is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f(mu_f).
+A constant q_f holds the conjugate; a q_f that falls with mu_f is a spring or a gas. So a device is
+a system like any other, with the unknowns u and y_f = mu_f length/scale_f. Its inertia is that of
+the shell in the device.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,8 +46,8 @@ class Device:
     Parameters
     ----------
     held
-        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that does not rise, or
-        the name of a further amplitude of the device, whose value it is.
+        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that
+        does not rise, or the name of a further amplitude of the device, whose value it is.
     scale
         Amplitude -> a value that counts as of order one.
 
@@ -54,10 +57,14 @@ class Device:
         The amplitudes that are unknown.
     """
 
-    def __init__(self, system: System, held: Mapping[str, Held], scale: Mapping[str, float]) -> None:
+    def __init__(
+        self, system: System, held: Mapping[str, Held], scale: Mapping[str, float]
+    ) -> None:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
         self._system, self.names = system, list(held)
-        self._held = [q if callable(q) or isinstance(q, str) else constant(q) for q in held.values()]
+        self._held = [
+            q if callable(q) or isinstance(q, str) else constant(q) for q in held.values()
+        ]
         self._unit = np.array([scale[name] / system.length for name in held])
         self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
 
@@ -100,7 +107,9 @@ class Device:
         return join(self._system.residual(v, whole), self.rows(v, whole), self.comm)
 
     def rows(self, u: Vector, mu: Amplitudes) -> Array:
-        """The further rows at a state of the inner system, zero where each conjugate is what it should be."""
+        """The further rows at a state of the inner system, zero where each conjugate is what it
+        should be.
+        """
         each = zip(self.names, self._held, strict=True)
         held = [mu[q] if isinstance(q, str) else q(mu[name])[0] for name, q in each]
         rows = np.array([self._system.potential(u, mu, name) for name in self.names]) + held
@@ -109,7 +118,9 @@ class Device:
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         v, whole = self._split(u, mu)
         if name in self._held:
-            return join(0.0 * v, self._unit * (np.array(self._held, dtype=object) == name), self.comm)
+            return join(
+                0.0 * v, self._unit * (np.array(self._held, dtype=object) == name), self.comm
+            )
         mixed = [self._system.curvature(v, whole, other, name) for other in self.names]
         return join(self._system.load(v, whole, name), np.array(mixed) * self._unit, self.comm)
 
@@ -135,7 +146,9 @@ class Device:
     def edge(self, u: Vector, mu: Amplitudes) -> tuple[list[Vector], Array]:
         """The columns C, and D (k, k), at a state of the inner system."""
         system, names = self._system, self.names
-        columns = [unit * system.load(u, mu, name) for name, unit in zip(names, self._unit, strict=True)]
+        columns = [
+            unit * system.load(u, mu, name) for name, unit in zip(names, self._unit, strict=True)
+        ]
         D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
         each = zip(names, self._held, strict=True)
         D += np.diag([0.0 if isinstance(q, str) else q(mu[name])[1] for name, q in each])
@@ -165,8 +178,12 @@ def constant(q: float) -> Conjugate:
 
 
 def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:
-    """The amplitude that moves the system by about its length, as a power of two: the same on any number of ranks."""
-    moved = max_abs(system.comm, factors.solve(system.load(state.u, state.mu, name))) / system.length
+    """The amplitude that moves the system by about its length, as a power of two: the same on any
+    number of ranks.
+    """
+    moved = (
+        max_abs(system.comm, factors.solve(system.load(state.u, state.mu, name))) / system.length
+    )
     return 2.0 ** -round(log2(moved)) if moved else 1.0
 
 
@@ -183,7 +200,9 @@ class Along:
         t of the states that `contract` gets.
     """
 
-    def __init__(self, system: System, name: str, curves: Mapping[str, Curve], begin: float = 0.0) -> None:
+    def __init__(
+        self, system: System, name: str, curves: Mapping[str, Curve], begin: float = 0.0
+    ) -> None:
         self.comm, self.size, self.length = system.comm, system.size, system.length
         self.coordinates = system.coordinates
         self._system, self._name, self._curves, self._begin = system, name, curves, begin
@@ -211,14 +230,22 @@ class Along:
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         whole = self._expanded(mu)
-        return sum(rate * self._system.potential(u, whole, i) for i, rate in self._rates(mu, name).items())
+        return sum(
+            rate * self._system.potential(u, whole, i) for i, rate in self._rates(mu, name).items()
+        )
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         whole, t = self._expanded(mu), mu[self._name]
         own, others = self._rates(mu, name), self._rates(mu, other)
         bends = {i: f(t)[2] for i, f in self._curves.items()} if name == other == self._name else {}
-        mixed = (a * b * self._system.curvature(u, whole, i, j) for i, a in own.items() for j, b in others.items())
-        return sum(mixed) + sum(bend * self._system.potential(u, whole, i) for i, bend in bends.items())
+        mixed = (
+            a * b * self._system.curvature(u, whole, i, j)
+            for i, a in own.items()
+            for j, b in others.items()
+        )
+        return sum(mixed) + sum(
+            bend * self._system.potential(u, whole, i) for i, bend in bends.items()
+        )
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
         return self._system.tangent(u, self._expanded(mu), stress)
@@ -228,8 +255,14 @@ class Along:
         return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
 
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
-        """Amplitude of the inner system -> dmu_i/dt for t; for one of its own amplitudes, itself -> 1."""
-        return {i: f(mu[self._name])[1] for i, f in self._curves.items()} if name == self._name else {name: 1.0}
+        """Amplitude of the inner system -> dmu_i/dt for t; for one of its own amplitudes, itself ->
+        1.
+        """
+        return (
+            {i: f(mu[self._name])[1] for i, f in self._curves.items()}
+            if name == self._name
+            else {name: 1.0}
+        )
 
 
 class HeldAlong:

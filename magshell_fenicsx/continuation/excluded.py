@@ -1,8 +1,10 @@
-"""The equations of a bifurcation into modes that a model excludes, with a second number p as unknown.
+"""The equations of a bifurcation into modes that a model excludes, with a second number p as
+unknown.
 
-Modes of a family m (waves of a meridian) have a tangent K_m of their own at a state of the model, and the path before
-them is regular: R(u, mu, p) = 0 and g(u, mu, p) = 0, with K_m v + g b = 0 and b . v = 1, so that dg = -v . dK_m v.
-Families do not couple. So where two of them are neutral at once both equations are regular, and each goes on alone.
+Modes of a family m (waves of a meridian) have a tangent K_m of their own at a state of the model,
+and the path before them is regular: R(u, mu, p) = 0 and g(u, mu, p) = 0, with K_m v + g b = 0 and b
+. v = 1, so that dg = -v . dK_m v. Families do not couple. So where two of them are neutral at once
+both equations are regular, and each goes on alone.
 """
 
 from collections.abc import Sequence
@@ -57,7 +59,13 @@ class ExcludedLines:
         p: float,
         beside: Sequence[tuple[float, float]],
     ) -> None:
-        self._system, self._family, self._m, self.pull, self.bend = newton.system, family, m, 0.0, 0.0
+        self._system, self._family, self._m, self.pull, self.bend = (
+            newton.system,
+            family,
+            m,
+            0.0,
+            0.0,
+        )
         self._p, self._state, self._b = p, state, b
         system, own, u, mu = newton.system, state.mu[name], state.u, state.mu
         self._factors = newton.factor_at(state)
@@ -76,8 +84,13 @@ class ExcludedLines:
         self._w_mu = self._factors.solve(system.load(u, mu, name))
         self._w_p = self._factors.solve(R_p)
         d = DIFFERENCE * (abs(own) or 1.0)
-        ahead, back = (family.along(p, State(u, {**mu, name: own + step}), m, self.v) for step in (d, -d))
-        self._g_mu, self._g_p = -(ahead - back) / (2 * d) - self._by(self._w_mu), -K_p - self._by(self._w_p)
+        ahead, back = (
+            family.along(p, State(u, {**mu, name: own + step}), m, self.v) for step in (d, -d)
+        )
+        self._g_mu, self._g_p = (
+            -(ahead - back) / (2 * d) - self._by(self._w_mu),
+            -K_p - self._by(self._w_p),
+        )
         self.balance(system.residual(u, mu))
 
     def counts(self) -> list[int]:
@@ -104,7 +117,8 @@ class ExcludedLines:
         return Way(-w_R - dmu * w_mu - dp * w_p, float(dmu), float(dp))
 
     def eigenvalue(self, m: int, p: float, state: State) -> float:
-        """The eigenvalue of a family's tangent that is nearest to zero; of the model's own tangent for m = 0.
+        """The eigenvalue of a family's tangent that is nearest to zero; of the model's own tangent
+        for m = 0.
 
         Of the family of v the one across b.
         """
@@ -117,12 +131,15 @@ class ExcludedLines:
             return 0.0
         d, state = offset(self._system, w), self._state
         ahead, back = (
-            self._family.along(self._p, State(state.u + step * w, state.mu), self._m, self.v) for step in (d, -d)
+            self._family.along(self._p, State(state.u + step * w, state.mu), self._m, self.v)
+            for step in (d, -d)
         )
         return -(ahead - back) / (2 * d)
 
 
-def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, across: Vector | None = None) -> float:
+def nearest_eigenvalue(
+    factors: Factorisation, comm: MPI.Comm, across: Vector | None = None
+) -> float:
     """The eigenvalue nearest to zero of a matrix, of those across a vector."""
     along = None if across is None else factors.solve(across)
     x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf

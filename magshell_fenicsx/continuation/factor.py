@@ -1,4 +1,6 @@
-"""Direct factorisation of the tangent, of one with an edge, and of small matrices; inertia, condition and the work."""
+"""Direct factorisation of the tangent, of one with an edge, and of small matrices; inertia,
+condition and the work.
+"""
 
 import time
 from collections.abc import Callable
@@ -10,15 +12,33 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.beside import ROUGH, TOLERANCE, Remembered, Solver, crossings, doubted
-from magshell_fenicsx.continuation.system import Beside, Edged, Rest, Skewed, Tangent, Vector, dot, symmetric_part
+from magshell_fenicsx.continuation.beside import (
+    ROUGH,
+    TOLERANCE,
+    Remembered,
+    Solver,
+    crossings,
+    doubted,
+)
+from magshell_fenicsx.continuation.system import (
+    Beside,
+    Edged,
+    Rest,
+    Skewed,
+    Tangent,
+    Vector,
+    dot,
+    symmetric_part,
+)
 
 PREFIX = "magshell_factor_"
 # PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
-PATIENT = 8  # factorisations of all entries after one that the factors of the sparse part could not stand for
+# factorisations of all entries after one that the factors of the sparse part could not stand for
+PATIENT = 8
 CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
-REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
+# CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
+REFUSED = 76
 ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
 Array = NDArray[np.float64]
 
@@ -26,11 +46,12 @@ Array = NDArray[np.float64]
 class Factorisation:
     """Factors of the latest tangent; symbolic work is kept between calls.
 
-    On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
-    pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is tried again after
-    `CALM` successive matrices in which MUMPS counts none. The memory of the other one is released. A skewed tangent
-    K + N takes two factorisations: that of K for the inertia, and LU of the sum for the solutions. Of K + D, in which
-    all unknowns act on each other, only K is factored where D is small beside it (`continuation.beside`).
+    On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is
+    no negative pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is
+    tried again after `CALM` successive matrices in which MUMPS counts none. The memory of the other
+    one is released. A skewed tangent K + N takes two factorisations: that of K for the inertia, and
+    LU of the sum for the solutions. Of K + D, in which all unknowns act on each other, only K is
+    factored where D is small beside it (`continuation.beside`).
 
     Attributes
     ----------
@@ -41,13 +62,15 @@ class Factorisation:
     matrix
         The matrix last factored; K, or K + N, if that was an edged one.
     negative_pivots
-        Unstable directions of the latest factored tangent (Sylvester's law of inertia). Of a skewed one those of K,
-        less one where det (K + N) has the other sign: then it has been singular once less often.
+        Unstable directions of the latest factored tangent (Sylvester's law of inertia). Of a skewed
+        one those of K, less one where det (K + N) has the other sign: then it has been singular
+        once less often.
     skewed
         Whether that tangent was a skewed one.
     doubt
-        Where K was factored in place of K + D, the inverse of the error of D, or of what may be of an earlier state,
-        relative to it, with which the pivots' signs would still be certain; else infinite.
+        Where K was factored in place of K + D, the inverse of the error of D, or of what may be of
+        an earlier state, relative to it, with which the pivots' signs would still be certain; else
+        infinite.
     counted
         Whether both are known of the latest tangent.
     """
@@ -74,18 +97,23 @@ class Factorisation:
         self._beside: Beside | None = None
 
     def factor(self, tangent: Tangent, *, counted: bool = True) -> None:
-        """Factor a matrix; an edged one by the factors of its K and k back-solves; `count_beside` unless `counted`.
+        """Factor a matrix; an edged one by the factors of its K and k back-solves; `count_beside`
+        unless `counted`.
 
         Raises
         ------
         PETSc.Error
-            If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other than the matrix.
+            If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other
+            than the matrix.
         """
         inner = tangent.K if isinstance(tangent, Edged) else tangent
         self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
             self._edge = self._rest = self._solver = None
-            if not (isinstance(inner, Beside) and self._factor_beside(inner, counted or inner is not tangent)):
+            if not (
+                isinstance(inner, Beside)
+                and self._factor_beside(inner, counted or inner is not tangent)
+            ):
                 self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, Skewed):
                 self._factor_sum(inner)
@@ -97,7 +125,9 @@ class Factorisation:
 
     @property
     def habit(self) -> int:
-        """-1 if CHOLMOD is tried first, else the number of successive matrices without a negative pivot."""
+        """-1 if CHOLMOD is tried first, else the number of successive matrices without a negative
+        pivot.
+        """
         return -1 if self._definite else self._calm
 
     @habit.setter
@@ -139,11 +169,15 @@ class Factorisation:
         return not counted or self.count_beside()
 
     def count_beside(self) -> bool:
-        """Count the negative pivots of K + D by the factors of K; False if D is not small beside it."""
+        """Count the negative pivots of K + D by the factors of K; False if D is not small beside
+        it.
+        """
         tangent, remembered = self._beside, self._remembered
         if not tangent or not remembered:  # an earlier count failed
             return False
-        first = self._back(np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0]))
+        first = self._back(
+            np.random.default_rng(self.comm.rank).standard_normal(tangent.K.getLocalSize()[0])
+        )
         counted = crossings(remembered.times, self._back, first, self.comm)
         if counted is None:
             self._waiting, self._remembered, self._rest = PATIENT, None, None
@@ -179,18 +213,29 @@ class Factorisation:
 
     def _factor_any(self, K: PETSc.Mat) -> None:
         entries = _entries(K)
-        if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (K.handle, entries):
+        if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (
+            K.handle,
+            entries,
+        ):
             # of another pattern PETSc makes new factors itself, without the options below
             self._mumps, self._entries = _new_pc(K, "mumps"), entries
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
             F.setMumpsIcntl(24, 1)  # report null pivots: PETSc gives no inertia without this
-            F.setMumpsCntl(3, -1e-100)  # only true zeros are null pivots: else the null vector is lost at a fold
-            F.setMumpsCntl(5, 1e-17)  # null pivots are replaced by a tiny number, for the same reason
+            F.setMumpsCntl(
+                3, -1e-100
+            )  # only true zeros are null pivots: else the null vector is lost at a fold
+            F.setMumpsCntl(
+                5, 1e-17
+            )  # null pivots are replaced by a tiny number, for the same reason
             if self.comm.size > 1:
-                F.setMumpsIcntl(13, 1)  # no ScaLAPACK for the root front: its pivots must be counted too
+                F.setMumpsIcntl(
+                    13, 1
+                )  # no ScaLAPACK for the root front: its pivots must be counted too
             F.setMumpsIcntl(14, 50)
-            F.setMumpsIcntl(8, 0)  # no scaling: a tenth faster, and the tangent's entries are of similar size
+            F.setMumpsIcntl(
+                8, 0
+            )  # no scaling: a tenth faster, and the tangent's entries are of similar size
         _renew(self._mumps, K)
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
         self._calm = 0 if self.negative_pivots else self._calm + 1
@@ -217,7 +262,9 @@ class Factorisation:
         return self._edge.times(x) if self._edge else self._product(x)
 
     def solve(self, rhs: Vector, *, rough: bool = False) -> Vector:
-        """The solution with the latest factors; if `rough`, within a small part of it where D stands beside K."""
+        """The solution with the latest factors; if `rough`, within a small part of it where D
+        stands beside K.
+        """
         return self._edge.solve(rhs) if self._edge else self._inner(rhs, rough=rough)
 
     def solve_transposed(self, rhs: Vector) -> Vector:
@@ -248,11 +295,15 @@ class Factorisation:
         return np.array(y.array_r)
 
     def _inner(self, rhs: Vector, *, rough: bool = False) -> Vector:
-        """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors of K do not serve."""
+        """K^-1 rhs, or (K + D)^-1 rhs; no numbers if K + D is so nearly singular that the factors
+        of K do not serve.
+        """
         if self._rest is None:
             return self._back(rhs)
         assert self._remembered
-        self._solver = self._solver or Solver(self._back, self._backs, self._remembered, self.comm, len(rhs))
+        self._solver = self._solver or Solver(
+            self._back, self._backs, self._remembered, self.comm, len(rhs)
+        )
         return self._solver.solve(self._back(rhs), ROUGH if rough else TOLERANCE)
 
     def _back(self, rhs: Vector) -> Vector:
@@ -268,7 +319,9 @@ class Factorisation:
         """K^-1 times columns, all at once."""
         assert self._pc is not None
         rows = (len(columns), PETSc.DETERMINE)
-        B = PETSc.Mat().createDense((rows, columns.shape[1]), array=np.array(columns, order="F"), comm=self.comm)
+        B = PETSc.Mat().createDense(
+            (rows, columns.shape[1]), array=np.array(columns, order="F"), comm=self.comm
+        )
         X = B.duplicate()
         with self.solving:
             self._pc.matApply(B, X)
@@ -367,17 +420,30 @@ class Edge:
     count
         k.
     negative_pivots
-        Number that the edge adds to that of K (Haynsworth's inertia additivity), without its multipliers.
+        Number that the edge adds to that of K (Haynsworth's inertia additivity), without its
+        multipliers.
     """
 
     def __init__(
-        self, edged: Edged, comm: MPI.Comm, solve: Callable[[Vector], Vector], times: Callable[[Vector], Vector]
+        self,
+        edged: Edged,
+        comm: MPI.Comm,
+        solve: Callable[[Vector], Vector],
+        times: Callable[[Vector], Vector],
     ) -> None:
-        self._C, self._D, self._comm, self._solve, self._times = edged.C, edged.D, comm, solve, times
+        self._C, self._D, self._comm, self._solve, self._times = (
+            edged.C,
+            edged.D,
+            comm,
+            solve,
+            times,
+        )
         self.count = len(edged.C)
         self._X = [solve(column) for column in self._C]
         self._S = self._D - self._products(self._X).T
-        self.negative_pivots = int(np.sum(np.linalg.eigvalsh((self._S + self._S.T) / 2) < 0)) - edged.multipliers
+        self.negative_pivots = (
+            int(np.sum(np.linalg.eigvalsh((self._S + self._S.T) / 2) < 0)) - edged.multipliers
+        )
 
     def times(self, x: Vector) -> Vector:
         """The whole matrix times (u, y)."""
@@ -397,7 +463,9 @@ class Edge:
         f, g = split(rhs, self.count, self._comm)
         u = self._solve(f)
         y = np.linalg.solve(self._S, g - self._products([u])[0])
-        return join(u - np.sum([yi * x for yi, x in zip(y, self._X, strict=True)], axis=0), y, self._comm)
+        return join(
+            u - np.sum([yi * x for yi, x in zip(y, self._X, strict=True)], axis=0), y, self._comm
+        )
 
     def _products(self, vectors: list[Vector]) -> NDArray[np.float64]:
         """Inner products (len(vectors), k) with the columns of C."""
@@ -426,6 +494,9 @@ class Stopwatch:
         self._start = time.perf_counter()
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.seconds += time.perf_counter() - self._start

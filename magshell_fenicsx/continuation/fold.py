@@ -5,9 +5,10 @@ The tangent is bordered by a vector near its null vector. With b . b = 1,
     K v + g b = 0      v =  K^-1 b / (b . K^-1 b)
     b . v     = 1      g = -1      / (b . K^-1 b)
 
-has g = 0 exactly where K is singular, and the gradient of g is -Pi'''(v, v, .) (minimal augmentation:
-Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4). A fold is R(u, mu) = 0 and
-g(u, mu) = 0, solved for (u, mu): an iteration of Newton's method takes one factorisation and three back-solves.
+has g = 0 exactly where K is singular, and the gradient of g is -Pi'''(v, v, .) (minimal
+augmentation: Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch.
+4). A fold is R(u, mu) = 0 and g(u, mu) = 0, solved for (u, mu): an iteration of Newton's method
+takes one factorisation and three back-solves.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,9 +40,12 @@ from magshell_fenicsx.continuation.system import (
 TOLERANCE = 1e-9  # of u with its component along a direction held, in lengths of the system
 MOST_TANGENTS, CONTRACTION = 8, 0.3
 ROUNDING = 1e-5  # in lengths: smaller steps that do not shrink are rounding
-DIFFERENCE = 1e-2  # in lengths: step of differences along v; only the speed of convergence depends on their error
+# in lengths: step of differences along v; only the speed of convergence depends on their error
+DIFFERENCE = 1e-2
 FOLD_TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
-FOLD_ROUNDING = 1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
+FOLD_ROUNDING = (
+    1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
+)
 MOST_ITERATIONS = 8
 LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
 FAR = 0.6  # of the amplitude: a fold further ahead is not estimated well
@@ -49,7 +53,8 @@ FAR = 0.6  # of the amplitude: a fold further ahead is not estimated well
 
 @dataclass(frozen=True)
 class _Spring:
-    """A spring at the degree of freedom where a shape is largest, as stiff as the diagonal entry there.
+    """A spring at the degree of freedom where a shape is largest, as stiff as the diagonal entry
+    there.
 
     Attributes
     ----------
@@ -64,14 +69,19 @@ class _Spring:
 def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
     """Add the spring to a tangent, which is then regular at a simple fold."""
     K = symmetric_part(tangent)
-    size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # without the entries of an edge
+    size, first = (
+        np.abs(shape[: K.getLocalSize()[0]]),
+        K.getOwnershipRange()[0],
+    )  # without the entries of an edge
     _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
     e = np.zeros_like(shape)
     if comm.rank == owner:
         e[int(np.argmax(size))] = 1.0
     sprung = [first + int(i) for i in np.flatnonzero(e)]
     itself = comm.allreduce(sum(K.getValue(i, i) for i in sprung))
-    stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
+    stiffness = (
+        2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0
+    )  # the sum is positive
     for i in sprung:
         K.setValue(i, i, stiffness, addv=True)
     K.assemble()
@@ -81,10 +91,13 @@ def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
 class AugmentedTangent:
     """The tangent at a state, bordered by b, from factors of K + s e e with a spring s.
 
-    A factorisation of K itself would break down at the fold. One more border removes the spring exactly.
+    A factorisation of K itself would break down at the fold. One more border removes the spring
+    exactly.
     """
 
-    def __init__(self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()) -> None:
+    def __init__(
+        self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()
+    ) -> None:
         self._system = system = newton.system
         K = system.tangent(state.u, state.mu, stress)
         spring = _sprung(K, b, system.comm)
@@ -95,7 +108,9 @@ class AugmentedTangent:
         self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), spring.e, dot_
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
         q = dot_(self._e, self._q)
-        self._border = np.array([[1 / spring.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]])
+        self._border = np.array(
+            [[1 / spring.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]]
+        )
         self.v, self.g = self._bordered(np.zeros_like(b), 1.0)
 
     def solve(self, f: Vector) -> tuple[Vector, float]:
@@ -116,11 +131,13 @@ class AugmentedTangent:
 def held_along(
     newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
 ) -> tuple[State, float] | None:
-    """The equilibrium with the guess's component along b, which a force along b holds, and its estimated error.
+    """The equilibrium with the guess's component along b, which a force along b holds, and its
+    estimated error.
 
-    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where forces set in within a
-    step, as between shells that touch, it is solved between soft faces first, as `BorderedNewton.solve` does.
-    None if Newton's method fails. `stress` is the stress of the guess, see `System.tangent`.
+    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where
+    forces set in within a step, as between shells that touch, it is solved between soft faces
+    first, as `BorderedNewton.solve` does. None if Newton's method fails. `stress` is the stress of
+    the guess, see `System.tangent`.
 
     Raises
     ------
@@ -130,7 +147,9 @@ def held_along(
     held = _held_along(newton, guess, b, stress)
     if held or not newton.options.kinks:
         return held
-    row = GivenConjugate(system := HeldAlong(newton.system, b), FORCE, -dot(system.comm, b, guess.u))
+    row = GivenConjugate(
+        system := HeldAlong(newton.system, b), FORCE, -dot(system.comm, b, guess.u)
+    )
     outcome = newton.on(system).solve(State(guess.u, {**guess.mu, FORCE: 0.0}), FORCE, row)
     return _held_along(newton, State(outcome.state.u, guess.mu), b) if outcome.converged else None
 
@@ -139,7 +158,12 @@ def _held_along(
     newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
 ) -> tuple[State, float] | None:
     """The same by full steps alone."""
-    system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b, stress), np.inf
+    system, u, tangent, last = (
+        newton.system,
+        guess.u,
+        AugmentedTangent(newton, guess, b, stress),
+        np.inf,
+    )
     tangents, own = 1, True
     while True:
         du, _ = tangent.solve(system.residual(u, guess.mu))
@@ -147,7 +171,11 @@ def _held_along(
         if size <= TOLERANCE or (own and CONTRACTION * last < size <= ROUNDING):
             return State(u - du, guess.mu), size
         if not own and size > CONTRACTION * last:
-            tangent, tangents, own = AugmentedTangent(newton, State(u, guess.mu), b, stress), tangents + 1, True
+            tangent, tangents, own = (
+                AugmentedTangent(newton, State(u, guess.mu), b, stress),
+                tangents + 1,
+                True,
+            )
             continue
         if tangents > MOST_TANGENTS or not np.isfinite(size):
             return None
@@ -155,7 +183,9 @@ def _held_along(
 
 
 def third(system: System, state: State, v: Vector, residual: Vector | None = None) -> Vector:
-    """Pi'''(v, v, .), by a second difference of the residual, which may be known at the state itself."""
+    """Pi'''(v, v, .), by a second difference of the residual, which may be known at the state
+    itself.
+    """
     d = offset(system, v)
     back, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 1))
     residual = system.residual(state.u, state.mu) if residual is None else residual
@@ -211,8 +241,8 @@ class Fold:
     left
         Null vector of the transposed K: `phi`, but for loads without potential.
     curvature
-        Second derivative of the amplitude along the path in units of `phi` times the system's length;
-        negative where the amplitude is largest.
+        Second derivative of the amplitude along the path in units of `phi` times the system's
+        length; negative where the amplitude is largest.
     unstable
         Number of unstable directions besides `phi`.
     iterations, factorisations
@@ -237,8 +267,8 @@ class Fold:
 def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
     """The fold in the amplitude `name` near a guess, to 1e-9 lengths if rounding allows that.
 
-    With tiny elements, rounding of K leaves an error of 1e-8 lengths along phi. The amplitude is stationary along phi,
-    so it is accurate nevertheless.
+    With tiny elements, rounding of K leaves an error of 1e-8 lengths along phi. The amplitude is
+    stationary along phi, so it is accurate nevertheless.
 
     Raises
     ------
@@ -251,7 +281,9 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
         if len(steps) == MOST_ITERATIONS:
             raise FoldLost(f"Newton's method found no fold in {MOST_ITERATIONS} iterations")
         try:
-            tangent = AugmentedTangent(newton, state, b if b is not None else _first_shape(newton, state, name))
+            tangent = AugmentedTangent(
+                newton, state, b if b is not None else _first_shape(newton, state, name)
+            )
             du, dmu = _step(system, state, name, tangent)
         except np.linalg.LinAlgError:
             raise FoldLost("the tangent is singular in more than one direction") from None
@@ -262,7 +294,10 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
     phi = _oriented(system, tangent.improved(last, state), system.load(state.u, state.mu, name))
-    pull, cubic = dot(system.comm, phi, system.load(state.u, state.mu, name)), third(system, state, phi)
+    pull, cubic = (
+        dot(system.comm, phi, system.load(state.u, state.mu, name)),
+        third(system, state, phi),
+    )
     return Fold(
         state=state,
         name=name,
@@ -276,7 +311,8 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
 
 
 def sensitivity(system: System, fold: Fold, column: Vector) -> float:
-    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(left . R_p)/(left . R_mu).
+    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(left .
+    R_p)/(left . R_mu).
 
     For another amplitude, R_p is its load column.
     """
@@ -284,11 +320,13 @@ def sensitivity(system: System, fold: Fold, column: Vector) -> float:
     return -dot(system.comm, fold.left, column) / pull
 
 
-def predict_fold(system: System, folds: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+def predict_fold(
+    system: System, folds: Sequence[tuple[float, Fold]], p: float, others: Amplitudes
+) -> Guess:
     """Extrapolate folds at other values of a parameter to `p`.
 
-    The polynomials through the last one, two and three folds are compared, and the one with the least residual is
-    used: for long or uneven steps a quadratic may be worse than no extrapolation.
+    The polynomials through the last one, two and three folds are compared, and the one with the
+    least residual is used: for long or uneven steps a quadratic may be worse than no extrapolation.
 
     Parameters
     ----------
@@ -326,7 +364,9 @@ def _left(newton: BorderedNewton, state: State, v: Vector) -> Vector:
     return v
 
 
-def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float]:
+def _step(
+    system: System, state: State, name: str, tangent: AugmentedTangent
+) -> tuple[Vector, float]:
     """Newton's step du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g."""
     comm, u, v = system.comm, state.u, tangent.v
     w_R, t_R = tangent.solve(system.residual(u, state.mu))
@@ -358,12 +398,14 @@ def _lagrange(values: Sequence[float], i: int, p: float) -> float:
 
 
 def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
-    """A guess of the next fold in the amplitude `name`, growing in size; None if it is far or not seen yet.
+    """A guess of the next fold in the amplitude `name`, growing in size; None if it is far or not
+    seen yet.
 
-    Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu varied by m,
-    equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi . R_mu = lambda phi . du/dmu.
-    The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other modes follow mu linearly.
-    The null vector of the guess points the way that the path goes. One factorisation.
+    Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu
+    varied by m, equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi
+    . R_mu = lambda phi . du/dmu. The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other
+    modes follow mu linearly. The null vector of the guess points the way that the path goes. One
+    factorisation.
     """
     system, state = newton.system, point.state
     comm, mu = system.comm, state.mu[name]

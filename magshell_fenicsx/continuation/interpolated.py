@@ -14,7 +14,9 @@ def slope(places: Sequence[float]) -> list[tuple[float, float]]:
     """Weights and places of the slope at the first place of the polynomial through all."""
     off = np.array(places) - places[0]
     scale = np.abs(off).max()
-    weights = np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
+    weights = (
+        np.linalg.solve(np.vander(off / scale, increasing=True).T, np.eye(len(places))[1]) / scale
+    )
     return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
 
 
@@ -42,7 +44,9 @@ def flat_beyond(rise: float, d0: float, d1: float) -> float:
 
 
 def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
-    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial through all of them."""
+    """Weights of the values and slopes at nodes, in the value at `s` of the Hermite polynomial
+    through all of them.
+    """
     weights = []
     for i, a in enumerate(nodes):
         others = [*nodes[:i], *nodes[i + 1 :]]
@@ -53,5 +57,7 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
 
 
 def corner(rise: float, low: float, high: float) -> float:
-    """The part of the way at which straight lines from both ends meet, not too near them; slopes as of `stationary`."""
+    """The part of the way at which straight lines from both ends meet, not too near them; slopes as
+    of `stationary`.
+    """
     return min(max((rise - high) / (low - high), LEAST), 1 - LEAST)

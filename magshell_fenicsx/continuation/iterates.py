@@ -12,7 +12,8 @@ FULL = 0.5  # a step longer than this part of the one before shows no quadratic 
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
 GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
-STEADY = 0.1  # steps that twice shrink more than to this part foresee the next ones; once may be by chance
+# steps that twice shrink more than to this part foresee the next ones; once may be by chance
+STEADY = 0.1
 SURE = 0.1  # part of the tolerance, for an error that is foreseen
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 
@@ -20,7 +21,8 @@ Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
 def foreseen(sizes: Sequence[float], ratios: int) -> float:
-    """The error after the last of some steps, if all further ones shrink as so many did; infinite if one shrank little.
+    """The error after the last of some steps, if all further ones shrink as so many did; infinite
+    if one shrank little.
 
     See P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4.
     """
@@ -82,13 +84,20 @@ class Iterates:
     def foreseen(self) -> float:
         """The error after the last step, where the last two ratios foresee it.
 
-        Bending may converge at once and hide stretching, which converges slowly: so one small ratio foresees nothing.
+        Bending may converge at once and hide stretching, which converges slowly: so one small ratio
+        foresees nothing.
         """
-        return np.inf if self.kinks or self.searched else foreseen([step.size for step in self.steps], 2)
+        return (
+            np.inf
+            if self.kinks or self.searched
+            else foreseen([step.size for step in self.steps], 2)
+        )
 
     @property
     def error(self) -> float:
-        """The estimated error after the last step; where that was foreseen, no less than what was allowed."""
+        """The estimated error after the last step; where that was foreseen, no less than what was
+        allowed.
+        """
         return min(self.steps[-1].size, max(self.foreseen, self.allowed)) if self.steps else np.inf
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
@@ -112,10 +121,18 @@ class Iterates:
         full = [s.size for s in own]
         if self.hasty and step.own and self._astray(own, step):
             return "far"
-        stalled = step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
+        stalled = (
+            step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
+        )
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
-        if step.own and len(before) > 2 and full and step.size > GROWN * full[-1] and not self.searched:
+        if (
+            step.own
+            and len(before) > 2
+            and full
+            and step.size > GROWN * full[-1]
+            and not self.searched
+        ):
             return "diverged"
         if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
@@ -124,6 +141,8 @@ class Iterates:
     def _astray(self, before: Sequence[Step], step: Step) -> bool:
         """Whether steps with matrices of their own lead away, past an instability, or stay long."""
         if len(before) == 1 and step.pivots != before[0].pivots:
-            past = step.pivots > before[0].pivots  # a shorter step of the path sees the instability, too
+            past = (
+                step.pivots > before[0].pivots
+            )  # a shorter step of the path sees the instability, too
             return step.size > (FULL if past else GROWN) * before[0].size
         return len(before) >= STUCK and step.size > FULL * before[-STUCK].size

@@ -1,11 +1,13 @@
 """Eigenpairs of a tangent: the one nearest to zero from its factors, and the lowest without gaps.
 
-The nearest to zero comes from Rayleigh-Ritz for K^-1 in a Krylov space, which grows by one solve at a time until the
-pair's residual is small. Plain inverse iteration does not converge between eigenvalues a and -a, and it converges
-slowly among many modes of almost equal stiffness, as on a sphere.
+The nearest to zero comes from Rayleigh-Ritz for K^-1 in a Krylov space, which grows by one solve at
+a time until the pair's residual is small. Plain inverse iteration does not converge between
+eigenvalues a and -a, and it converges slowly among many modes of almost equal stiffness, as on a
+sphere.
 
-The lowest, K phi = lambda M phi, come from SLEPc's Lanczos iteration around a shift below all eigenvalues. The inertia
-of K - sigma M shows that no eigenvalue lies below the shift, and none between those found is missing.
+The lowest, K phi = lambda M phi, come from SLEPc's Lanczos iteration around a shift below all
+eigenvalues. The inertia of K - sigma M shows that no eigenvalue lies below the shift, and none
+between those found is missing.
 """
 
 from dataclasses import dataclass
@@ -19,14 +21,20 @@ from slepc4py import SLEPc
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, dot, symmetric_part
 
-TOLERANCE = 1e-8  # of K^-1 v - v/lambda, over 1/|lambda|; the error of the eigenvalue is of its square
+TOLERANCE = (
+    1e-8  # of K^-1 v - v/lambda, over 1/|lambda|; the error of the eigenvalue is of its square
+)
 MOST_SOLVES = 300
 MOST_VECTORS, KEPT = 24, 8  # vectors in the space before a restart, and after it
-TIED = 1e-6  # if a and -a are equally near to zero up to this relative difference, the negative one is returned
-PATIENCE = 12  # after so many solves without progress, a residual at the level of rounding is accepted
+# if a and -a are equally near to zero up to this relative difference, the negative one is returned
+TIED = 1e-6
+PATIENCE = (
+    12  # after so many solves without progress, a residual at the level of rounding is accepted
+)
 ROUNDING = 100 * np.finfo(float).eps  # level of rounding of K v - lambda v, over the norm of K
 LANCZOS_TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
-MARGIN = 1e-6  # eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
+# eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
+MARGIN = 1e-6
 MOST_TRIALS = 30
 
 
@@ -35,9 +43,11 @@ class NoEigenpair(RuntimeError):
 
 
 def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
-    """Eigenvalue and eigenvector of length one; for a nearly singular tangent that is the null vector. Collective.
+    """Eigenvalue and eigenvector of length one; for a nearly singular tangent that is the null
+    vector. Collective.
 
-    The sign of the vector is arbitrary; for a multiple eigenvalue it is any vector of the eigenspace.
+    The sign of the vector is arbitrary; for a multiple eigenvalue it is any vector of the
+    eigenspace.
 
     Raises
     ------
@@ -61,7 +71,9 @@ def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class _Pair:
-    """`error`: the residual over 1/|lambda|, including that of a pair of the other sign that may be nearer to zero."""
+    """`error`: the residual over 1/|lambda|, including that of a pair of the other sign that may be
+    nearer to zero.
+    """
 
     value: float
     vector: Vector
@@ -134,7 +146,9 @@ class _Space:
 
 
 def _real_pairs(A: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The eigenpairs of a small matrix, ascending; real eigenvalues alone if there are any, else real parts."""
+    """The eigenpairs of a small matrix, ascending; real eigenvalues alone if there are any, else
+    real parts.
+    """
     theta, Y = np.linalg.eig(A)
     real = theta.imag == 0.0
     theta, Y = (theta[real], Y[:, real]) if real.any() else (theta, Y)
@@ -151,7 +165,9 @@ class Stability(Protocol):
 
 @dataclass(frozen=True)
 class CriticalMode:
-    """Eigenpair of a tangent whose eigenvalue is nearest to zero; `negative_pivots` of the same tangent."""
+    """Eigenpair of a tangent whose eigenvalue is nearest to zero; `negative_pivots` of the same
+    tangent.
+    """
 
     eigenvalue: float
     vector: Vector
@@ -190,14 +206,16 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
     Parameters
     ----------
     K
-        A symmetric tangent. It may be indefinite. Exactly singular it is only with the `kernel` that is given.
+        A symmetric tangent. It may be indefinite. Exactly singular it is only with the `kernel`
+        that is given.
     M
-        A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and columns for the held
-        ones. Its sparsity pattern is part of that of K.
+        A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and
+        columns for the held ones. Its sparsity pattern is part of that of K.
     count
         Number of eigenpairs. If there are more negative eigenvalues, all of these are returned.
     kernel
-        Dimension of the kernel of a tangent that has no negative eigenvalue. Its eigenvalues are returned as zero.
+        Dimension of the kernel of a tangent that has no negative eigenvalue. Its eigenvalues are
+        returned as zero.
 
     Raises
     ------
@@ -245,7 +263,9 @@ def null_vector(K: Tangent) -> Vector:
 
 
 class _Slices:
-    """K - sigma M for several sigma: its inertia, and the eigenpairs around sigma; the latest factors are kept."""
+    """K - sigma M for several sigma: its inertia, and the eigenpairs around sigma; the latest
+    factors are kept.
+    """
 
     def __init__(self, K: PETSc.Mat, M: PETSc.Mat) -> None:
         self._K, self._M = K, M
@@ -292,9 +312,13 @@ class _Slices:
         eps.setFromOptions()
         eps.solve()
         if eps.getConverged() < count:
-            raise ModesNotFound(f"Lanczos found {eps.getConverged()} of {count} eigenpairs around {sigma:g}")
+            raise ModesNotFound(
+                f"Lanczos found {eps.getConverged()} of {count} eigenpairs around {sigma:g}"
+            )
         v = self._K.createVecRight()
-        modes = [Mode(float(eps.getEigenpair(i, v).real), np.array(v.array_r)) for i in range(count)]
+        modes = [
+            Mode(float(eps.getEigenpair(i, v).real), np.array(v.array_r)) for i in range(count)
+        ]
         eps.destroy()
         return sorted(modes, key=lambda mode: mode.eigenvalue)
 

@@ -1,8 +1,9 @@
 """A moving state, what acts on it, and what a loading device makes of it where it begins.
 
-A device holds the conjugates q of some amplitudes: g(u, mu) = dPi/dmu + q = 0. Where g depends on its own amplitude (a
-gas, a body that is pressed on) that follows from u. Otherwise g constrains u: C.v = 0 and C.a + v.(dC/du v) = 0 with
-the column C = dg/du, and the amplitude is the force of this constraint.
+A device holds the conjugates q of some amplitudes: g(u, mu) = dPi/dmu + q = 0. Where g depends on
+its own amplitude (a gas, a body that is pressed on) that follows from u. Otherwise g constrains u:
+C.v = 0 and C.a + v.(dC/du v) = 0 with the column C = dg/du, and the amplitude is the force of this
+constraint.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Device
-from magshell_fenicsx.continuation.system import Amplitudes, State, System, Tangent, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    State,
+    System,
+    Tangent,
+    Vector,
+    dot,
+    max_abs,
+)
 
 Array = NDArray[np.float64]
 Inverse = Callable[[Vector], Vector]
@@ -43,8 +52,8 @@ class Motion:
     memory
         What viscous forces remember of the steps so far: a step that is refused leaves it.
     imbalance, turnover
-        Kinetic + stored + dissipated - work, less its value at the begin, and the sum of their magnitudes; nan where
-        the balance is not checked.
+        Kinetic + stored + dissipated - work, less its value at the begin, and the sum of their
+        magnitudes; nan where the balance is not checked.
     """
 
     t: float
@@ -69,14 +78,17 @@ class Viscous(Protocol):
     memory
         What they remember of the steps to u0; `accept` replaces it.
     slowness
-        Longest time in which they let a displacement creep to its end, so that errors of steps add up.
+        Longest time in which they let a displacement creep to its end, so that errors of steps add
+        up.
     """
 
     memory: Any
     slowness: float
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
-        """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
+        """The force at a part of the step from u0 to u1, with the velocity v there; zero at
+        supports.
+        """
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
         """The system's tangent with the derivative of the force by u1; dv/du at the end is `rate`."""
@@ -92,7 +104,8 @@ class Viscous(Protocol):
 
 
 class Averaged(Protocol):
-    """Forces of contact, which set in and cease within a step: each step takes their mean along its way.
+    """Forces of contact, which set in and cease within a step: each step takes their mean along its
+    way.
 
     Attributes
     ----------
@@ -106,7 +119,9 @@ class Averaged(Protocol):
     settings: frozenset[str]
 
     def harder(self, begin: State, v: Vector) -> dict[str, float]:
-        """Settings of what must become stiffer before a step, since it may meet too fast, and stores nothing yet."""
+        """Settings of what must become stiffer before a step, since it may meet too fast, and
+        stores nothing yet.
+        """
 
     def along(self, begin: State, end: State, part: float) -> None:
         """Let the system's forces at this part of a step be its mean ones, until `present`."""
@@ -151,7 +166,8 @@ class Ground(Protocol):
 def constrained(
     system: System, device: Device, inverse: Inverse, u: Vector, v: Vector, mu: Amplitudes
 ) -> tuple[Vector, Vector, dict[str, float]]:
-    """The nearest displacement and velocity, in the sense of the mass, that the device allows, with its amplitudes.
+    """The nearest displacement and velocity, in the sense of the mass, that the device allows, with
+    its amplitudes.
 
     Parameters
     ----------
@@ -168,7 +184,9 @@ def constrained(
         step = _sum(np.where(springs, 0.0, part), X)
         y, u = y - np.where(springs, part, 0.0), u - step
         moved = max_abs(comm, step) / system.length
-        if moved <= ROUNDING and np.abs(part[springs]).max(initial=0.0) <= ROUNDING * (1 + np.abs(y).max()):
+        if moved <= ROUNDING and np.abs(part[springs]).max(initial=0.0) <= ROUNDING * (
+            1 + np.abs(y).max()
+        ):
             break
     across = np.where(springs, 0.0, [dot(comm, c, v) for c in C])
     v = v - _sum(np.where(springs, 0.0, np.linalg.solve(S, across)), X)
@@ -179,8 +197,12 @@ def _sum(parts: Array, vectors: list[Vector]) -> Vector:
     return np.asarray(np.sum([part * x for part, x in zip(parts, vectors, strict=True)], axis=0))
 
 
-def held_back(system: System, device: Device, inverse: Inverse, now: Motion) -> tuple[Vector, dict[str, float]]:
-    """The acceleration with the forces of constraints, and these; that of `now` is without their change."""
+def held_back(
+    system: System, device: Device, inverse: Inverse, now: Motion
+) -> tuple[Vector, dict[str, float]]:
+    """The acceleration with the forces of constraints, and these; that of `now` is without their
+    change.
+    """
     C, D = device.edge(now.u, now.mu)
     free, size = np.diag(D) == 0, max_abs(system.comm, now.v)
     ahead, behind, step = C, C, 1.0

@@ -1,4 +1,6 @@
-"""Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive steps."""
+"""Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive
+steps.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -27,15 +29,24 @@ from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot
 Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
 Arrive = Callable[[float, Sequence[Point]], float]
-MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
+# after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth
+# more time
+MANY = 2
 BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
 GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
 WORSE = 2.0  # such an error, over that of the last guess
 TURNS = "the path turns sharply, or the step jumped to another branch"
-VAIN = 5  # failures one after the other, after which no line search is tried: a path that ends has no point ahead
+# failures one after the other, after which no line search is tried: a path that ends has no point
+# ahead
+VAIN = 5
 NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
-WILD, LEAST_MOST = 3.0, 0.1  # of the way to a guess, and in lengths: a longer correction of it is given up
-ABOUT = 0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
+WILD, LEAST_MOST = (
+    3.0,
+    0.1,
+)  # of the way to a guess, and in lengths: a longer correction of it is given up
+ABOUT = (
+    0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
+)
 FARTHER = 3.0  # states so many times as far apart as their tangents lead are not on one path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
@@ -98,7 +109,10 @@ class Path:
         if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         else:
-            s, rate = self.value(self.control, state), 1.0 if self.control == "load" else response.softness
+            s, rate = (
+                self.value(self.control, state),
+                1.0 if self.control == "load" else response.softness,
+            )
         return self._point(state, s, response).per(rate)
 
     def at(self, s: float, guess: State, base: Point, *, most: float = np.inf) -> Point | str:
@@ -114,8 +128,12 @@ class Path:
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
         return self.solve(self._row(s, base), s, guess, stress, most=most)
 
-    def inside(self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True) -> Point | str:
-        """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
+    def inside(
+        self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True
+    ) -> Point | str:
+        """The point at `s` between two others, or the reason why the solve failed; `base` as in
+        `at`.
+        """
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         ends, near = (low,) if base.across else (low, high), None if counted else high.state
@@ -123,20 +141,28 @@ class Path:
         return self.solve(self._row(s, base), s, guess, stress, near=near, counted=counted)
 
     def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
-        """About the point at `s` between two others, without its own inertia; where that is too uncertain, why."""
+        """About the point at `s` between two others, without its own inertia; where that is too
+        uncertain, why.
+        """
 
         def find() -> Point | str:
             guess = self.between(s, low, high)
             self.newton.stand_at(high.state)
             state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT)
             t = (s - low.s) / (high.s - low.s)
-            along = Response((1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu, 0.0, low.negative_pivots)
+            along = Response(
+                (1 - t) * low.du + t * high.du,
+                (1 - t) * low.dmu + t * high.dmu,
+                0.0,
+                low.negative_pivots,
+            )
             return self._point(state, s, along) if state else FAR
 
         return self.recorded(find)
 
     def renewed(self, point: Point, state: State) -> Point:
-        """The point at the same s with other amplitudes beside that of the path, from a state near it.
+        """The point at the same s with other amplitudes beside that of the path, from a state near
+        it.
 
         Raises
         ------
@@ -159,28 +185,43 @@ class Path:
         most: float = np.inf,
         counted: bool = True,
     ) -> Point | str:
-        """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row.
+        """The point on which a row holds, or the reason why the solve failed; its tangent is per
+        unit of the row.
 
-        With a solution `near` by, old factors may begin. Unless `counted`, nobody asks for unstable directions.
+        With a solution `near` by, old factors may begin. Unless `counted`, nobody asks for unstable
+        directions.
         """
-        old = NEAR if near else 0.0  # a tangent of the path must not depend on what was factored before its point
+        old = (
+            NEAR if near else 0.0
+        )  # a tangent of the path must not depend on what was factored before its point
 
         def find() -> Point | str:
             if near:
-                close = counted and max_abs(self.system.comm, guess.u - near.u) < NEAR * self.system.length
+                close = (
+                    counted
+                    and max_abs(self.system.comm, guess.u - near.u) < NEAR * self.system.length
+                )
                 self.newton.stand_at(near, NEAR if close else np.inf)
             before, search = self.newton.factorisation.count, self._vain < VAIN
-            outcome = self.newton.solve(guess, self.name, row, stress, search=search, near=old, most=most)
+            outcome = self.newton.solve(
+                guess, self.name, row, stress, search=search, near=old, most=most
+            )
             if not outcome.converged:
                 return outcome.reason
             spent = self.newton.factorisation.count - before
             exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-            response = self.newton.response(outcome.state, self.name, row, exact=exact, counted=counted)
+            response = self.newton.response(
+                outcome.state, self.name, row, exact=exact, counted=counted
+            )
             found = self._point(outcome.state, s, response)
-            return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
+            return replace(
+                found, iterations=outcome.iterations, factorisations=spent, error=outcome.error
+            )
 
         point = self.recorded(find)
-        self._hard += point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
+        self._hard += (
+            point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
+        )
         self._vain = self._vain + 1 if isinstance(point, str) else 0
         return point
 
@@ -217,9 +258,15 @@ class Path:
         u, mu, name = state.u, state.mu, self.name
         bend = self.system.curvature(u, mu, name, name)
         dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - bend * dmu
-        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner(base.normal, direction)}[self.control]
+        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner(base.normal, direction)}[
+            self.control
+        ]
         softness = dq / dmu if dmu else np.inf
-        s = self._arc_length(state, base) if self.control == "arc" else self.value(self.control, state)
+        s = (
+            self._arc_length(state, base)
+            if self.control == "arc"
+            else self.value(self.control, state)
+        )
         return self._point(state, s, Response(du, dmu, softness, negative_pivots)).per(rate)
 
     def _arc_length(self, state: State, base: Point) -> float:
@@ -228,11 +275,19 @@ class Path:
 
     def measured_from(self, base: Point, point: Point) -> Point:
         """The point with its arc length from a base; unchanged with another control."""
-        return replace(point, s=self._arc_length(point.state, base)) if self.control == "arc" else point
+        return (
+            replace(point, s=self._arc_length(point.state, base))
+            if self.control == "arc"
+            else point
+        )
 
     def as_base(self, point: Point) -> Point:
         """The point with a tangent of length one, so that arc length can be measured from it."""
-        return point.per(self.metric.norm(point.du, point.dmu)) if self.control == "arc" and not point.across else point
+        return (
+            point.per(self.metric.norm(point.du, point.dmu))
+            if self.control == "arc" and not point.across
+            else point
+        )
 
     def before(self, low: Point, high: Point) -> Point:
         """The first of two points, from which the second is measured: see `_beside`."""
@@ -240,9 +295,15 @@ class Path:
         return self._beside(low) if sharp else low
 
     def _beside(self, point: Point) -> Point:
-        """The point with arc length along its displacement: a path that turns sharply has none along its tangent."""
+        """The point with arc length along its displacement: a path that turns sharply has none
+        along its tangent.
+        """
         square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
-        return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0)) if square else point
+        return (
+            replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0))
+            if square
+            else point
+        )
 
     def value(self, quantity: Quantity, state: State) -> float:
         """The amplitude of the path, or the displacement conjugate to it, at a state."""
@@ -252,15 +313,19 @@ class Path:
 
     def given(self, quantity: Quantity, target: float) -> Row:
         """The row that holds the amplitude, or the displacement conjugate to it, at a target."""
-        return GivenLoad(self.name, target) if quantity == "load" else GivenConjugate(self.system, self.name, target)
+        return (
+            GivenLoad(self.name, target)
+            if quantity == "load"
+            else GivenConjugate(self.system, self.name, target)
+        )
 
     def towards(
         self, start: Point, targets: Sequence[float], arrive: Arrive = lambda s, seen: s
     ) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag marks the targets.
 
-        A point that was found too far away is looked at again from the next points: it is a step of theirs for nothing.
-        `arrive` may shorten a step to some s that is foreseen from some points.
+        A point that was found too far away is looked at again from the next points: it is a step of
+        theirs for nothing. `arrive` may shorten a step to some s that is foreseen from some points.
 
         Raises
         ------
@@ -274,7 +339,9 @@ class Path:
                 tried = self._tried(here, plan)
                 corners = isinstance(tried, Far) and self._passes_corners(here, tried, plan)
                 if isinstance(tried, Far):
-                    course.far, tried = (None, self.as_base(tried.point)) if corners else (tried, tried.reason)
+                    course.far, tried = (
+                        (None, self.as_base(tried.point)) if corners else (tried, tried.reason)
+                    )
                 if isinstance(tried, str):
                     course.failed(plan, tried, self.options.smallest)
                     continue
@@ -286,7 +353,9 @@ class Path:
                     yield course.here, course.here.s == target
 
     def _planned(self, course: Course, target: float, arrive: Arrive) -> Plan:
-        """The next step on the way to a target: it ends a little behind a fold, or where forces set in."""
+        """The next step on the way to a target: it ends a little behind a fold, or where forces set
+        in.
+        """
         passed, here, way = course.passed, course.here, target - course.here.s
         length = course.length(way)
         length = min(length, self._past_fold(passed, length))
@@ -302,10 +371,14 @@ class Path:
         if ahead.lets_go:  # others may meet on the way that its tangent foresees
             seen = passed[-1:]
             ahead = self._ahead(here.state, self.extended(s, seen))
-        return Plan(here.s + ahead.part * (s - here.s) if ahead.part < 1 else s, seen, length, ahead)
+        return Plan(
+            here.s + ahead.part * (s - here.s) if ahead.part < 1 else s, seen, length, ahead
+        )
 
     def _tried(self, here: Point, plan: Plan) -> Point | Far | str:
-        """The next point, one that is too far away, or why there is none; see `_reached` before forces set in."""
+        """The next point, one that is too far away, or why there is none; see `_reached` before
+        forces set in.
+        """
         tried, ahead = self._try(plan.s, plan.seen), plan.ahead
         if ahead.part < 1 and not ahead.behind:
             return self._reached(here, tried)
@@ -313,7 +386,9 @@ class Path:
         return self._try(plan.s, [self._beside(here)]) if sharp else tried
 
     def _look_again(self, course: Course, far: Far, sense: float) -> bool:
-        """Whether a point that was found too far away is a step from the last one; if so it is the last one now."""
+        """Whether a point that was found too far away is a step from the last one; if so it is the
+        last one now.
+        """
         here, again = course.here, self.measured_from(course.here, far.point)
         length, far.looks = (again.s - here.s) * sense, far.looks + 1
         solved = length > 0 and (far.exact or not again.turned_from(here))
@@ -324,24 +399,37 @@ class Path:
         return found
 
     def _past_fold(self, passed: Sequence[Point], length: float) -> float:
-        """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
+        """The length to a little behind the next fold of mu, where the cubic through two points has
+        its maximum.
+        """
         if len(passed) < 2 or self.control == "load":
             return np.inf
         before, here = passed[-2:]
         way, last = here.s - before.s, self.seen_from(before, here)
         rise = (here.state.mu[self.name] - before.state.mu[self.name]) / way
-        return max(BEHIND * (flat_beyond(rise, before.dmu, last.dmu) - 1) * abs(way), LEAST_PART * length)
+        return max(
+            BEHIND * (flat_beyond(rise, before.dmu, last.dmu) - 1) * abs(way), LEAST_PART * length
+        )
 
     def _missed(self, passed: Sequence[Point]) -> list[float]:
-        """By how much the cubic through two points and the quintic through three miss the next one, the last of all."""
-        return [self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf for n in (3, 4)]
+        """By how much the cubic through two points and the quintic through three miss the next one,
+        the last of all.
+        """
+        return [
+            self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf
+            for n in (3, 4)
+        ]
 
     def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
-        """The part of a step to `s` whose first guess misses little, or about as much as the last cubic missed."""
+        """The part of a step to `s` whose first guess misses little, or about as much as the last
+        cubic missed.
+        """
         cubic, quintic = (self.extended(s, passed[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
         allowed = max(GUESSED * self.system.length, WORSE * missed)
-        return min(1.0, (allowed / error) ** 0.25) if error else 1.0  # the error of a cubic grows with the fourth power
+        return (
+            min(1.0, (allowed / error) ** 0.25) if error else 1.0
+        )  # the error of a cubic grows with the fourth power
 
     def _distance(self, passed: Sequence[Point], point: Point) -> float:
         """How far a point is from where earlier ones led."""
@@ -349,25 +437,37 @@ class Path:
         return max_abs(self.system.comm, guess.u - point.state.u)
 
     def extended(self, s: float, passed: Sequence[Point]) -> State:
-        """A state at `s`, of the polynomial through points with their tangents; arc length is from the last.
+        """A state at `s`, of the polynomial through points with their tangents; arc length is from
+        the last.
 
         Points before a turn of s do not count.
         """
         last = passed[-1]
-        seen = [*(self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]), last]
-        while len(seen) > 1 and min(steps := np.diff([point.s for point in seen])) * max(steps) <= 0:
+        seen = [
+            *(self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]),
+            last,
+        ]
+        while (
+            len(seen) > 1 and min(steps := np.diff([point.s for point in seen])) * max(steps) <= 0
+        ):
             seen.pop(0)
         return self._joined(s, seen)
 
     def between(self, s: float, *points: Point) -> State:
-        """A first guess at `s`: the Hermite polynomial through points with their tangents, a cubic through two."""
+        """A first guess at `s`: the Hermite polynomial through points with their tangents, a cubic
+        through two.
+        """
         return self._joined(s, points)
 
     def _joined(self, s: float, points: Sequence[Point]) -> State:
         last, name = points[-1].state, self.name
         u, mu = np.array(last.u), last.mu[name]
-        for (value, slope), point in zip(hermite(s, [point.s for point in points]), points, strict=True):
-            u += value * (point.state.u - last.u) + slope * point.du  # what does not move stays, to the last digit
+        for (value, slope), point in zip(
+            hermite(s, [point.s for point in points]), points, strict=True
+        ):
+            u += (
+                value * (point.state.u - last.u) + slope * point.du
+            )  # what does not move stays, to the last digit
             mu += value * (point.state.mu[name] - last.mu[name]) + slope * point.dmu
         return last.with_(u, name, float(mu))
 
@@ -378,12 +478,16 @@ class Path:
         return point.per(self.metric.inner(base.normal, (point.du, point.dmu)))
 
     def _try(self, s: float, passed: Sequence[Point]) -> Point | Far | str:
-        """The next point, foreseen from some points, or one that is too far away, or the reason why there is none."""
+        """The next point, foreseen from some points, or one that is too far away, or the reason why
+        there is none.
+        """
         here = passed[-1]
         self.progress.trying(here, s - here.s)
         guess = self.extended(s, passed)
         moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
-        grows = self.newton.options.kinks  # steps may, where forces set in; given up there, they end beside the path
+        grows = (
+            self.newton.options.kinks
+        )  # steps may, where forces set in; given up there, they end beside the path
         point = self.at(s, guess, here, most=np.inf if grows else max(WILD * moved, LEAST_MOST))
         if isinstance(point, str):
             return point
@@ -393,20 +497,31 @@ class Path:
         return Far(point, reason, turned) if reason else self.as_base(point)
 
     def _jumped(self, here: Point, there: Point) -> str | None:
-        """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
+        """The reason to reject a step whose ends do not lie on one smooth arc; None if there is
+        none.
+        """
         length = there.s - here.s
-        if abs(there.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.passes_several:
+        if (
+            abs(there.negative_pivots - here.negative_pivots) > 1
+            and abs(length) > self.options.passes_several
+        ):
             return "the step passed several instabilities, or jumped to another branch"
         same = there.negative_pivots == here.negative_pivots or here.across is not None
-        corner = self.newton.options.kinks and same  # no corner is an instability, but where the load turns back
+        corner = (
+            self.newton.options.kinks and same
+        )  # no corner is an instability, but where the load turns back
         return None if (self._explained if corner else self._smooth)(here, there) else TURNS
 
     def _smooth(self, here: Point, there: Point) -> bool:
         """Whether the ends of a step lie on one smooth arc, as far as their tangents show."""
         chord = there.state.u - here.state.u
         unexplained = chord - (there.s - here.s) / 2 * (here.du + there.du)
-        gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
-        return self._cosine(here, there) >= self.options.turn and gap <= max(self.options.gap * whole, SEEN)
+        gap, whole = (
+            max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
+        )
+        return self._cosine(here, there) >= self.options.turn and gap <= max(
+            self.options.gap * whole, SEEN
+        )
 
     def _reached(self, here: Point, there: Point | Far | str) -> Point | Far | str:
         """A point before forces set in, unless they did, or there is a corner."""
@@ -416,7 +531,9 @@ class Path:
         return there if clear and self._smooth(here, self.seen_from(here, there)) else TURNS
 
     def _corner(self, here: Point, there: Point) -> bool:
-        """Whether the path has a corner between two points, from before which nothing behind it is foreseen."""
+        """Whether the path has a corner between two points, from before which nothing behind it is
+        foreseen.
+        """
         return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
 
     def _passes_corners(self, here: Point, far: Far, plan: Plan) -> bool:
@@ -427,9 +544,16 @@ class Path:
         close.
         """
         shortest = plan.length / 2 < self.options.smallest
-        if not (shortest and self.control == "arc" and self.newton.options.corners and far.reason == TURNS):
+        if not (
+            shortest
+            and self.control == "arc"
+            and self.newton.options.corners
+            and far.reason == TURNS
+        ):
             return False
-        return not far.point.turned_from(here) and not self.are_apart(here, self.seen_from(here, far.point))
+        return not far.point.turned_from(here) and not self.are_apart(
+            here, self.seen_from(here, far.point)
+        )
 
     def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
         """Whether two points are farther apart than a path between them is long, as their tangents
@@ -449,10 +573,14 @@ class Path:
         after = dot(comm, turn, rest) / square if square else 0.0  # of the way, behind the corner
         after = min(max(after / length, 0.0), 1.0) * length
         gap = max_abs(comm, rest - after * turn)
-        return gap <= max(self.options.gap * max_abs(comm, rest + length * here.du), SEEN * self.system.length)
+        return gap <= max(
+            self.options.gap * max_abs(comm, rest + length * here.du), SEEN * self.system.length
+        )
 
     def _cosine(self, a: Point, b: Point) -> float:
-        """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing there."""
+        """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing
+        there.
+        """
         lengths = self.metric.norm(a.du, 0.0) * self.metric.norm(b.du, 0.0)
         if lengths < SEEN**2:
             return 1.0
@@ -461,8 +589,15 @@ class Path:
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
-        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
-        return replace(again, iterations=point.iterations, factorisations=point.factorisations + 1, error=point.error)
+        again = self._point(
+            point.state, point.s, self.newton.response(point.state, self.name, row, exact=True)
+        )
+        return replace(
+            again,
+            iterations=point.iterations,
+            factorisations=point.factorisations + 1,
+            error=point.error,
+        )
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "arc":
@@ -472,9 +607,9 @@ class Path:
     def _point(self, state: State, s: float, response: Response) -> Point:
         """A point with its tangent and both numbers of unstable directions.
 
-        With q held instead of mu, there is one unstable direction less where dq/dmu < 0. This is Haynsworth's
-        inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur complement.
-        A coordinate whose force is held has one more instead where dq/dmu > 0.
+        With q held instead of mu, there is one unstable direction less where dq/dmu < 0. This is
+        Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur
+        complement. A coordinate whose force is held has one more instead where dq/dmu > 0.
         """
         pivots = response.negative_pivots
         held = pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)

@@ -1,4 +1,6 @@
-"""An accepted point of an equilibrium path, the record of points for a resumed run, and reports on the way."""
+"""An accepted point of an equilibrium path, the record of points for a resumed run, and reports on
+the way.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -120,7 +122,10 @@ class Journal(Protocol):
         """
 
     def begin(self, space: object) -> None:
-        """The results from here on are of another system, with the unknowns of that space. Collective."""
+        """The results from here on are of another system, with the unknowns of that space.
+
+        Collective.
+        """
 
     def check(self, known: bool) -> None:
         """Between two steps in time towards one result, which may be `known` already. Collective.
@@ -149,7 +154,10 @@ class NoJournal:
 
 
 class Progress(Protocol):
-    """Receives the next action of a history. No method is collective, and no result may depend on it."""
+    """Receives the next action of a history.
+
+    No method is collective, and no result may depend on it.
+    """
 
     def trying(self, here: Point, length: float) -> None:
         """A step of a length in s from an accepted point begins."""
@@ -189,10 +197,11 @@ class StepOptions:
     straight
         A step grows only if the cosine between the tangents of successive points is larger.
     turn
-        Least cosine between the tangents of successive points. A sharper turn counts as a jump to another
-        branch, and a smaller step is tried.
+        Least cosine between the tangents of successive points. A sharper turn counts as a jump to
+        another branch, and a smaller step is tried.
     gap
-        Largest part of a step that the tangents at its ends may leave unexplained. A larger one counts as a jump too.
+        Largest part of a step that the tangents at its ends may leave unexplained. A larger one
+        counts as a jump too.
     several
         The longest step that may pass more than one instability; 0: an eighth of the first.
     """

@@ -1,15 +1,16 @@
 """A search for further solutions at the amplitudes of a known one, by deflation from many guesses.
 
-A guess is tried in two ways: by Newton's method with all known solutions deflated, and by the path on which a force
-along its displacement that holds it is released. Each solution that is found gives two more guesses, along its softest
-mode. A search for stable solutions first lets each guess settle: go down in energy until it rests at one.
+A guess is tried in two ways: by Newton's method with all known solutions deflated, and by the path
+on which a force along its displacement that holds it is released. Each solution that is found gives
+two more guesses, along its softest mode. A search for stable solutions first lets each guess
+settle: go down in energy until it rests at one.
 
-**Release.** R(u) + t b = 0 with -b . u = q, first that of the guess; then the path is followed by arc length, through
-folds, until the force t is zero: there is an equilibrium.
+**Release.** R(u) + t b = 0 with -b . u = q, first that of the guess; then the path is followed by
+arc length, through folds, until the force t is zero: there is an equilibrium.
 
-**Settling.** Every step solves (K + s K0) du = -R, with the tangent K0 of the unloaded system: one implicit step of the
-flow K0 du/dt = -R, of length 1/s. Sharp folds relax, while soft directions stay almost where they are. It goes down the
-energy, so its fixed points are stable equilibria.
+**Settling.** Every step solves (K + s K0) du = -R, with the tangent K0 of the unloaded system: one
+implicit step of the flow K0 du/dt = -R, of length 1/s. Sharp folds relax, while soft directions
+stay almost where they are. It goes down the energy, so its fixed points are stable equilibria.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -37,9 +38,16 @@ from magshell_fenicsx.continuation.system import (
     symmetric_part,
 )
 
-FIRST, LONGEST, SHORTEST = 0.02, 1000.0, 1e-3  # steps: the first in the metric's length, others over the first
+FIRST, LONGEST, SHORTEST = (
+    0.02,
+    1000.0,
+    1e-3,
+)  # steps: the first in the metric's length, others over the first
 MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
-MOST_BRACKETS, LITTLE = 4, 1e-2  # solves for the zero of the force; this part of its change counts as zero
+MOST_BRACKETS, LITTLE = (
+    4,
+    1e-2,
+)  # solves for the zero of the force; this part of its change counts as zero
 SCALE = 1e6  # the force counts as nothing in the arc length
 MOST_FACTORS = 40
 UNEXPLAINED = 0.7  # part of the residual that a step towards rest may leave
@@ -47,20 +55,26 @@ EASY = 0.2  # where it leaves less, the next is longer
 RESTED = 0.05  # in lengths of the system: a shorter step with so small a shift ends
 SMALL = 0.01
 COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
-MODE, DOWN = 1.0, 0.3  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
+MODE, DOWN = (
+    1.0,
+    0.3,
+)  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
 MOST_CHANGED = 10  # times that a solution gets stiffer penalties or new cuts
 DESCENTS = 20  # times that a guess goes on settling
 OVER = "the time of the search is over"
 
 
 def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]:
-    """Guesses of equilibria on the path of a force along b that holds a guess, each where the force is zero.
+    """Guesses of equilibria on the path of a force along b that holds a guess, each where the force
+    is zero.
 
     The path begins in the direction in which the force falls in size.
     """
     system = newton.system
     residual, size = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
-    b = np.asarray(b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0))  # a force of order one
+    b = np.asarray(
+        b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0)
+    )  # a force of order one
     holder = newton.on(HeldAlong(system, b))
     first = -dot(system.comm, b, residual) / dot(system.comm, b, b)
     row = GivenConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
@@ -75,7 +89,9 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
         for count, (point, _) in enumerate(path.towards(reached, [np.inf]), 1):
             before, after = (p.state.mu[FORCE] for p in (reached, point))
             if before * after <= 0 and before != after:
-                yield State(_at_rest(path, reached, path.seen_from(reached, point)).u, dict(guess.mu))
+                yield State(
+                    _at_rest(path, reached, path.seen_from(reached, point)).u, dict(guess.mu)
+                )
             reached = point
             if count == MOST_STEPS or abs(after) > largest:
                 return
@@ -84,7 +100,9 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
 
 
 def _at_rest(path: Path, base: Point, high: Point) -> State:
-    """Where the holding force is zero between two points, by regula falsi until little of it is left."""
+    """Where the holding force is zero between two points, by regula falsi until little of it is
+    left.
+    """
     low, most = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
     for _ in range(MOST_BRACKETS):
         first, last = low.state.mu[FORCE], high.state.mu[FORCE]
@@ -117,7 +135,10 @@ class Settling:
     def __post_init__(self) -> None:
         K = symmetric_part(self.system.tangent(self.unloaded.u, self.unloaded.mu))
         self._K0 = K.copy()
-        self._stiff, self._factors = Factorisation(self.system.comm), Factorisation(self.system.comm)
+        self._stiff, self._factors = (
+            Factorisation(self.system.comm),
+            Factorisation(self.system.comm),
+        )
         self._stiff.factor(self._K0)
 
     def settled(self, guess: State) -> State:
@@ -129,7 +150,9 @@ class Settling:
             while spent < MOST_FACTORS:
                 spent += 1
                 shifted = K.copy()
-                shifted.axpy(shift, self._K0, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)  # K has what touches too
+                shifted.axpy(
+                    shift, self._K0, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+                )  # K has what touches too
                 self._factors.factor(shifted)
                 if self._factors.negative_pivots:
                     shift *= 2
@@ -137,7 +160,9 @@ class Settling:
                 du = -self._factors.solve(residual)
                 ahead = system.residual(u + du, guess.mu)
                 left = self._size(ahead + shift * self._stiff.times(du)) / self._size(residual)
-                if left <= UNEXPLAINED and not self.passes(State(u, guess.mu), State(u + du, guess.mu)):
+                if left <= UNEXPLAINED and not self.passes(
+                    State(u, guess.mu), State(u + du, guess.mu)
+                ):
                     u, residual = u + du, ahead
                     ends = shift < SMALL and max_abs(system.comm, du) <= RESTED * system.length
                     shift /= 4 if left < EASY else 1
@@ -149,7 +174,10 @@ class Settling:
 
     def _size(self, residual: Vector) -> float:
         """The size of a residual: of the displacement that it causes, in the norm of K0."""
-        return float(np.sqrt(abs(dot(self.system.comm, residual, self._stiff.solve(residual))))) or np.finfo(float).tiny
+        return (
+            float(np.sqrt(abs(dot(self.system.comm, residual, self._stiff.solve(residual)))))
+            or np.finfo(float).tiny
+        )
 
 
 @dataclass(frozen=True)
@@ -195,7 +223,12 @@ class Guess:
     """
 
     def __init__(
-        self, make: Callable[[], State], base: State, displacement: Callable[[Vector], Vector], *, reached: bool
+        self,
+        make: Callable[[], State],
+        base: State,
+        displacement: Callable[[Vector], Vector],
+        *,
+        reached: bool,
     ) -> None:
         self._make, self._base, self._displacement, self.reached = make, base, displacement, reached
 
@@ -226,11 +259,13 @@ def further(
     start
         A solution.
     guesses
-        Further guesses, which are tried first; ways lead there on which no shells pass through each other.
+        Further guesses, which are tried first; ways lead there on which no shells pass through each
+        other.
     displacement
         A vector of the system with zeros for unknowns that are no displacements.
     descend
-        Lets a state go down in energy by some steps; then only stable solutions count. None: all count.
+        Lets a state go down in energy by some steps; then only stable solutions count. None: all
+        count.
     rules
         Of shells that may touch.
     """
@@ -242,7 +277,9 @@ def further(
         attempts = [*([search.by_descent] if descend else []), search.by_newton, search.by_release]
         while attempts:
             attempt = attempts.pop(0)
-            path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {accepted}")
+            path.progress.doing(
+                f"searching: guess {number} of at most {limits.guesses}, solutions found: {accepted}"
+            )
             point = path.recorded(partial(_unless, limits.over, attempt, guess))
             if point == OVER:
                 return
@@ -259,7 +296,9 @@ def further(
             return
 
 
-def _unless(over: Callable[[], bool], attempt: Callable[[Guess], Point | str], guess: Guess) -> Point | str:
+def _unless(
+    over: Callable[[], bool], attempt: Callable[[Guess], Point | str], guess: Guess
+) -> Point | str:
     """The result of an attempt; states without meaning, far from equilibrium, may have no factors."""
     try:
         return OVER if over() else attempt(guess)
@@ -284,14 +323,22 @@ class _Search:
         over: Callable[[], bool],
         rules: Rules,
     ) -> None:
-        self._path, self.known, self._descend, self._over, self._rules = path, known, descend, over, rules
+        self._path, self.known, self._descend, self._over, self._rules = (
+            path,
+            known,
+            descend,
+            over,
+            rules,
+        )
         self._system, self._newton = path.system, path.newton
         self._solver = Path(path.newton, path.name, "load", path.options)  # without a journal
         self._value = known[0].mu[path.name]
         self._row = path.given("load", self._value)
 
     def kept(self, guess: Guess, point: Point) -> Point | str:
-        """A solution as the rules ask for it, or why it is none: every known one is reached without passing through."""
+        """A solution as the rules ask for it, or why it is none: every known one is reached without
+        passing through.
+        """
         for _ in range(MOST_CHANGED):
             if (own := self._rules.own(point.state)) is None:
                 break
@@ -317,7 +364,9 @@ class _Search:
         return self._accepted(guess.state)
 
     def by_descent(self, guess: Guess) -> Point | str:
-        """The stable solution below a guess; from an unstable one on the way it goes on along the softest mode."""
+        """The stable solution below a guess; from an unstable one on the way it goes on along the
+        softest mode.
+        """
         assert self._descend
         state, tried = guess.state, "it does not come to rest"
         for _ in range(DESCENTS):
@@ -327,7 +376,9 @@ class _Search:
             if self._newton.factor_at(state).negative_pivots:
                 continue
             near = deflated(self._newton, state, self._path.name, self._row)
-            outcome = self._solver.solve(self._row, self._value, near) if near else "no solution is near"
+            outcome = (
+                self._solver.solve(self._row, self._value, near) if near else "no solution is near"
+            )
             if isinstance(outcome, str):
                 tried = outcome
             elif self._is_known(outcome.state):
@@ -350,11 +401,16 @@ class _Search:
     def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:
         """Guesses on both sides of a solution along its softest mode."""
         mode = _Mode(self._path, state)
-        return [Guess(partial(mode.state, size), state, displacement, reached=False) for size in (MODE, -MODE)]
+        return [
+            Guess(partial(mode.state, size), state, displacement, reached=False)
+            for size in (MODE, -MODE)
+        ]
 
     def _accepted(self, guess: State) -> Point | str:
         path = self._path
-        near = deflated(self._newton, guess, path.name, self._row, [state.u for state in self.known])
+        near = deflated(
+            self._newton, guess, path.name, self._row, [state.u for state in self.known]
+        )
         if near is None:
             return "Newton's method finds no other solution"
         point = self._solver.solve(self._row, self._value, near)

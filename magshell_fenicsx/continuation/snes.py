@@ -1,9 +1,10 @@
 """PETSc's SNES on the bordered system: what it calls, its options, and the reasons why it ends.
 
-SNES has the loop, the line search and the monitors. Its linear solver is the bordered matrix, which is kept while the
-steps shrink. Its test of convergence is the next step, which measures the error if its matrix is good (P. Deuflhard,
-Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4, QNERR). The residual does not measure it: rounding of
-the stiff part of a structure hides errors of its soft part.
+SNES has the loop, the line search and the monitors. Its linear solver is the bordered matrix, which
+is kept while the steps shrink. Its test of convergence is the next step, which measures the error
+if its matrix is good (P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec.
+2.1.4, QNERR). The residual does not measure it: rounding of the stiff part of a structure hides
+errors of its soft part.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,15 +18,27 @@ from petsc4py import PETSc
 from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.iterates import FULL, Iterates, Step, Verdict, foreseen
-from magshell_fenicsx.continuation.system import Direction, Roughly, State, System, Weighted, followed, max_abs
+from magshell_fenicsx.continuation.system import (
+    Direction,
+    Roughly,
+    State,
+    System,
+    Weighted,
+    followed,
+    max_abs,
+)
 from magshell_fenicsx.platform import compat
 
-MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
+# this part of the largest displacement counts as the length where it exceeds the system's length
+MOTION = 0.1
 DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
 OLD = 3  # matrices of a solve after which an older part of them is made anew, once
 AWAY = 1.0  # in lengths: after a longer step that part would soon be too old again
-FORESEEN = 0.01  # a step with foreseen forces over those since they were computed: below it they are computed again
-CERTAIN = 0.1  # part of the tolerance, for an error after computed forces that is not looked at again
+# a step with foreseen forces over those since they were computed: below it they are computed again
+FORESEEN = 0.01
+CERTAIN = (
+    0.1  # part of the tolerance, for an error after computed forces that is not looked at again
+)
 SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix are of this solver alone
 DIVERGED, FAR = "the iteration diverged", "the first guess is too far away"
@@ -58,26 +71,29 @@ class NewtonOptions:
     ----------
     tolerance
         Estimated error of u, over the system's length or, where that is longer, a tenth of the
-        largest displacement: a strip of 1000 thicknesses that rolls up is not known to 1e-12 of its length.
-        PETSc's option `-snes_stol` replaces it.
+        largest displacement: a strip of 1000 thicknesses that rolls up is not known to 1e-12 of its
+        length. PETSc's option `-snes_stol` replaces it.
     max_iterations
         Iterations after which a step is given up; `-snes_max_it` replaces it.
     contraction
         The first factors are kept while a step is shorter than this part of the one before.
     hard
-        The same for later factors, and for all factors if the guess comes with a stress: old factors mislead there.
+        The same for later factors, and for all factors if the guess comes with a stress: old
+        factors mislead there.
     cheap
-        This many steps with old factors cost less than new factors. So old factors that halve the step are kept
-        if that many steps reach the tolerance, but not if the guess comes with a stress.
+        This many steps with old factors cost less than new factors. So old factors that halve the
+        step are kept if that many steps reach the tolerance, but not if the guess comes with a
+        stress.
     fresh
-        Distance, in lengths, up to which factors are used for the tangent and the inertia of a solution.
+        Distance, in lengths, up to which factors are used for the tangent and the inertia of a
+        solution.
     largest_step
         An iteration that moves u by more than this many lengths counts as divergence.
     patience
         Matrices after which the steps of a solve must have shrunk.
     stiffnesses
-        Amplitudes that are the stiffness of faces between which forces set in within a step, as where shells touch,
-        with their values in a state that has none.
+        Amplitudes that are the stiffness of faces between which forces set in within a step, as
+        where shells touch, with their values in a state that has none.
     corners
         Whether a path has corners although full steps do not circle, as where points of rigid
         bodies touch.
@@ -105,7 +121,10 @@ class LatestTangent:
 
     def __init__(self, system: System, factorisation: Factorisation) -> None:
         self.system, self._factorisation = system, factorisation
-        self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and its number
+        self._made: tuple[State | None, int] = (
+            None,
+            0,
+        )  # the state that was factored last, and its number
         self._stressed = False  # whether it was factored with another stress than its own
         self.rough = False  # whether a small part of it is that of an earlier state
 
@@ -121,19 +140,29 @@ class LatestTangent:
         return self._factorisation
 
     def near(self, state: State, most: float) -> bool:
-        """Whether the latest factors belong to a state less than so many lengths from another one; of any load."""
+        """Whether the latest factors belong to a state less than so many lengths from another one;
+        of any load.
+        """
         mine, system = self.state, self.system
         return mine is not None and max_abs(system.comm, state.u - mine.u) < most * system.length
 
     def at(
-        self, state: State, stress: Sequence[Weighted] = (), *, rough: bool = False, sure: bool = True
+        self,
+        state: State,
+        stress: Sequence[Weighted] = (),
+        *,
+        rough: bool = False,
+        sure: bool = True,
     ) -> Factorisation:
-        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an earlier state.
+        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an
+        earlier state.
 
         If also `sure`, it is so only where that cannot change the number of unstable directions.
         """
         near, factors = self.state, self._factorisation
-        other = near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm))
+        other = near is not state and (
+            near is None or self._stressed or not near.equals(state, self.system.comm)
+        )
         if other or (self.rough and not rough) or (sure and not self.certain):
             self.rough = rough and factored_roughly(self.system, factors, state, stress, sure=sure)
             if not self.rough:
@@ -143,21 +172,32 @@ class LatestTangent:
 
     @property
     def foresees(self) -> bool:
-        """Whether a part of the forces may be foreseen from states before: it is small, and was so far."""
+        """Whether a part of the forces may be foreseen from states before: it is small, and was so
+        far.
+        """
         return isinstance(self.system, Roughly) and self.system.dear and self._factorisation.knows
 
     @property
     def certain(self) -> bool:
-        """Whether the number of unstable directions is known, of the latest factors, in spite of an older part."""
+        """Whether the number of unstable directions is known, of the latest factors, in spite of an
+        older part.
+        """
         factors = self._factorisation
         known = factors.counted or factors.count_beside()
         return known and (not self.rough or factors.doubt <= DOUBT)
 
 
 def factored_roughly(
-    system: System, factors: Factorisation, state: State, stress: Sequence[Weighted] = (), *, sure: bool = True
+    system: System,
+    factors: Factorisation,
+    state: State,
+    stress: Sequence[Weighted] = (),
+    *,
+    sure: bool = True,
 ) -> bool:
-    """Factor a tangent whose small part is that of an earlier state; False if it is not small, now or before."""
+    """Factor a tangent whose small part is that of an earlier state; False if it is not small, now
+    or before.
+    """
     if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
         return False
     factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
@@ -193,20 +233,33 @@ class Linearised:
         foreseeing: bool = False,
         rough: float = 0.0,
     ) -> None:
-        """Begin a solve, with a line search or without, with foreseen forces or not; as `BorderedNewton.solve`.
+        """Begin a solve, with a line search or without, with foreseen forces or not; as
+        `BorderedNewton.solve`.
 
         See `Iterates` for `rough`.
         """
         self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
         self._computed = list[float]()  # steps with computed forces
         self._tolerance, self._near = tolerance, near
-        self._guess, self._name, self._row, self._stress, self._followed = guess, name, row, stress, bool(stress)
+        self._guess, self._name, self._row, self._stress, self._followed = (
+            guess,
+            name,
+            row,
+            stress,
+            bool(stress),
+        )
         patience = SEARCHED if searched else self._options.patience
         o = self._options
-        kinks = o.kinks or foreseeing or bool(self._system.coordinates)  # the force of a body is stiff
-        self._iterates = Iterates(min(o.largest_step, most), patience, searched, kinks, most < np.inf, rough)
+        kinks = (
+            o.kinks or foreseeing or bool(self._system.coordinates)
+        )  # the force of a body is stiff
+        self._iterates = Iterates(
+            min(o.largest_step, most), patience, searched, kinks, most < np.inf, rough
+        )
         self.matrix = self._chord = self._state = self._ahead = None
-        self._at = self._residual = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
+        self._at = (
+            self._residual
+        ) = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
 
     @property
     def error(self) -> float:
@@ -241,7 +294,9 @@ class Linearised:
         self.join(self.matrix.times(*self.split(x)), y)
 
     def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The inverse of the matrix times a vector; for the iterate's residual it is known since the test."""
+        """The inverse of the matrix times a vector; for the iterate's residual it is known since
+        the test.
+        """
         assert self._chord
         assert self._ahead
         solved = f.stateGet() == self._residual and f.handle == self._handle
@@ -255,7 +310,9 @@ class Linearised:
 
     def _least(self, state: State) -> float:
         """The size of a step that counts as converged."""
-        return self._tolerance * max(1.0, MOTION * max_abs(self._system.comm, state.u) / self._system.length)
+        return self._tolerance * max(
+            1.0, MOTION * max_abs(self._system.comm, state.u) / self._system.length
+        )
 
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
         """Choose the matrix for an iterate, and compute its next step; once for each iterate."""
@@ -279,14 +336,18 @@ class Linearised:
         return state
 
     def _foreseeable(self, state: State) -> float:
-        """A step with foreseen forces that is not larger has forces computed in its place; negative if it need not."""
+        """A step with foreseen forces that is not larger has forces computed in its place; negative
+        if it need not.
+        """
         least = self._least(state)
         if foreseen(self._computed, 1) <= CERTAIN * least:  # one ratio: each costs much
             return -1.0
         return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
 
     def misled(self) -> bool:
-        """Whether the last step is much shorter with computed forces than with foreseen ones; also if nobody knows."""
+        """Whether the last step is much shorter with computed forces than with foreseen ones; also
+        if nobody knows.
+        """
         if not (self._foreseen and self._state and self._chord and self.matrix):
             return True  # nothing is known of it
         state, before = self._state, self._iterates.steps[-1].size
@@ -312,12 +373,14 @@ class Linearised:
             self._chord.took(self._ahead)
         else:
             self._chord = None
-        # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
-        # Computer Methods in Applied Mechanics and Engineering 313, 2017)
+        # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano,
+        # Leonetti, Garcea, Computer Methods in Applied Mechanics and Engineering 313, 2017)
         self._stress = followed(before.u, -self._ahead[0] if full else state.u - before.u)
 
     def _next_step(self, state: State, f: Direction) -> Direction:
-        """The next step, which SNES subtracts: from the latest matrix, or from a new one at this iterate."""
+        """The next step, which SNES subtracts: from the latest matrix, or from a new one at this
+        iterate.
+        """
         steps = self._iterates.steps
         if self._chord and self.matrix:
             step = self._chord.step(f)
@@ -327,7 +390,11 @@ class Linearised:
                 return step
         own = bool(steps) or not self._tangent.near(state, self._near)
         anew = sum(step.own for step in steps) == OLD and not self.foreseeing
-        factors = self._tangent.at(state, self._stress, rough=not anew, sure=False) if own else self._tangent.latest
+        factors = (
+            self._tangent.at(state, self._stress, rough=not anew, sure=False)
+            if own
+            else self._tangent.latest
+        )
         matrix, step = self._stepped(factors, state, f)
         if own and self._too_old(matrix, step):
             factors = self._tangent.at(state, self._stress, sure=False)
@@ -337,9 +404,13 @@ class Linearised:
         steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))
         return step
 
-    def _stepped(self, factors: Factorisation, state: State, f: Direction) -> tuple[Bordered, Direction]:
+    def _stepped(
+        self, factors: Factorisation, state: State, f: Direction
+    ) -> tuple[Bordered, Direction]:
         """Return a matrix from some factors, and its step."""
-        matrix = Bordered(self._system, factors, state, self._name, self._row, rough=self._tangent.rough)
+        matrix = Bordered(
+            self._system, factors, state, self._name, self._row, rough=self._tangent.rough
+        )
         return matrix, matrix.solve(*f, rough=True)
 
     def _too_old(self, matrix: Bordered, step: Direction) -> bool:
@@ -349,7 +420,11 @@ class Linearised:
         It is small beside the rest at that state, but need not be so now. After the step the
         residual is what the matrix lacks, times the step.
         """
-        before, size, hard = [s.size for s in self._iterates.steps if s.own], matrix.size(step), self._options.hard
+        before, size, hard = (
+            [s.size for s in self._iterates.steps if s.own],
+            matrix.size(step),
+            self._options.hard,
+        )
         if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):
             return False
         lacks = self._tangent.latest.change(step[0])
@@ -361,11 +436,15 @@ class Linearised:
         ratio = size / steps[-1].size
         first = sum(step.own for step in steps) <= 1 and not self._followed
         ends = ratio <= 0.5 and size * ratio**o.cheap <= self._tolerance and not self._followed
-        late = first and len(steps) > 1 and size <= o.contraction**2 * steps[-2].size  # Broyden's steps shrink unevenly
+        late = (
+            first and len(steps) > 1 and size <= o.contraction**2 * steps[-2].size
+        )  # Broyden's steps shrink unevenly
         return ends or late or ratio <= (o.contraction if first else o.hard)
 
     def _rounding(self, state: State, f: PETSc.Vec) -> float:
-        """The error from rounding of the residual, estimated from its change when u is rounded differently."""
+        """The error from rounding of the residual, estimated from its change when u is rounded
+        differently.
+        """
         matrix = self.matrix
         assert matrix
         side = np.random.default_rng(self._system.comm.rank).choice([-1.0, 1.0], state.u.size)
@@ -394,8 +473,12 @@ class Linearised:
         return self._guess.with_(u, self._name, mu)
 
 
-def make_snes(linearised: Linearised, x: PETSc.Vec, options: NewtonOptions, search: str = "basic") -> PETSc.SNES:
-    """A SNES for vectors like `x`, with a line search, full steps if `basic`; PETSc's options may set another."""
+def make_snes(
+    linearised: Linearised, x: PETSc.Vec, options: NewtonOptions, search: str = "basic"
+) -> PETSc.SNES:
+    """A SNES for vectors like `x`, with a line search, full steps if `basic`; PETSc's options may
+    set another.
+    """
     sizes = x.getSizes()
     J = PETSc.Mat().createPython((sizes, sizes), context=linearised, comm=x.comm)
     J.setUp()

@@ -1,4 +1,6 @@
-"""Steps along a path: the next one as it is planned, and how long the one after it is, by what became of it."""
+"""Steps along a path: the next one as it is planned, and how long the one after it is, by what
+became of it.
+"""
 
 from dataclasses import dataclass
 
@@ -8,7 +10,8 @@ from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
 from magshell_fenicsx.continuation.snes import HIDDEN
 
 MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
-LOOKS = 2  # at a point that was found too far away; a third point before it means that it is on another branch
+# at a point that was found too far away; a third point before it means that it is on another branch
+LOOKS = 2
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 LOOKED_BACK = 4  # points from which the next is foreseen: three, and one with which they are judged
@@ -25,7 +28,8 @@ class Ahead:
     behind
         Whether it ends just behind; else just before.
     lets_go
-        Whether forces of the point are lost at the guess: then its tangent alone foresees the next one.
+        Whether forces of the point are lost at the guess: then its tangent alone foresees the next
+        one.
     """
 
     part: float = 1.0
@@ -35,7 +39,9 @@ class Ahead:
 
 @dataclass(frozen=True)
 class Plan:
-    """The next step: where it ends, the points that foresee it, its length without forces that set in, and those."""
+    """The next step: where it ends, the points that foresee it, its length without forces that set
+    in, and those.
+    """
 
     s: float
     seen: list[Point]
@@ -45,7 +51,9 @@ class Plan:
 
 @dataclass
 class Far:
-    """A point that was found too far away, why it is no step, whether it has its own inertia, and the looks at it."""
+    """A point that was found too far away, why it is no step, whether it has its own inertia, and
+    the looks at it.
+    """
 
     point: Point
     reason: str
@@ -104,7 +112,9 @@ class Course:
         if not self.step >= smallest:
             raise PathStopped(reason, self.here)
 
-    def reached(self, point: Point, plan: Plan, options: StepOptions, *, straight: bool, corner: bool) -> None:
+    def reached(
+        self, point: Point, plan: Plan, options: StepOptions, *, straight: bool, corner: bool
+    ) -> None:
         """A step ended at a point, almost straight, or behind a corner."""
         o, length = options, plan.length
         if straight and (point.factorisations <= o.easy or point.iterations <= o.few):

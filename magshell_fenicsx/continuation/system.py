@@ -16,7 +16,9 @@ Direction = tuple[Vector, float]  # (du, dmu)
 
 
 class Rest(Protocol):
-    """What is added to a sparse symmetric matrix, where all unknowns act on each other; it does not change."""
+    """What is added to a sparse symmetric matrix, where all unknowns act on each other; it does not
+    change.
+    """
 
     def times(self, v: Vector) -> Vector:
         """Its product with a vector. Collective."""
@@ -40,7 +42,8 @@ class Beside:
     changing
         What may be that of an earlier state: D and its part in K; D alone if None.
     present
-        The product of that of the present state with a vector, dear; None if nothing is older. Collective.
+        The product of that of the present state with a vector, dear; None if nothing is older.
+        Collective.
     foreseen
         The same product as foreseen from states where forces are known, cheap; None if nothing is
         older. Collective.
@@ -70,14 +73,16 @@ class Skewed:
 
 @dataclass(frozen=True)
 class Edged:
-    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers; K may be skewed.
+    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers; K may
+    be skewed.
 
     Attributes
     ----------
     C, D
         k columns on this rank, and (k, k) numbers.
     multipliers
-        Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no unstable direction.
+        Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no
+        unstable direction.
     """
 
     K: "PETSc.Mat | Beside | Skewed"
@@ -90,7 +95,9 @@ Tangent: TypeAlias = PETSc.Mat | Beside | Skewed | Edged
 
 
 def symmetric_part(tangent: Tangent) -> PETSc.Mat:
-    """The symmetric matrix of u in a tangent, itself and no copy; with all entries where all unknowns are coupled."""
+    """The symmetric matrix of u in a tangent, itself and no copy; with all entries where all
+    unknowns are coupled.
+    """
     while isinstance(tangent, Skewed | Edged):
         tangent = tangent.K
     return tangent.D.added_to(tangent.K) if isinstance(tangent, Beside) else tangent
@@ -108,9 +115,9 @@ class System(Protocol):
     length
         A displacement that counts as of order one; convergence is measured with it.
     coordinates
-        Amplitudes that are positions, for example of a body that presses on the shell. Their conjugates are forces:
-        where the force is held, the position is free. All other amplitudes are forces: where the conjugate of one
-        is held, that is a constraint.
+        Amplitudes that are positions, for example of a body that presses on the shell. Their
+        conjugates are forces: where the force is held, the position is free. All other amplitudes
+        are forces: where the conjugate of one is held, that is a constraint.
     """
 
     comm: MPI.Comm
@@ -131,19 +138,22 @@ class System(Protocol):
         """d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply their terms."""
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
-        """d2Pi/du2, assembled, or dR/du where a load has no potential; the matrix is reused by the next call.
+        """d2Pi/du2, assembled, or dR/du where a load has no potential; the matrix is reused by the
+        next call.
 
         Parameters
         ----------
         stress
-            Displacements with weights. A system may use the weighted sum of their stresses in place of the stress
-            of u. That sum is linear along the path, while small errors of a guess u spoil its own stress.
+            Displacements with weights. A system may use the weighted sum of their stresses in place
+            of the stress of u. That sum is linear along the path, while small errors of a guess u
+            spoil its own stress.
         """
 
 
 @runtime_checkable
 class Roughly(Protocol):
-    """A system that may have a part of its tangent that is dear, and mostly small beside the others.
+    """A system that may have a part of its tangent that is dear, and mostly small beside the
+    others.
 
     Attributes
     ----------
@@ -160,12 +170,16 @@ class Roughly(Protocol):
     def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
         """Whether forces foreseen near a state are right along a direction."""
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Tangent:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False
+    ) -> Tangent:
         """As that of `System`; if `rough`, that part may be that of an earlier state."""
 
 
 def followed(u: Vector, step: Vector) -> list[Weighted]:
-    """The stress extrapolated linearly from u along a step, as weighted displacements; strain is quadratic in u."""
+    """The stress extrapolated linearly from u along a step, as weighted displacements; strain is
+    quadratic in u.
+    """
     return [(1.0, u), (0.5, u + step), (-0.5, u - step)]
 
 

@@ -1,9 +1,11 @@
-"""One step in time of M a + c M v + D + dPi/du(u; mu(t)) = 0, by the generalised alpha method with the exact tangent.
+"""One step in time of M a + c M v + D + dPi/du(u; mu(t)) = 0, by the generalised alpha method with
+the exact tangent.
 
-J. Chung and G. M. Hulbert, Journal of Applied Mechanics 60 (1993): second order; high frequencies fade by the factor
-rho at each step. With rho = 1 the force is averaged along the step at Gauss points, which conserves the energy
-(G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41, 2008). PETSc's TSALPHA2 has the same formulas for
-rho < 1, but shows neither its acceleration, without which a resumed run is another one, nor a place for that average.
+J. Chung and G. M. Hulbert, Journal of Applied Mechanics 60 (1993): second order; high frequencies
+fade by the factor rho at each step. With rho = 1 the force is averaged along the step at Gauss
+points, which conserves the energy (G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41,
+2008). PETSc's TSALPHA2 has the same formulas for rho < 1, but shows neither its acceleration,
+without which a resumed run is another one, nor a place for that average.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -17,7 +19,14 @@ from petsc4py import PETSc
 from magshell_fenicsx.continuation.control import Chord
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
-from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
+from magshell_fenicsx.continuation.motion import (
+    Averaged,
+    Ground,
+    Motion,
+    Viscous,
+    constrained,
+    held_back,
+)
 from magshell_fenicsx.continuation.snes import MOTION
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
@@ -32,7 +41,8 @@ from magshell_fenicsx.continuation.system import (
     max_abs,
 )
 
-TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
+# of u in a step, over the system's length or, where that is longer, a tenth of the displacement
+TOLERANCE = 1e-10
 FLOOR = 1e-3  # of the length: energies below that of such a displacement count as none
 STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
 ROUNDED = 10.0  # steps up to this many times the rounding error are
@@ -40,10 +50,17 @@ MOST = 20  # iterations
 FAR = 3.0  # lengths: a step that is longer, and than the first one, does not come back
 PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
-SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
-ROUNDING = 1e-8  # changes of the acceleration times the square of the time step, from iterations that end at TOLERANCE
+# error of the last step up to which the acceleration predicts the next: in stiff motions it
+# alternates
+SMOOTH = 1e-2
+# changes of the acceleration times the square of the time step, from iterations that end at
+# TOLERANCE
+ROUNDING = 1e-8
 OTHER = 0.05  # relative change of the time step after which factors are renewed
-GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
+GAUSS = (
+    (0.5 - np.sqrt(1 / 12), 0.5),
+    (0.5 + np.sqrt(1 / 12), 0.5),
+)  # exact for the membrane's energy, of degree 4
 Array = NDArray[np.float64]
 Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
 
@@ -96,7 +113,8 @@ class Integrator:
     averaged
         Contacts, beside which the balance of energy is checked in each step.
     device
-        Amplitudes that are unknown, since their conjugates are held at the end of each step; None: all are loads.
+        Amplitudes that are unknown, since their conjugates are held at the end of each step; None:
+        all are loads.
 
     Attributes
     ----------
@@ -119,33 +137,49 @@ class Integrator:
         ground: Ground | None = None,
         averaged: Averaged | None = None,
     ) -> None:
-        self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
+        self.system, self.mass, self.loads, self.drag, self.viscous = (
+            system,
+            mass,
+            loads,
+            drag,
+            viscous,
+        )
         self.rule = Rule.of(rho)
         self.ground, self.averaged, self._total = ground, averaged, np.nan
         self.device, self._free = device, tuple(device.names) if device else ()
         self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
-        self._K: PETSc.Mat | None = None  # of the pattern of another one, which contact of shells changes
+        self._K: PETSc.Mat | None = (
+            None  # of the pattern of another one, which contact of shells changes
+        )
         self._like: PETSc.Mat | None = None
         self.factored: Factored | None = None
         self._x, self._y = mass.createVecs()
         # what a state has from its history: turns of edges under moments, whose work is counted on
-        self._advance: Callable[[State, Amplitudes], State] = getattr(system, "advance", lambda state, before: state)
+        self._advance: Callable[[State, Amplitudes], State] = getattr(
+            system, "advance", lambda state, before: state
+        )
 
     def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
-        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`.
+        """A motion with the acceleration that the loads after t give it; sums go on from those of
+        `before`.
 
-        What a device constrains is put where it must be, along the forces of the constraint, and so is its velocity.
+        What a device constrains is put where it must be, along the forces of the constraint, and so
+        is its velocity.
         """
         mu = self.loads(t, False)
         work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
         if before:
             mu |= {name: before.mu[name] for name in self._free} | self._kept(before)
         inverse = self._inverse_mass()
-        if self.ground:  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
+        if (
+            self.ground
+        ):  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
             work -= self._kinetic(v, t, True)
-            v = v - inverse(self._pulled(self.ground.velocity(t, False) - self.ground.velocity(t, True)))
+            v = v - inverse(
+                self._pulled(self.ground.velocity(t, False) - self.ground.velocity(t, True))
+            )
             work += self._kinetic(v, t, False)
         if self.device:
             u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
@@ -155,7 +189,9 @@ class Integrator:
             self.viscous.begin()
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.ground:
-            r = r + self._pulled(self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False))
+            r = r + self._pulled(
+                self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False)
+            )
         if self.viscous:
             r = r + self.viscous.force(u, u, v, 1.0, 0.0)
         a = -inverse(r)
@@ -169,10 +205,14 @@ class Integrator:
     def jumps(self, t: float) -> bool:
         """Whether a motion begins anew at a kink or jump of the loads.
 
-        Beside a body it does not at a kink: the acceleration is continuous, and that of what is left of the residual
-        would be large where the contact is stiff.
+        Beside a body it does not at a kink: the acceleration is continuous, and that of what is
+        left of the residual would be large where the contact is stiff.
         """
-        return not self.averaged or self.ground is not None or self.loads(t, True) != self.loads(t, False)
+        return (
+            not self.averaged
+            or self.ground is not None
+            or self.loads(t, True) != self.loads(t, False)
+        )
 
     def balanced(self, now: Motion) -> Motion:
         """The motion with its imbalance, where that is checked."""
@@ -270,10 +310,14 @@ class Integrator:
     def _chord(self) -> Chord[Vector]:
         """The latest factors, which Broyden's update carries from iterate to iterate."""
         comm = self.system.comm
-        return Chord(self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b)
+        return Chord(
+            self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b
+        )
 
     def _pull(self, now: Motion, dt: float) -> Vector:
-        """The forces of inertia and drag by moving supports in a step, with zeros for unknown amplitudes."""
+        """The forces of inertia and drag by moving supports in a step, with zeros for unknown
+        amplitudes.
+        """
         pull, ground, end = 0.0 * now.u, self.ground, now.t + dt
         if ground:
             m, f = self.rule.alpha_m, self.rule.alpha_f
@@ -289,25 +333,39 @@ class Integrator:
         return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
 
     def _at(self, now: Motion, y: Array, part: float, dt: float) -> dict[str, float]:
-        """Amplitudes at a part of a step; unknown ones and places of supports grow evenly, as displacements do."""
+        """Amplitudes at a part of a step; unknown ones and places of supports grow evenly, as
+        displacements do.
+        """
         mu = self.loads(now.t + part * dt, True)
         ends = self.device.values(y) if self.device else {}
         if self.ground:
             last = self.loads(now.t + dt, True)
             ends |= {name: last[name] for name in self.ground.names & set(mu)}
-        return mu | self._kept(now) | {n: now.mu[n] + part * (end - now.mu[n]) for n, end in ends.items()}
+        return (
+            mu
+            | self._kept(now)
+            | {n: now.mu[n] + part * (end - now.mu[n]) for n, end in ends.items()}
+        )
 
     def _kept(self, now: Motion) -> dict[str, float]:
         """The stiffnesses of contacts, which a motion raises and keeps."""
-        return {name: now.mu[name] for name in self.averaged.settings & set(now.mu)} if self.averaged else {}
+        return (
+            {name: now.mu[name] for name in self.averaged.settings & set(now.mu)}
+            if self.averaged
+            else {}
+        )
 
-    def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
+    def _unbalanced(
+        self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float
+    ) -> Vector:
         rule = self.rule
         m, f = rule.alpha_m, rule.alpha_f
         self._average(now, u, y, dt)
         r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
         for part, weight in rule.forces:
-            r = r + weight * self.system.residual(now.u + part * (u - now.u), self._at(now, y, part, dt))
+            r = r + weight * self.system.residual(
+                now.u + part * (u - now.u), self._at(now, y, part, dt)
+            )
         if self.viscous:
             r = r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt)
         if self.device is None:
@@ -322,7 +380,9 @@ class Integrator:
             self.averaged.along(State(now.u, now.mu), end, 1 - self.rule.alpha_f)
 
     def _rounding(self, now: Motion, u: Vector, y: Array, dt: float) -> float:
-        """The size of a step that rounding of the forces makes, from their change when u is rounded differently."""
+        """The size of a step that rounding of the forces makes, from their change when u is rounded
+        differently.
+        """
         side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
 
         def unbalanced(u: Vector) -> Vector:
@@ -334,7 +394,9 @@ class Integrator:
         return max_abs(self.system.comm, d) / self.system.length
 
     def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
-        """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
+        """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the
+        step.
+        """
         part = 1 - self.rule.alpha_f
         between, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
         self._average(now, u, y, dt)
@@ -345,7 +407,9 @@ class Integrator:
         self.factorisation.habit = at.habit
         rule, part, u, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
         rate = rule.gamma / (rule.beta * dt)
-        tangent = self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
+        tangent = (
+            self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
+        )
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed | Beside) else tangent
         if self._like is None or self._K is None or self._like.handle != K.handle:
@@ -355,12 +419,16 @@ class Integrator:
         self._K.scale(part)
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rate
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        whole: Tangent = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        whole: Tangent = (
+            Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        )
         if isinstance(tangent, Beside):
             whole = Beside(self._K, tangent.D.scaled(part))
         if self.device:
             C, D = self.device.edge(u, mu)
-            self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))
+            self.factorisation.factor(
+                Edged(whole, [part * c for c in C], part * D, self.device.multipliers)
+            )
         else:
             self.factorisation.factor(whole)
         self.factored = at
@@ -370,16 +438,27 @@ class Integrator:
         a, v = self._rates(now, u, dt)
         mu = self._advance(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
         after, mean = Motion(t, u, v, a, mu), dict[str, float]()
-        beside = self.averaged.names | (self.ground.names if self.ground else frozenset()) if self.averaged else ()
+        beside = (
+            self.averaged.names | (self.ground.names if self.ground else frozenset())
+            if self.averaged
+            else ()
+        )
         if self.averaged and (moving := self._driven.intersection(beside)):
             self._average(now, u, y, dt)
             mean = {name: self._mean(name, now, after, y, dt) for name in moving}
             self.averaged.present()
-        potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
+        potentials, moved, w = (
+            self._potentials(after, True),
+            u - now.u,
+            (1 - rule.alpha_f) * v + rule.alpha_f * now.v,
+        )
         work = sum(self._work(name, now, mu, potentials, mean.get(name)) for name in potentials)
         if self.ground and self.drag:
             ends = self.ground.velocity(now.t, False), self.ground.velocity(t, True)
-            along, w = moved + dt / 2 * (ends[0] + ends[1]), w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0]
+            along, w = (
+                moved + dt / 2 * (ends[0] + ends[1]),
+                w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0],
+            )
             lost = self.drag * dot(comm, along, self.ground.times(w))
         else:
             lost = self.drag * dot(comm, moved, self._times(w)) if self.drag else 0.0
@@ -397,9 +476,13 @@ class Integrator:
         error = abs(self.rule.beta - 1 / 6) * dt**2 * change / of
         if self.viscous is None:
             return error
-        if self.viscous.slowness > dt and dt**2 * change > ROUNDING * of:  # errors add up in the motion's own time
+        if (
+            self.viscous.slowness > dt and dt**2 * change > ROUNDING * of
+        ):  # errors add up in the motion's own time
             most = max(max_abs(comm, after.a), change)
-            error *= max(1.0, min(self.viscous.slowness, max_abs(comm, after.v) / max(most, 1e-300)) / dt)
+            error *= max(
+                1.0, min(self.viscous.slowness, max_abs(comm, after.v) / max(most, 1e-300)) / dt
+            )
         doubt = self.viscous.doubt(now.u, after.u, dt)
         if doubt is not None:
             whole = self.device.padded(doubt) if self.device else doubt
@@ -410,16 +493,22 @@ class Integrator:
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
         """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
         mu, still = now.mu, (self.system.coordinates - self._driven) | set(self._kept(now))
-        potentials = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
+        potentials = {
+            name: self.system.potential(now.u, mu, name) for name in mu if name not in still
+        }
         if self.ground:
             a = now.a + self.ground.acceleration(now.t, before)
-            forces = self.ground.times(a + self.drag * (now.v + self.ground.velocity(now.t, before)))
+            forces = self.ground.times(
+                a + self.drag * (now.v + self.ground.velocity(now.t, before))
+            )
             for name in self._driven & self.ground.names:
                 potentials[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
         return potentials
 
     def _mean(self, name: str, now: Motion, after: Motion, y: Array, dt: float) -> float:
-        """The force on what moves beside a contact in a step, as the step has it; of supports with that of inertia."""
+        """The force on what moves beside a contact in a step, as the step has it; of supports with
+        that of inertia.
+        """
         ground, m, f, force = self.ground, self.rule.alpha_m, self.rule.alpha_f, 0.0
         for part, weight in self.rule.forces:
             place = now.u + part * (after.u - now.u), self._at(now, y, part, dt)
@@ -434,9 +523,16 @@ class Integrator:
         return force
 
     def _work(
-        self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float], mean: float | None
+        self,
+        name: str,
+        now: Motion,
+        mu: Mapping[str, float],
+        potentials: Mapping[str, float],
+        mean: float | None,
     ) -> float:
-        """In a step: of a load on its displacement, of a position that moves on what it meets, with its mean force."""
+        """In a step: of a load on its displacement, of a position that moves on what it meets, with
+        its mean force.
+        """
         a, b = now.potentials[name], potentials[name]
         if name in self.system.coordinates:
             return ((a + b) / 2 if mean is None else mean) * (mu[name] - now.mu[name])

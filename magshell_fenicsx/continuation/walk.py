@@ -1,4 +1,6 @@
-"""A walk along a path to its goal, with every instability located and every requested point on the way."""
+"""A walk along a path to its goal, with every instability located and every requested point on the
+way.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,12 +20,20 @@ from magshell_fenicsx.continuation.targets import TargetMissed, arriving, target
 
 MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
 FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
-MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a point between its ends
+MIDDLE = (
+    0.5,
+    0.35,
+    0.65,
+    0.2,
+    0.8,
+)  # places in a bracket, tried in turn, for a point between its ends
 MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
 MOST_SOLVES = 60  # in the search for one instability, with its repetitions in shorter steps
 MOST_REPEATED = 3  # searches in shorter steps, before several instabilities count as a cluster
 PARTED = 1e-4  # in lengths: about a neutral mode rounding moves a state by less
-BESIDE = 0.5  # of the way between two points: what is farther from their cubic lies on another branch
+BESIDE = (
+    0.5  # of the way between two points: what is farther from their cubic lies on another branch
+)
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 MOST_STEPS = 1000
@@ -86,9 +96,14 @@ class Allowance:
 
 
 def instabilities(
-    path: Path, low: Point, high: Point, tolerance: float = LOCATED, allowance: Allowance | None = None
+    path: Path,
+    low: Point,
+    high: Point,
+    tolerance: float = LOCATED,
+    allowance: Allowance | None = None,
 ) -> Iterator[Instability]:
-    """All singular points between two successive points, in order, as far as inertia and tangents reveal them.
+    """All singular points between two successive points, in order, as far as inertia and tangents
+    reveal them.
 
     Parameters
     ----------
@@ -110,7 +125,9 @@ def instabilities(
 
 @dataclass
 class _Search:
-    """A search between two points, the first of which is the base of solves; counts are since the last result."""
+    """A search between two points, the first of which is the base of solves; counts are since the
+    last result.
+    """
 
     path: Path
     base: Point
@@ -129,8 +146,13 @@ class _Search:
         if single and turned:
             fold = self.fold(low, high)
             point = self.spent(fold) if change == 1 else self.finished(fold)
-            before = low.negative_pivots, low.negative_pivots_held  # rounding decides what its own matrix counts
-            yield Instability(replace(point, negative_pivots=before[0], negative_pivots_held=before[1]), "fold")
+            before = (
+                low.negative_pivots,
+                low.negative_pivots_held,
+            )  # rounding decides what its own matrix counts
+            yield Instability(
+                replace(point, negative_pivots=before[0], negative_pivots_held=before[1]), "fold"
+            )
         elif single:
             point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):
@@ -160,7 +182,9 @@ class _Search:
         return "the iteration has left the branch" if self.left(solved, low, high) else solved
 
     def left(self, point: Point, low: Point, high: Point) -> bool:
-        """Whether a point is so far from the cubic between two points that it lies on another branch."""
+        """Whether a point is so far from the cubic between two points that it lies on another
+        branch.
+        """
         if self.base.across:  # no cubic goes around a corner
             return False
         system, guess = self.path.system, self.path.between(point.s, low, high)
@@ -169,7 +193,9 @@ class _Search:
         return off > max(BESIDE * chord, SEEN * system.length)
 
     def middle(self, low: Point, high: Point) -> Point | None:
-        """A point somewhere between two others, with its own inertia; rounding may hide some places."""
+        """A point somewhere between two others, with its own inertia; rounding may hide some
+        places.
+        """
         for part in MIDDLE:
             if self.allowance.spent:
                 return None
@@ -180,7 +206,9 @@ class _Search:
         return None
 
     def crossing(self, low: Point, high: Point) -> Point | None:
-        """The bifurcation between two points, as the solution of a regular system; None if there is no solution."""
+        """The bifurcation between two points, as the solution of a regular system; None if there is
+        no solution.
+        """
         path = self.path
         if path.newton.factorisation.skewed:
             return None  # the regular system needs a symmetric tangent
@@ -198,11 +226,17 @@ class _Search:
             if isinstance(solved, str):
                 continue
             inside = min(low.s, high.s) <= solved.s <= max(low.s, high.s)
-            if inside and pivots[0] <= solved.negative_pivots < pivots[1] and not self.left(solved, low, high):
+            if (
+                inside
+                and pivots[0] <= solved.negative_pivots < pivots[1]
+                and not self.left(solved, low, high)
+            ):
                 return self.spent(solved)
         return None
 
-    def _regular(self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point) -> Point | str:
+    def _regular(
+        self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point
+    ) -> Point | str:
         path = self.path
         try:
             bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress)
@@ -210,9 +244,12 @@ class _Search:
             return "no bifurcation was found"
         self.iterations += bifurcation.iterations
         self.factorisations += bifurcation.factorisations
-        # the null vector and the response span the tangents of both branches; this one continues the path
+        # the null vector and the response span the tangents of both branches; this one continues
+        # the path
         state, along = bifurcation.state, self._slope(bifurcation.state, low, high)
-        direction = projected(path.metric, along, [(bifurcation.phi, 0.0), (-bifurcation.response, 1.0)])
+        direction = projected(
+            path.metric, along, [(bifurcation.phi, 0.0), (-bifurcation.response, 1.0)]
+        )
         point = path.on(state, direction, self.base, bifurcation.unstable)
         return replace(point, error=bifurcation.error, load_error=bifurcation.load_error)
 
@@ -228,10 +265,14 @@ class _Search:
         name = self.path.name
         for _ in range(MOST_TRIALS):
             width = abs(high.state.mu[name] - low.state.mu[name])
-            middle = self.middle(low, high) if width > self.tolerance * abs(low.state.mu[name]) else None
+            middle = (
+                self.middle(low, high) if width > self.tolerance * abs(low.state.mu[name]) else None
+            )
             if middle is None:
                 break
-            low, high = (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+            low, high = (
+                (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+            )
             self.refuse_apart(low, high)
         return replace(self.spent(low), load_error=abs(high.state.mu[name] - low.state.mu[name]))
 
@@ -272,7 +313,8 @@ class _Search:
         return point
 
     def rest(self, point: Point, stability: Stability, slope: float, most: float) -> float:
-        """How far the load is from where the eigenvalue is zero, and what rounding of the tangent hides of that.
+        """How far the load is from where the eigenvalue is zero, and what rounding of the tangent
+        hides of that.
 
         Parameters
         ----------
@@ -282,7 +324,9 @@ class _Search:
             How far it is at most.
         """
         u = point.state.u
-        sides = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], (2, u.size))  # as rounding does
+        sides = np.random.default_rng(self.path.system.comm.rank).choice(
+            [-1.0, 1.0], (2, u.size)
+        )  # as rounding does
         near = [u, *(u + side * np.spacing(u) for side in sides)]
         values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in near]
         return float((abs(values[0]) + SCATTER * np.ptp(values)) / abs(slope)) if slope else most
@@ -290,8 +334,9 @@ class _Search:
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue shows a larger error, it goes on
-        until that is no longer halved. The method's order is 1.44, and close to zero the eigenvalue is only rounding.
+        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue shows a
+        larger error, it goes on until that is no longer halved. The method's order is 1.44, and
+        close to zero the eigenvalue is only rounding.
         """
         name, side, last, best = self.path.name, 0, np.inf, None
         first = critical_mode(stability, low.state)
@@ -305,15 +350,23 @@ class _Search:
             if point is None:  # the path's own tangent is singular there as well
                 break
             mu = point.state.mu[name]
-            moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
+            moved, width = (
+                abs(point.s - last) * abs(point.dmu),
+                abs(high.s - low.s) * abs(point.dmu),
+            )
             if moved <= self.tolerance**0.75 * abs(mu) and a * b < 0:
-                found = replace(point, load_error=self.rest(point, stability, _slope_of(*ends), width))
+                found = replace(
+                    point, load_error=self.rest(point, stability, _slope_of(*ends), width)
+                )
                 stalled = best and found.load_error > best.load_error / 2
                 if stalled or found.load_error <= self.tolerance * abs(mu):
                     return min(best or found, found, key=lambda one: one.load_error)
                 best = found  # the next guess, from the other side, may be nearer
             if width <= self.tolerance * abs(mu) and not best:
-                return replace(point, load_error=max(width, self.rest(point, stability, _slope_of(*ends), width)))
+                return replace(
+                    point,
+                    load_error=max(width, self.rest(point, stability, _slope_of(*ends), width)),
+                )
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue
@@ -329,12 +382,16 @@ class _Search:
 
 
 def _slope_of(low: tuple[float, float], high: tuple[float, float]) -> float:
-    """The slope between two loads with their eigenvalues; zero if these have one sign: they are not of one mode."""
+    """The slope between two loads with their eigenvalues; zero if these have one sign: they are not
+    of one mode.
+    """
     (a, first), (b, last) = low, high
     return (last - first) / (b - a) if first * last < 0 and a != b else 0.0
 
 
-def _stationary(low: Point, high: Point, name: str, find: Callable[[float, float, float], float]) -> float:
+def _stationary(
+    low: Point, high: Point, name: str, find: Callable[[float, float, float], float]
+) -> float:
     """Where the Hermite cubic of mu(s) is stationary between the ends, or where else one finds it."""
     L = high.s - low.s
     return low.s + L * find((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
@@ -359,7 +416,9 @@ def locate_bifurcation(
     """
     search = _Search(path, stable, tolerance)
     try:
-        return search.finished(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+        return search.finished(
+            search.bifurcation(stable, path.seen_from(stable, unstable), stability)
+        )
     except NoEigenpair as e:
         raise PathStopped(f"locating an instability: {e}", stable) from None
 
@@ -396,9 +455,10 @@ class Walk:
     Parameters
     ----------
     renew
-        The state of the first of two successive points with other amplitudes beside that of the path, from which the
-        walk goes on in place of the second; None if that is accepted. It raises `StepTooLong` if it must not be. Where
-        no solution is found with such amplitudes it is asked again, and may accept the second point now.
+        The state of the first of two successive points with other amplitudes beside that of the
+        path, from which the walk goes on in place of the second; None if that is accepted. It
+        raises `StepTooLong` if it must not be. Where no solution is found with such amplitudes it
+        is asked again, and may accept the second point now.
 
     Attributes
     ----------
@@ -413,7 +473,11 @@ class Walk:
     """
 
     def __init__(
-        self, path: Path, start: Point, goal: Goal, renew: Callable[[Point, Point], State | None] | None = None
+        self,
+        path: Path,
+        start: Point,
+        goal: Goal,
+        renew: Callable[[Point, Point], State | None] | None = None,
     ) -> None:
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self.done = False
@@ -427,7 +491,8 @@ class Walk:
         Raises
         ------
         PathStopped
-            If the path is lost, returns to a fold that it has passed, or needs more steps than allowed.
+            If the path is lost, returns to a fold that it has passed, or needs more steps than
+            allowed.
         """
         options, shorter, why = self.path.options, None, ""
         while True:
@@ -440,11 +505,16 @@ class Walk:
                     break
                 if state:
                     try:
-                        self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                        self.points[-1], shorter = (
+                            self.path.renewed(low, state),
+                            abs(point.s - low.s),
+                        )
                         self._allowance.end = None  # it has the amplitudes before
                         break
                     except PathStopped as e:
-                        if self._renew and self._renew(low, point):  # nearer to the first point the change is smaller
+                        if self._renew and self._renew(
+                            low, point
+                        ):  # nearer to the first point the change is smaller
                             shorter, why = abs(point.s - low.s) / 4, str(e)
                             break
                 try:
@@ -461,13 +531,17 @@ class Walk:
                         self.points.append(event)
                         return
                 self.points.append(point)
-                self.done = not self._ahead() or (self.goal.until == "points" and len(self.points) > self.goal.steps)
+                self.done = not self._ahead() or (
+                    self.goal.until == "points" and len(self.points) > self.goal.steps
+                )
                 yield ("target" if reached else "step"), point
                 if len(self.points) > self.goal.steps:
                     if self.goal.until == "points":
                         return
                     raise PathStopped(
-                        f"{self.goal.steps} steps have not reached the {self.goal.until}", point, final=True
+                        f"{self.goal.steps} steps have not reached the {self.goal.until}",
+                        point,
+                        final=True,
                     )
             if shorter is None:
                 return
@@ -492,12 +566,17 @@ class Walk:
             yield from self._steps()
 
     def _refuse_loop(self, fold: Point) -> None:
-        """Stop at a fold that was passed before. Two successive folds may be close, so the last one is not compared."""
+        """Stop at a fold that was passed before.
+
+        Two successive folds may be close, so the last one is not compared.
+        """
         name, u = self.path.name, fold.state.u
         mu = fold.state.mu[name]
         for passed in self._folds[:-1]:
             if self.path.metric.norm(u - passed.state.u, mu - passed.state.mu[name]) < SAME:
-                said = "the path has come back to this fold: a closed loop, which leads nowhere else"
+                said = (
+                    "the path has come back to this fold: a closed loop, which leads nowhere else"
+                )
                 raise PathStopped(said, fold, final=True)
         self._folds.append(fold)
 
@@ -522,7 +601,9 @@ class Walk:
         return arriving(self.path, goal.quantity, goal.targets[-1], s, seen) if ends else s
 
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
-        """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""
+        """Instabilities and, with arc length, targets between two points; the flag marks the end of
+        the walk.
+        """
         events: list[tuple[Label, Point, bool]] = []
         for event in self._located(low, high):
             ends = self.goal.until in ("limit", event.kind)
@@ -535,7 +616,9 @@ class Walk:
             folds = (event for label, event, _ in events if label == "fold" and event.s != low.s)
             for end in (*(self.path.as_base(fold) for fold in folds), high):
                 seen = [*seen[-2:], end]  # a target just below a fold is passed on both sides of it
-                for target, point in targets_between(self.path, self.goal.quantity, targets, self.goal.sense, seen):
+                for target, point in targets_between(
+                    self.path, self.goal.quantity, targets, self.goal.sense, seen
+                ):
                     events.append(("target", point, until and target == targets[-1]))
         return sorted(events, key=lambda item: abs(item[1].s - low.s))
 

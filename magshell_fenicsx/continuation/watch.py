@@ -1,4 +1,6 @@
-"""The unstable modes that a model excludes: their number along a path, and the points where it changes."""
+"""The unstable modes that a model excludes: their number along a path, and the points where it
+changes.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +17,18 @@ from magshell_fenicsx.continuation.point import Finding, PathStopped, Point
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.continuation.walk import locate_bifurcation
 
-MOST_HALVINGS = 12  # of a step in which several modes of a family change; what is left counts as one
-FASTER = 2.0  # the softest mode is assumed to soften at most so many times as fast as between the last two looks
+MOST_HALVINGS = (
+    12  # of a step in which several modes of a family change; what is left counts as one
+)
+# the softest mode is assumed to soften at most so many times as fast as between the last two looks
+FASTER = 2.0
 MOST_PASSED = 4  # the most successive points without a look
 CLOSER = 3  # halvings of a step between whose ends modes may soften and recover
 ITERATIONS = 4  # inverse iterations from the last softest mode
 FIRST = 12  # inverse iterations if there is no such mode
-NEW = 0.1  # part of a general vector in the start vector, so that modes of another symmetry are found
+NEW = (
+    0.1  # part of a general vector in the start vector, so that modes of another symmetry are found
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,9 @@ class Step:
         return None if isinstance(found, str) else found
 
     def crossings(self, change: Change) -> Iterator[tuple[Point, int]]:
-        """Each point at which a mode is neutral, and the change of the number of unstable directions there."""
+        """Each point at which a mode is neutral, and the change of the number of unstable
+        directions there.
+        """
         ends = self._points[0], self._points[-1]
         counts = {id(ends[0]): change.before, id(ends[1]): change.after}
         yield from self._between(*ends, change, counts, MOST_HALVINGS)
@@ -75,7 +84,9 @@ class Step:
         middle = self._middle(low, high, solve=abs(after - before) > 1 and halvings > 0)
         if middle is None:
             base = self._path.as_base(low)
-            crossing = locate_bifurcation(self._path, base, self._path.measured_from(base, high), change.stability)
+            crossing = locate_bifurcation(
+                self._path, base, self._path.measured_from(base, high), change.stability
+            )
             self._kept(crossing)
             yield crossing, after - before
         else:
@@ -83,9 +94,13 @@ class Step:
             yield from self._between(low, middle, change, counts, halvings - 1)
             yield from self._between(middle, high, change, counts, halvings - 1)
 
-    def _middle(self, low: Point, high: Point, *, solve: bool, counted: bool = True) -> Point | None:
+    def _middle(
+        self, low: Point, high: Point, *, solve: bool, counted: bool = True
+    ) -> Point | None:
         """A point between two others: a known one, else a new one if `solve` is set."""
-        first, last = (next(i for i, p in enumerate(self._points) if p is end) for end in (low, high))
+        first, last = (
+            next(i for i, p in enumerate(self._points) if p is end) for end in (low, high)
+        )
         if last - first > 1:
             return self._points[(first + last) // 2]
         if not solve:
@@ -144,7 +159,9 @@ class Excluded(Protocol):
 
 @dataclass(frozen=True)
 class Crossing:
-    """A point where a mode of a family is neutral, and the number of excluded unstable directions there."""
+    """A point where a mode of a family is neutral, and the number of excluded unstable directions
+    there.
+    """
 
     label: str
     point: Point
@@ -162,7 +179,8 @@ class _Look:
     counts
         Numbers of unstable directions of all families.
     softest, vector
-        Magnitude of the eigenvalue nearest to zero of the only family, and its mode; None if there are several.
+        Magnitude of the eigenvalue nearest to zero of the only family, and its mode; None if there
+        are several.
     numbers
         Gives the tangents of several families, see `Tangents`; None if there are none.
     """
@@ -178,17 +196,19 @@ class _Look:
 class Watch:
     """Looks along a path for the unstable directions that a model excludes.
 
-    A look counts the unstable directions at a point. Several families get a look at every accepted point. The tangent
-    of a single family costs as much as the model's. So a point is skipped if the softest mode would not yet be neutral
-    there, even if it softened `FASTER` times as fast per length of the path as between the last two looks. At first no
-    point is skipped, then at most one in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened
-    faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
-    get a look.
+    A look counts the unstable directions at a point. Several families get a look at every accepted
+    point. The tangent of a single family costs as much as the model's. So a point is skipped if the
+    softest mode would not yet be neutral there, even if it softened `FASTER` times as fast per
+    length of the path as between the last two looks. At first no point is skipped, then at most one
+    in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened faster, and to
+    less than a half, or that the number of unstable directions has changed, all skipped points get
+    a look.
 
-    Between two points several families may soften and recover. The tangents of the parabola through the last three
-    looks are means of three matrices (its Bernstein coefficients): those at both ends and one between. If that one is
-    not positive definite for a family that is stable at both ends, the point half way gets a look, and so on. It gets
-    one in the first interval of a path whose first point has one.
+    Between two points several families may soften and recover. The tangents of the parabola through
+    the last three looks are means of three matrices (its Bernstein coefficients): those at both
+    ends and one between. If that one is not positive definite for a family that is stable at both
+    ends, the point half way gets a look, and so on. It gets one in the first interval of a path
+    whose first point has one.
 
     Parameters
     ----------
@@ -198,7 +218,8 @@ class Watch:
     Attributes
     ----------
     unlocated
-        The reason why a change could not be located, for the first such change; "" if there is none.
+        The reason why a change could not be located, for the first such change; "" if there is
+        none.
     """
 
     def __init__(self, excluded: Excluded | None) -> None:
@@ -217,12 +238,18 @@ class Watch:
         return sum(self._looked.counts) if self._looked else 0
 
     def begin(
-        self, path: Path, start: Point, expand: Callable[[State], State] = lambda state: state, *, look: bool = False
+        self,
+        path: Path,
+        start: Point,
+        expand: Callable[[State], State] = lambda state: state,
+        *,
+        look: bool = False,
     ) -> None:
         """Begin to watch a path at its first point.
 
-        If that is not the last point of the path before, it gets a look only if the second point is unstable. If it is
-        unstable too, `pass_to` returns it as a crossing of each family whose number is not that of the last look.
+        If that is not the last point of the path before, it gets a look only if the second point is
+        unstable. If it is unstable too, `pass_to` returns it as a crossing of each family whose
+        number is not that of the last look.
 
         Parameters
         ----------
@@ -233,7 +260,13 @@ class Watch:
         """
         self._before = self._looked.counts if self._looked else (0,) * len(self._families)
         looked = self._looked if start.state.u is self._u and not self._passed else None
-        self._path, self._expand, self._last, self._u, self._along = path, expand, start, start.state.u, 0.0
+        self._path, self._expand, self._last, self._u, self._along = (
+            path,
+            expand,
+            start,
+            start.state.u,
+            0.0,
+        )
         self._rate: float | None = None
         self._may_pass, self._passed, self._earlier = 0, [], None
         self._looked = replace(looked, point=start, along=0.0) if looked else None
@@ -276,7 +309,9 @@ class Watch:
 
     @property
     def _at_least(self) -> float:
-        """The least eigenvalue that the softest mode may have at the last point; -inf without a rate."""
+        """The least eigenvalue that the softest mode may have at the last point; -inf without a
+        rate.
+        """
         if self._looked is None or self._rate is None:
             return -np.inf
         return self._looked.softest - FASTER * self._rate * (self._along - self._looked.along)
@@ -306,8 +341,12 @@ class Watch:
             earlier = every[-2]
         return every
 
-    def _closer(self, other: _Look | None, low: _Look, high: _Look, halvings: int) -> Iterator[_Look]:
-        """Looks between two, from a third one before or after these; without one the middle is looked at."""
+    def _closer(
+        self, other: _Look | None, low: _Look, high: _Look, halvings: int
+    ) -> Iterator[_Look]:
+        """Looks between two, from a third one before or after these; without one the middle is
+        looked at.
+        """
         if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
             return
         step = Step(self._path, low.point, high.point)
@@ -331,17 +370,24 @@ class Watch:
         return self._look(point, low.along + (high.along - low.along) * part / (part + rest))
 
     def _may_recover(self, other: _Look | None, low: _Look, high: _Look) -> bool:
-        """Whether a family that is stable at both ends of a step may be unstable in it, by a parabola."""
+        """Whether a family that is stable at both ends of a step may be unstable in it, by a
+        parabola.
+        """
         tangents = self._excluded.tangents if self._excluded else None
         if not tangents or low.numbers is None or high.numbers is None or high.along == low.along:
             return False
         if other is None or other.numbers is None or other.along in (low.along, high.along):
             return True
-        at, numbers = (other.along, low.along, high.along), (other.numbers, low.numbers, high.numbers)
+        at, numbers = (
+            (other.along, low.along, high.along),
+            (other.numbers, low.numbers, high.numbers),
+        )
 
         def find() -> Finding:
             indefinite = tangents.indefinite(_between_looks(at, [each() for each in numbers]))
-            return Finding({"recovers": any(not low.counts[i] and not high.counts[i] for i in indefinite)})
+            return Finding(
+                {"recovers": any(not low.counts[i] and not high.counts[i] for i in indefinite)}
+            )
 
         return bool(self._path.noted(find).values["recovers"])
 
@@ -353,11 +399,16 @@ class Watch:
 
     def _between(self, low: _Look, high: _Look) -> list[Crossing]:
         """The crossings between two points, in the order of the path."""
-        step, located = Step(self._path, low.point, high.point), list[tuple[float, str, Point, int]]()
+        step, located = (
+            Step(self._path, low.point, high.point),
+            list[tuple[float, str, Point, int]](),
+        )
         for family, before, after in zip(self._families, low.counts, high.counts, strict=False):
             change = Change(_Expanded(family, self._expand), before, after)
             try:
-                located += [(step.place(p), family.label, p, rise) for p, rise in step.crossings(change)]
+                located += [
+                    (step.place(p), family.label, p, rise) for p, rise in step.crossings(change)
+                ]
             except PathStopped as e:
                 self.unlocated = self.unlocated or str(e)
         crossings, unstable = list[Crossing](), sum(low.counts)
@@ -369,7 +420,11 @@ class Watch:
     def _look(self, point: Point, along: float) -> _Look:
         if self._excluded is None:
             return _Look(point, along, ())
-        excluded, tangents, state = self._excluded, self._excluded.tangents, self._expand(point.state)
+        excluded, tangents, state = (
+            self._excluded,
+            self._excluded.tangents,
+            self._expand(point.state),
+        )
         numbers = cache(partial(tangents.numbers, state)) if tangents else None
         near = self._looked.vector if self._looked else None
 
@@ -383,7 +438,14 @@ class Watch:
             return Finding({"counts": [factors.negative_pivots], "softest": softest}, vector)
 
         found = self._path.noted(find)
-        return _Look(point, along, tuple(found.values["counts"]), found.values["softest"], found.vector, numbers)
+        return _Look(
+            point,
+            along,
+            tuple(found.values["counts"]),
+            found.values["softest"],
+            found.vector,
+            numbers,
+        )
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,9 @@ Value = float | int | str
 class DistributionSection(Section):
     """A random number, or a word chosen at random.
 
-    normal and lognormal: mean and deviation are those of the number itself, before bounds cut the distribution off.
-    uniform: between above and below. choice: one of values. In place of the section a number is that number always.
+    normal and lognormal: mean and deviation are those of the number itself, before bounds cut the
+    distribution off. uniform: between above and below. choice: one of values. In place of the
+    section a number is that number always.
     """
 
     kind: Literal["normal", "lognormal", "uniform", "choice"]
@@ -60,13 +61,17 @@ class DistributionSection(Section):
         if low >= high:
             raise ValueError(f"above must be less than below, here {low:g} and {high:g}")
         if self.kind == "lognormal" and not self._mean > 0:
-            raise ValueError(f"a lognormal number is positive: its mean must be too, here {self._mean:g}")
+            raise ValueError(
+                f"a lognormal number is positive: its mean must be too, here {self._mean:g}"
+            )
         if self.kind in ("normal", "lognormal") and np.diff(self._probabilities)[0] < LEAST_PART:
             raise ValueError(
                 f"almost no number lies between above and below, here {low:g} and {high:g}: choose bounds closer to "
                 f"the mean, {self._mean:g}"
             )
-        if self.weights is not None and (len(self.weights) != len(self.values or []) or not sum(self.weights)):
+        if self.weights is not None and (
+            len(self.weights) != len(self.values or []) or not sum(self.weights)
+        ):
             raise ValueError("weights: one for each of the values, not all zero")
         return self
 
@@ -88,7 +93,9 @@ class DistributionSection(Section):
         centre, width = self._normal
         inner = min(max(first + part * (last - first), nextafter(0, 1)), nextafter(1, 0))
         x = NormalDist(centre, width).inv_cdf(inner)
-        return self._with_unit(float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high)))
+        return self._with_unit(
+            float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high))
+        )
 
     @property
     def _mean(self) -> float:
@@ -130,7 +137,8 @@ def _certain(value: Any) -> Any:
 
 
 Distribution = Annotated[
-    DistributionSection, BeforeValidator(_certain, json_schema_input_type=float | DistributionSection)
+    DistributionSection,
+    BeforeValidator(_certain, json_schema_input_type=float | DistributionSection),
 ]
 
 
@@ -142,7 +150,9 @@ class NoRoom(ValueError):
     """The places do not fit at their least distance; the message has the numbers."""
 
 
-def random_places(rng: np.random.Generator, count: int, polar: tuple[float, float], distance: float) -> Array:
+def random_places(
+    rng: np.random.Generator, count: int, polar: tuple[float, float], distance: float
+) -> Array:
     """Polar angles and azimuths (count, 2) in degrees, uniform in area between two polar angles.
 
     A place at less than `distance` from an earlier one is drawn again (random sequential addition).
@@ -164,16 +174,22 @@ def random_places(rng: np.random.Generator, count: int, polar: tuple[float, floa
         for _ in range(count):
             for _ in range(MOST_TRIES):
                 z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
-                new = np.array([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z])
+                new = np.array(
+                    [np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z]
+                )
                 if (places @ new <= least).all():
                     places = np.vstack([places, new])
                     break
             else:
                 break
         if len(places) == count:
-            angles = np.degrees([np.arccos(places[:, 2]), np.arctan2(places[:, 1], places[:, 0]) % (2 * pi)])
+            angles = np.degrees(
+                [np.arccos(places[:, 2]), np.arctan2(places[:, 1], places[:, 0]) % (2 * pi)]
+            )
             return np.asarray(angles.T)
-    raise NoRoom(f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or closer ones")
+    raise NoRoom(
+        f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or closer ones"
+    )
 
 
 def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> None:
@@ -198,7 +214,9 @@ Angle = Annotated[float, Field(ge=0, le=180)]
 
 
 class DefectsSection(Section):
-    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in area."""
+    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in
+    area.
+    """
 
     kind: Literal["gaussian", "dimple"] = "gaussian"
     """The kind of all of them, as in `shell.imperfections`"""
@@ -216,9 +234,15 @@ class DefectsSection(Section):
     @model_validator(mode="after")
     def _there_is_room(self) -> Self:
         if self.polar[0] >= self.polar[1]:
-            raise ValueError(f"polar: the first angle must be less than the second, here {self.polar}")
+            raise ValueError(
+                f"polar: the first angle must be less than the second, here {self.polar}"
+            )
         numbers = [self.count.at(part) for part in np.linspace(0, 1 - 1e-9, 101)]
-        if any(not float(n).is_integer() or not 0 <= float(n) <= 500 for n in numbers if not isinstance(n, str)):
+        if any(
+            not float(n).is_integer() or not 0 <= float(n) <= 500
+            for n in numbers
+            if not isinstance(n, str)
+        ):
             raise ValueError("count: must be whole numbers from 0 to 500")
         refuse_no_room(max(int(n) for n in numbers), (self.polar[0], self.polar[1]), self.distance)
         return self
@@ -246,4 +270,6 @@ class DefectsSection(Section):
 
 def generator(seed: int, number: int, name: str) -> np.random.Generator:
     """The random numbers of a sample for one name."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, zlib.crc32(name.encode()))))
+    return np.random.default_rng(
+        np.random.SeedSequence(seed, spawn_key=(number, zlib.crc32(name.encode())))
+    )

@@ -1,8 +1,9 @@
 """All values that a formula has in a box: interval arithmetic, with first derivatives.
 
-Values at places show a formula only there. The arithmetic of intervals shows that it has no others between them, or
-that it may have, however narrow a step or a Gaussian is. After each operation the range is also the value in
-the middle of the box and what the derivatives can add to it, so that it shrinks with the square of the box.
+Values at places show a formula only there. The arithmetic of intervals shows that it has no others
+between them, or that it may have, however narrow a step or a Gaussian is. After each operation the
+range is also the value in the middle of the box and what the derivatives can add to it, so that it
+shrinks with the square of the box.
 """
 
 from collections.abc import Callable
@@ -53,7 +54,9 @@ class Range:
     def hull(self, *values: Any) -> "Range":
         return Range.of(reduce(np.minimum, values), reduce(np.maximum, values))
 
-    def unless(self, which: NDArray[np.bool_], low: float = -np.inf, high: float = np.inf) -> "Range":
+    def unless(
+        self, which: NDArray[np.bool_], low: float = -np.inf, high: float = np.inf
+    ) -> "Range":
         """With others where `which` holds."""
         return Range(np.where(which, low, self.low), np.where(which, high, self.high))
 
@@ -86,7 +89,9 @@ def _divide(a: Range, b: Range) -> Range:
 
 def _power(a: Range, p: Range) -> Range:
     if p.low.ndim or p.low != p.high:
-        return _exp(_multiply(p, _log(a)))  # NumPy has no real power of a negative number with a broken exponent
+        return _exp(
+            _multiply(p, _log(a))
+        )  # NumPy has no real power of a negative number with a broken exponent
     n = float(p.low)
     if n != int(n) or abs(n) > 1e9:
         return _power_positive(Range(np.maximum(a.low, 0.0), a.high), n)
@@ -102,7 +107,11 @@ def _power(a: Range, p: Range) -> Range:
 def _power_positive(a: Range, n: float) -> Range:
     if n == 2:
         return a.hull(np.square(a.low), np.square(a.high))
-    return a.hull(np.power(a.low, n), np.power(a.high, n)) if n >= 0 else _inverse(_power_positive(a, -n))
+    return (
+        a.hull(np.power(a.low, n), np.power(a.high, n))
+        if n >= 0
+        else _inverse(_power_positive(a, -n))
+    )
 
 
 def _absolute(a: Range) -> Range:
@@ -118,7 +127,10 @@ def _sin(a: Range) -> Range:
         passed = np.floor((a.high - peak) / turns) > np.floor((a.low - peak) / turns)
         return np.asarray(passed | ~np.isfinite(a.size))
 
-    low, high = np.where(passes(-np.pi / 2), -1.0, ends.low), np.where(passes(np.pi / 2), 1.0, ends.high)
+    low, high = (
+        np.where(passes(-np.pi / 2), -1.0, ends.low),
+        np.where(passes(np.pi / 2), 1.0, ends.high),
+    )
     return Range(low, high)
 
 
@@ -127,7 +139,9 @@ def _cos(a: Range) -> Range:
 
 
 def _tan(a: Range) -> Range:
-    pole: NDArray[np.bool_] = np.floor((a.high - np.pi / 2) / np.pi) > np.floor((a.low - np.pi / 2) / np.pi)
+    pole: NDArray[np.bool_] = np.floor((a.high - np.pi / 2) / np.pi) > np.floor(
+        (a.low - np.pi / 2) / np.pi
+    )
     return a.monotone(np.tan).unless(pole | ~np.isfinite(a.size))
 
 
@@ -183,7 +197,10 @@ VALUES: dict[np.ufunc, Callable[..., Range]] = {
 
 def _power_slopes(a: Range, p: Range) -> list[Range]:
     by_base = _multiply(p, _power(a, Range(p.low - 1, p.high - 1)))
-    return [by_base, _multiply(_power(a, p), _log(a)) if p.low.ndim else Range.number(0.0)]  # the power is a number
+    return [
+        by_base,
+        _multiply(_power(a, p), _log(a)) if p.low.ndim else Range.number(0.0),
+    ]  # the power is a number
 
 
 def _angle_slopes(y: Range, x: Range) -> list[Range]:
@@ -247,7 +264,9 @@ class Enclosed(NDArrayOperatorsMixin):
         slopes = [none] * 3
         for a, by in zip(arguments, partial, strict=True):
             if isinstance(a, Enclosed):
-                slopes = [_add(one, _multiply(by, own)) for one, own in zip(slopes, a.slopes, strict=True)]
+                slopes = [
+                    _add(one, _multiply(by, own)) for one, own in zip(slopes, a.slopes, strict=True)
+                ]
         middle = ufunc(*(a.middle if isinstance(a, Enclosed) else a for a in arguments))
         most = np.zeros_like(self.middle)
         for slope, half in zip(slopes, self.halves, strict=True):

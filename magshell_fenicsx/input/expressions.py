@@ -54,13 +54,17 @@ class Taylor(NDArrayOperatorsMixin):
         for (i, j), partial in second.items():
             if i in varying and j in varying:
                 product = arguments[i].gradient[:, None] * arguments[j].gradient
-                hessian = hessian + partial * (product if i == j else product + product.swapaxes(0, 1))
+                hessian = hessian + partial * (
+                    product if i == j else product + product.swapaxes(0, 1)
+                )
         return Taylor(ufunc(*values), gradient, hessian)
 
 
 def _power(x: Any, p: Any) -> Partials:
     def term(factor: Any, exponent: Any) -> Any:
-        return np.where(factor == 0, 0.0, factor * np.power(x, exponent))  # not 0/0, of x**1 at 0 for instance
+        return np.where(
+            factor == 0, 0.0, factor * np.power(x, exponent)
+        )  # not 0/0, of x**1 at 0 for instance
 
     value, log = np.power(x, p), np.log(x)
     mixed = np.power(x, p - 1) * (1 + p * log)
@@ -102,7 +106,10 @@ PARTIALS: dict[np.ufunc, Callable[..., Partials]] = {
 }
 
 
-FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "arctan2")}
+FUNCTIONS = {
+    name: getattr(np, name)
+    for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "arctan2")
+}
 NAMES = ("x", "y", "z", "pi")
 _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -113,9 +120,16 @@ _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
-_ALLOWED = (*(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant), *_OPERATORS)
-_Step = tuple[Callable[..., Any], int] | np.float64 | str  # of a stack: a function of some values, a number, a name
-_Operation = tuple[Callable[..., Any], tuple[int, ...], tuple[int, ...]]  # of which values, and which are then not used
+_ALLOWED = (
+    *(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant),
+    *_OPERATORS,
+)
+_Step = (
+    tuple[Callable[..., Any], int] | np.float64 | str
+)  # of a stack: a function of some values, a number, a name
+_Operation = tuple[
+    Callable[..., Any], tuple[int, ...], tuple[int, ...]
+]  # of which values, and which are then not used
 _Program = list[_Operation | np.float64 | str]
 
 
@@ -126,10 +140,13 @@ class Read:
     steps: _Program
 
     def __call__(self, x: Array, y: Array, z: Array) -> Array:
-        return np.broadcast_to(np.asarray(_evaluate(self.steps, x, y, z), dtype=np.float64), x.shape)
+        return np.broadcast_to(
+            np.asarray(_evaluate(self.steps, x, y, z), dtype=np.float64), x.shape
+        )
 
     def bounds(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
-        """In boxes between corners (n, 3) a least and a largest value, and by how much f's derivatives differ (n,).
+        """In boxes between corners (n, 3) a least and a largest value, and by how much f's
+        derivatives differ (n,).
 
         The latter times the sides, summed.
         """
@@ -137,13 +154,19 @@ class Read:
         if not isinstance(enclosed, Enclosed):
             return np.full(n, enclosed), np.full(n, enclosed), np.zeros(n)
         sides, widths = 2 * enclosed.halves, (slope.high - slope.low for slope in enclosed.slopes)
-        bent = sum(np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True))
-        return (*np.broadcast_arrays(enclosed.values.low, enclosed.values.high), np.broadcast_to(bent, n))  # type: ignore[return-value]
+        bent = sum(
+            np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True)
+        )
+        return (
+            *np.broadcast_arrays(enclosed.values.low, enclosed.values.high),
+            np.broadcast_to(bent, n),
+        )  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class Together:
-    """Formulas of places in another frame and unit of length, for what they may have between places.
+    """Formulas of places in another frame and unit of length, for what they may have between
+    places.
 
     Attributes
     ----------
@@ -169,7 +192,9 @@ class Together:
         return tuple(np.stack(each, axis=-1) for each in zip(*of_formulas, strict=True))
 
 
-def together(functions: Sequence[object], frame: Array | None = None, length: float = 1.0) -> Together | None:
+def together(
+    functions: Sequence[object], frame: Array | None = None, length: float = 1.0
+) -> Together | None:
     """Those of some functions that are formulas; None without."""
     readable = [f for f in functions if isinstance(f, Read)]
     return Together(readable, frame, length) if readable else None
@@ -222,7 +247,9 @@ def _read(text: str) -> _Program:
         tree = ast.parse(text, mode="eval")
         nodes = list(ast.walk(tree))
     except (RecursionError, MemoryError):
-        raise ValueError(f"{said!r} is too long: allowed are some thousand terms in a row") from None
+        raise ValueError(
+            f"{said!r} is too long: allowed are some thousand terms in a row"
+        ) from None
     except (SyntaxError, ValueError) as e:
         if "nested parentheses" in str(e):
             raise ValueError(f"{said!r}: allowed are 200 brackets within each other") from None
@@ -236,9 +263,13 @@ def _read(text: str) -> _Program:
             allowed = node.id in (FUNCTIONS if id(node) in called else NAMES)
         if isinstance(node, ast.Call):
             name = node.func.id if isinstance(node.func, ast.Name) else ""
-            allowed = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
+            allowed = (
+                name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
+            )
         if not allowed:
-            raise ValueError(f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}")
+            raise ValueError(
+                f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}"
+            )
     return _once(_steps(tree))
 
 
@@ -249,14 +280,23 @@ def _once(steps: list[_Step]) -> _Program:
     for step in steps:
         of = tuple(stack[-step[1] :]) if isinstance(step, tuple) else ()
         stack = stack[: len(stack) - len(of)]
-        key = (step[0], of) if isinstance(step, tuple) else step if isinstance(step, str) else step.hex()
+        key = (
+            (step[0], of)
+            if isinstance(step, tuple)
+            else step
+            if isinstance(step, str)
+            else step.hex()
+        )
         if key not in numbers:  # 0.0 and -0.0 are not the same
             numbers[key] = len(made)
             made.append(step)
             operands.append(of)
         stack.append(numbers[key])
     last = {value: i for i, of in enumerate(operands) for value in of}
-    no_more = [tuple(value for value in dict.fromkeys(of) if last[value] == i) for i, of in enumerate(operands)]
+    no_more = [
+        tuple(value for value in dict.fromkeys(of) if last[value] == i)
+        for i, of in enumerate(operands)
+    ]
     each = zip(made, operands, no_more, strict=True)
     return [(step[0], of, then) if isinstance(step, tuple) else step for step, of, then in each]
 
@@ -299,7 +339,8 @@ def is_formula(text: str) -> bool:
 
 
 def _steps(tree: ast.Expression) -> list[_Step]:
-    """What a stack does in turn: a sum of thousand terms is as many levels deep, too deep for recursion.
+    """What a stack does in turn: a sum of thousand terms is as many levels deep, too deep for
+    recursion.
 
     Numbers are NumPy's: these neither grow without end, as 9**9**9 does, nor turn complex.
     """
@@ -328,7 +369,9 @@ def _steps(tree: ast.Expression) -> list[_Step]:
 
 @dataclass(frozen=True)
 class ByFormula:
-    """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of their own."""
+    """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of
+    their own.
+    """
 
     by_formula: ClassVar[bool] = True
     of_position: Sequence[Callable[[Array, Array, Array], Array]]
@@ -371,14 +414,18 @@ def function(value: float | str) -> Callable[[Array, Array, Array], Array]:
 
 @dataclass(frozen=True)
 class FormulasInSpace:
-    """Three formulas of the deformed place as a `FieldInSpace`, in a frame whose axes are the rows of `axes`."""
+    """Three formulas of the deformed place as a `FieldInSpace`, in a frame whose axes are the rows
+    of `axes`.
+    """
 
     components: list[Callable[[Array], Taylor]]
     axes: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         parts, Q = [component(x @ self.axes) for component in self.components], self.axes
-        B, G, H = (np.stack([getattr(f, d) for f in parts]) for d in ("value", "gradient", "hessian"))
+        B, G, H = (
+            np.stack([getattr(f, d) for f in parts]) for d in ("value", "gradient", "hessian")
+        )
         return (
             np.einsum("ai,in->na", Q, B),
             np.einsum("ai,bj,ijn->nab", Q, Q, G, optimize=True),

@@ -1,4 +1,5 @@
-"""What the user reads when a case is wrong: file, line, key, value, what is allowed; and what a key means.
+"""What the user reads when a case is wrong: file, line, key, value, what is allowed; and what a key
+means.
 
 Python does not keep the docstrings of keys: they are read in the source when somebody asks.
 """
@@ -17,7 +18,12 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
-NO_KEYS = ("a word", "a gas", "a pair", "a pair with keys")  # tags of a union that has no sections to choose from
+NO_KEYS = (
+    "a word",
+    "a gas",
+    "a pair",
+    "a pair with keys",
+)  # tags of a union that has no sections to choose from
 NO_CONTAINER = ("list_type", "dict_type")
 LIKE_A_NAME = "[A-Za-z]"  # what patterns of names contain, others are of text with a unit
 
@@ -27,19 +33,27 @@ def meaning(section: type[BaseModel], key: str) -> str:
     field = section.model_fields.get(key)
     if field is not None and field.description:
         return field.description
-    return next((docstring for base in section.__mro__ if (docstring := _docstrings(base).get(key))), "")
+    return next(
+        (docstring for base in section.__mro__ if (docstring := _docstrings(base).get(key))), ""
+    )
 
 
 @cache
 def _docstrings(section: type) -> dict[str, str]:
     """Key -> docstring of a class's own keys."""
-    own = _classes(section.__module__).get(section.__qualname__) if issubclass(section, BaseModel) else None
+    own = (
+        _classes(section.__module__).get(section.__qualname__)
+        if issubclass(section, BaseModel)
+        else None
+    )
     pairs = zip(own.body, own.body[1:], strict=False) if own else ()
     return {
         key.target.id: inspect.cleandoc(text.value.value)
         for key, text in pairs
         if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name)
-        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+        if isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
     }
 
 
@@ -84,17 +98,23 @@ class InvalidCase(CaseError):
 def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
     """One line for each mistake.
 
-    Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts as one, and what is
-    neither as a value.
+    Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts
+    as one, and what is neither as a value.
     """
     placed = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
     places = [location for location, _ in placed]
 
     def beside(location: Location, kind: str) -> bool:
-        within = any(len(other) > len(location) and other[: len(location)] == location for other in places)
+        within = any(
+            len(other) > len(location) and other[: len(location)] == location for other in places
+        )
         return within or (kind in NO_CONTAINER and places.count(location) > 1)
 
-    told = [explain(error, location, source, case) for location, error in placed if not beside(location, error["type"])]
+    told = [
+        explain(error, location, source, case)
+        for location, error in placed
+        if not beside(location, error["type"])
+    ]
     return "\n".join(dict.fromkeys(told))
 
 
@@ -102,13 +122,24 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     """One line for one of pydantic's errors, at the location of its key."""
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    said = re.sub(r"^\w+ should have (at \w+ \d+) items? after validation, not", r"must have \1 items, not", said)
+    said = re.sub(
+        r"^\w+ should have (at \w+ \d+) items? after validation, not",
+        r"must have \1 items, not",
+        said,
+    )
     if kind == "string_pattern_mismatch":
         name = LIKE_A_NAME in error["ctx"]["pattern"]
-        said = "must be a letter, then letters, digits and _" if name else "must be a number with a unit"
+        said = (
+            "must be a letter, then letters, digits and _"
+            if name
+            else "must be a number with a unit"
+        )
     if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
         keys = about[1].split(".")
-        location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
+        location, said = (
+            tuple(int(key) if key.isdecimal() else key for key in keys),
+            said[about.end() :],
+        )
     place, key = source.place(location), dotted(location) or "case"
     if kind == "list_type":
         said = "must be a list, in brackets"
@@ -134,7 +165,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
     written = _at(source.data, location, str) if isinstance(value, float) else ""
-    text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # its limits are those of the number
+    text = (
+        f"{shown(written)} is {value:.6g}" if written else shown(value)
+    )  # its limits are those of the number
     return f"{place}: {key}: {text}: {said}{meaning}"
 
 
@@ -151,7 +184,9 @@ def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:
     return f"unknown {what}; {hint}allowed here: {', '.join(sorted(allowed))}"
 
 
-def refuse_unknown(keys: Iterable[str], section: type[BaseModel], place: str, others: Iterable[str] = ()) -> None:
+def refuse_unknown(
+    keys: Iterable[str], section: type[BaseModel], place: str, others: Iterable[str] = ()
+) -> None:
     """See that keys are those of a section, or others that stand there too.
 
     Raises
@@ -180,7 +215,12 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
         if key in NO_KEYS:
             continue
         known = models[0].model_fields if len(models) == 1 else ()
-        if len(models) < 2 and not named and isinstance(key, str) and key not in {*known, *_at(data, kept, dict)}:
+        if (
+            len(models) < 2
+            and not named
+            and isinstance(key, str)
+            and key not in {*known, *_at(data, kept, dict)}
+        ):
             continue  # of a union of values, or of a section and a list of it
         if named:
             kept.append(key)
@@ -200,7 +240,9 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
 def _at(data: Any, location: Sequence[str | int], kind: type) -> Any:
     """The part of plain data at a location; an empty one if it is of another kind."""
     for key in location:
-        fits = isinstance(data, dict) or (isinstance(data, list) and isinstance(key, int) and key < len(data))
+        fits = isinstance(data, dict) or (
+            isinstance(data, list) and isinstance(key, int) and key < len(data)
+        )
         data = data.get(key) if isinstance(data, dict) else data[key] if fits else None
     return data if isinstance(data, kind) else kind()
 
@@ -214,7 +256,10 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     """The first words on a key, in brackets, with its unit."""
     section, field = _found(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
-    words, unit = re.split(r"[;:.,] | \[", description)[0], re.search(r"\[([^\[\]]+)\]$", description)
+    words, unit = (
+        re.split(r"[;:.,] | \[", description)[0],
+        re.search(r"\[([^\[\]]+)\]$", description),
+    )
     return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
 
 
@@ -237,7 +282,9 @@ def _parts(annotation: Any) -> Iterator[Any]:
         yield from _parts(part)
 
 
-def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
+def _found(
+    location: Location, data: Any, case: type[BaseModel]
+) -> tuple[type[BaseModel], FieldInfo | None]:
     """The innermost section at a location; and the last key, if it is one of a section."""
     model, field, models, named = case, None, list[type[BaseModel]](), False
     for key in location:
@@ -258,7 +305,11 @@ def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[B
 
 def _has_names(field: FieldInfo | None) -> bool:
     """Whether the keys below a key are names that the user gives to sections."""
-    return field is not None and get_origin(field.annotation) is dict and bool(_models(field.annotation))
+    return (
+        field is not None
+        and get_origin(field.annotation) is dict
+        and bool(_models(field.annotation))
+    )
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
@@ -270,7 +321,9 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 def _tag_key(models: list[type[BaseModel]]) -> str:
     """The key that selects one of several section classes; empty without one."""
-    return next((key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), "")
+    return next(
+        (key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), ""
+    )
 
 
 def _tags(model: type[BaseModel]) -> list[str]:

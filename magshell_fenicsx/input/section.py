@@ -1,7 +1,8 @@
-"""The base of all sections of a case: strict types, no unknown keys, numbers with units, files, a choice of sections.
+"""The base of all sections of a case: strict types, no unknown keys, numbers with units, files, a
+choice of sections.
 
-Of sections that are chosen by a key, only the validators of chosen ones are built: a case has few of many. Targets with
-units become numbers over the sizes of their case at the door.
+Of sections that are chosen by a key, only the validators of chosen ones are built: a case has few
+of many. Targets with units become numbers over the sizes of their case at the door.
 """
 
 import re
@@ -56,14 +57,19 @@ def _units() -> "pint.UnitRegistry":
 class Section(BaseModel):
     """A section of the case file.
 
-    The docstring of a key appears in docs/case.md and in the schema; its unit is in brackets at the end. See `meaning`.
-    A section that is a default is made by `model_construct`: a validator built at import would serve no case.
+    The docstring of a key appears in docs/case.md and in the schema; its unit is in brackets at the
+    end. See `meaning`. A section that is a default is made by `model_construct`: a validator built
+    at import would serve no case.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True
+    )
 
     def __setstate__(self, state: dict[Any, Any]) -> None:
-        """Of another rank, where its class may not have been needed yet: without its schema it could not be written."""
+        """Of another rank, where its class may not have been needed yet: without its schema it
+        could not be written.
+        """
         super().__setstate__(state)
         if not type(self).__pydantic_complete__:
             type(self).model_rebuild()
@@ -100,7 +106,8 @@ def _converted(value: str, unit: str) -> float:
 
 
 def number_and_unit(text: str) -> tuple[str, str]:
-    """The number and the unit of a text, which is empty for a bare number; both are empty for a word.
+    """The number and the unit of a text, which is empty for a bare number; both are empty for a
+    word.
 
     Examples
     --------
@@ -162,7 +169,9 @@ class WithUnit(BeforeValidator):
 
 
 def or_number(unit: str, number: Any = float) -> WithUnit:
-    """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the schema."""
+    """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the
+    schema.
+    """
     return WithUnit(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
 
 
@@ -201,15 +210,21 @@ def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
 
 @dataclass(frozen=True)
 class OrOfProgram:
-    """In the annotation of a union: one of its members is what a program gives and no file has, with a `digest`."""
+    """In the annotation of a union: one of its members is what a program gives and no file has,
+    with a `digest`.
+    """
 
     kind: Any
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         others = reduce(or_, (part for part in get_args(source) if part is not self.kind))
         told = core_schema.wrap_serializer_function_ser_schema(self._told)
         written = handler.generate_schema(others)
-        return core_schema.no_info_wrap_validator_function(self._validated, written, serialization=told)
+        return core_schema.no_info_wrap_validator_function(
+            self._validated, written, serialization=told
+        )
 
     def _validated(self, value: Any, validate: Callable[[Any], Any]) -> Any:
         return value if isinstance(value, self.kind) else validate(value)
@@ -242,7 +257,8 @@ Pressure = Annotated[float, _quantity("pascal")]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Lengths = Annotated[
-    list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)
+    list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]],
+    Field(min_length=3, max_length=3),
 ]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 FluxDensity = Annotated[float, _quantity("tesla")]
@@ -255,7 +271,9 @@ def _points_somewhere(v: list[float]) -> list[float]:
     return v
 
 
-Along = Annotated[Vector, AfterValidator(_points_somewhere)]  # a direction, by a vector of any length
+Along = Annotated[
+    Vector, AfterValidator(_points_somewhere)
+]  # a direction, by a vector of any length
 
 
 class AboutAxis(Section):
@@ -284,16 +302,22 @@ class Direction(Section):
     def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
         """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
         polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
-        return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+        return np.array(
+            [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+        )
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """In an annotation: which key chooses; each section has the values that choose it as the key's `Literal`."""
+    """In an annotation: which key chooses; each section has the values that choose it as the key's
+    `Literal`.
+    """
 
     by: str
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         choices = {
             tag: handler.generate_schema(Annotated[section, Later(section)])
             for section in get_args(source)
@@ -308,13 +332,17 @@ class Later:
 
     section: type[BaseModel]
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         return core_schema.with_info_plain_validator_function(self._validated)
 
     def _validated(self, value: Any, info: ValidationInfo) -> BaseModel:
         return self.section.model_validate(value, context=info.context)
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         self.section.model_rebuild()
         return handler(self.section.__pydantic_core_schema__)
 
@@ -360,10 +388,14 @@ class FileKeys(Section):
 
 def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
     """Hashes of the files that sections read, by the keys of the files."""
-    return {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
+    return {
+        f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file
+    }
 
 
-Rubberlike: TypeAlias = float | tuple[tuple[float, ...], tuple[float, ...]]  # see `parts.rubber.LawKeys.rubber`
+Rubberlike: TypeAlias = (
+    float | tuple[tuple[float, ...], tuple[float, ...]]
+)  # see `parts.rubber.LawKeys.rubber`
 
 
 class Sized(Protocol):
@@ -390,7 +422,11 @@ class Sized(Protocol):
 
 def given(shell: Sized) -> Given:
     """What a shell gives with units."""
-    in_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")  # whose E always has a unit
+    in_pascals = shell.with_units or shell.geometry in (
+        "hemisphere",
+        "disc",
+        "strip",
+    )  # whose E always has a unit
     R = shell.reference if shell.with_units else nan
     E = shell.youngs_modulus if in_pascals and shell.youngs_modulus else nan
     rho = shell.density if shell.with_units and shell.density else nan
@@ -412,7 +448,9 @@ class OverUnit(BeforeValidator):
 
 
 def over(unit: Unit) -> OverUnit:
-    """A validator: text with a unit -> a number over a size of the case, such as h; a number is one already."""
+    """A validator: text with a unit -> a number over a size of the case, such as h; a number is one
+    already.
+    """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, str):
@@ -430,8 +468,14 @@ def over(unit: Unit) -> OverUnit:
 
 
 def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
-    """Whether a field with this annotation takes text with a unit as a number over a size of the case."""
-    within = (each for part in (annotation, *get_args(annotation)) for each in getattr(part, "__metadata__", ()))
+    """Whether a field with this annotation takes text with a unit as a number over a size of the
+    case.
+    """
+    within = (
+        each
+        for part in (annotation, *get_args(annotation))
+        for each in getattr(part, "__metadata__", ())
+    )
     return any(isinstance(each, OverUnit) for each in (*metadata, *within))
 
 

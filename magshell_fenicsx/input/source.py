@@ -16,7 +16,11 @@ INSTEAD: dict[Location, str] = {
     ("shell", "imperfections"): "defect"
 }  # a key of a setting -> the key beside it that it takes the place of
 MERGE = "tag:yaml.org,2002:merge"  # of the key <<
-LARGEST, MOST_ENTRIES, DEEPEST = 1_000_000, 10_000, 20  # bytes, keys and items, levels: far beyond any case
+LARGEST, MOST_ENTRIES, DEEPEST = (
+    1_000_000,
+    10_000,
+    20,
+)  # bytes, keys and items, levels: far beyond any case
 
 
 class CaseError(ValueError):
@@ -24,7 +28,10 @@ class CaseError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2. A key is its text, also `on` and `no`."""
+    """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2.
+
+    A key is its text, also `on` and `no`.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         for key, _ in node.value:
@@ -35,7 +42,9 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
+    re.compile(
+        r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
+    ),
     list("-+0123456789."),
 )
 
@@ -90,11 +99,15 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
     source = Source(str(file), {}, folder=file.parent.absolute())
     node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(node, yaml.MappingNode):
-        raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")
+        raise CaseError(
+            f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)"
+        )
     _walk(node, (), source)
     data = _parsed(source, lambda: _Loader(text).get_single_data())
     if not isinstance(data, dict):  # an explicit tag can make anything of a mapping
-        raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")
+        raise CaseError(
+            f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)"
+        )
     source.data = data
     for setting in settings:
         override(source, setting)
@@ -112,7 +125,9 @@ def _parsed(source: Source, parse: Callable[[], Any]) -> Any:
         raise CaseError(f"{where}: not valid YAML: {said}") from None
     except RecursionError:
         raise CaseError(f"{source.name}: not valid YAML: it is nested too deeply") from None
-    except Exception as e:  # a value that its explicit tag (!!timestamp, !!int) does not fit: any kind
+    except (
+        Exception
+    ) as e:  # a value that its explicit tag (!!timestamp, !!int) does not fit: any kind
         raise CaseError(f"{source.name}: not valid YAML: {type(e).__name__}: {e}") from None
 
 
@@ -149,7 +164,9 @@ def override(source: Source, assignment: str) -> None:
     """
     path, equals, text = assignment.partition("=")
     if not equals or not path.strip():
-        raise CaseError(f"--set {assignment}: write it as key.path=value, for example --set mesh.degree=3")
+        raise CaseError(
+            f"--set {assignment}: write it as key.path=value, for example --set mesh.degree=3"
+        )
     keys = path.strip().split(".")
     section: Any = source.data
     location: list[str | int] = []
@@ -157,14 +174,22 @@ def override(source: Source, assignment: str) -> None:
         if isinstance(section, list):
             if not key.isdecimal() or int(key) >= len(section):
                 allowed = f"items 0 to {len(section) - 1}" if section else "no items"
-                raise CaseError(f"--set {assignment}: {'.'.join(keys[: i + 1])}: the list has {allowed}")
+                raise CaseError(
+                    f"--set {assignment}: {'.'.join(keys[: i + 1])}: the list has {allowed}"
+                )
         elif not isinstance(section, dict):
             raise CaseError(f"--set {assignment}: {keys[i - 1]} is a value, not a section")
         location.append(int(key) if isinstance(section, list) else key)
         if i < len(keys) - 1:
-            section = section[int(key)] if isinstance(section, list) else section.setdefault(key, {})
+            section = (
+                section[int(key)] if isinstance(section, list) else section.setdefault(key, {})
+            )
     given = Source(f"--set {assignment}", {})
-    _walk(_parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""), (), given)
+    _walk(
+        _parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""),
+        (),
+        given,
+    )
     section[location[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
     replaced = INSTEAD.get(tuple(location), "")
     if not source.places.get((*location[:-1], replaced), "--set").startswith("--set"):

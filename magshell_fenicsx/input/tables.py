@@ -131,8 +131,8 @@ def column_size(name: str, unit: str, of: str) -> float:
 
 
 def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Array, Array]:
-    """Places (n, 3) and vectors (n, 3), or both (n, 2), of a CSV file with the columns x, y, z, bx, by, bz or
-    rho, z, b_rho, b_z.
+    """Places (n, 3) and vectors (n, 3), or both (n, 2), of a CSV file with the columns x, y, z, bx,
+    by, bz or rho, z, b_rho, b_z.
 
     Raises
     ------
@@ -143,13 +143,17 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
         lines = text_of((files or Files()).content(file)).splitlines()
         header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if row]
     except (OSError, ValueError, csv.Error) as e:
-        raise CaseError(f"{key}: {file}: cannot be read: {getattr(e, 'strerror', None) or 'no table'}") from None
+        raise CaseError(
+            f"{key}: {file}: cannot be read: {getattr(e, 'strerror', None) or 'no table'}"
+        ) from None
     for dim in (3, 2):
         columns = (*PLACES[dim], *VECTORS[dim])
         if sorted(header) == sorted(columns):
             return _points_and_vectors(file, key, header, rows, columns, dim)
     allowed = " or ".join(", ".join((*PLACES[dim], *VECTORS[dim])) for dim in (3, 2))
-    raise CaseError(f"{key}: {file}: its columns are {shorten(', '.join(header), 200)}; allowed are {allowed}")
+    raise CaseError(
+        f"{key}: {file}: its columns are {shorten(', '.join(header), 200)}; allowed are {allowed}"
+    )
 
 
 def write_vectors(file: Path, places: Array, vectors: Array) -> None:
@@ -161,14 +165,23 @@ def write_vectors(file: Path, places: Array, vectors: Array) -> None:
 
 
 def _points_and_vectors(
-    file: Path, key: str, header: Sequence[str], rows: Sequence[Sequence[str]], columns: Sequence[str], dim: int
+    file: Path,
+    key: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    columns: Sequence[str],
+    dim: int,
 ) -> tuple[Array, Array]:
     try:
-        values = np.array([[float(row[header.index(name)]) for name in columns] for row in rows]).reshape(-1, 2 * dim)
+        values = np.array(
+            [[float(row[header.index(name)]) for name in columns] for row in rows]
+        ).reshape(-1, 2 * dim)
     except (ValueError, IndexError):
         raise CaseError(f"{key}: {file}: has a row without a number in each column") from None
     if not 0 < len(values) <= MOST_POINTS or not np.isfinite(values).all():
-        raise CaseError(f"{key}: {file}: has {len(values)} rows of numbers; allowed are 1 to {MOST_POINTS}, all finite")
+        raise CaseError(
+            f"{key}: {file}: has {len(values)} rows of numbers; allowed are 1 to {MOST_POINTS}, all finite"
+        )
     return values[:, :dim], values[:, dim:]
 
 

@@ -1,8 +1,9 @@
-"""Several shells as one triangulation: each is meshed as it is alone, then turned and moved to its place.
+"""Several shells as one triangulation: each is meshed as it is alone, then turned and moved to its
+place.
 
-A node is its place in space (3,), its node in the shell's own triangulation, and last the number of its shell. So
-readers of mesh files find places, and the embedding finds the shell's own: placement and curvature are as exact as
-those of the shell alone.
+A node is its place in space (3,), its node in the shell's own triangulation, and last the number of
+its shell. So readers of mesh files find places, and the embedding finds the shell's own: placement
+and curvature are as exact as those of the shell alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +28,9 @@ from magshell_fenicsx.mesh.patch import (
 )
 
 Array = NDArray[np.float64]
-MEET = 1e-5  # of the extent: how far vertices that meet may be apart; curved edges are that far from a coarse mesh
+# of the extent: how far vertices that meet may be apart; curved edges are that far from a coarse
+# mesh
+MEET = 1e-5
 SAME = 1e-12  # over R: places that differ by rounding
 NEARLY = 1e-5  # of a side: a place so near to its end is there
 ROUNDS = 40  # of the search for the nearest place of a side
@@ -39,7 +42,8 @@ OWN = 6  # most numbers of a node of its own: place and normal, in a mesh file
 
 @dataclass(frozen=True)
 class Place:
-    """Where a shell is: places x (n, 3) of its own, over its own length, are at scale Q x + position.
+    """Where a shell is: places x (n, 3) of its own, over its own length, are at scale Q x +
+    position.
 
     Attributes
     ----------
@@ -65,7 +69,8 @@ class Place:
 
 @dataclass(frozen=True)
 class Member:
-    """A shell of an assembly: its name, its own triangulation, its place, and which points of it are named.
+    """A shell of an assembly: its name, its own triangulation, its place, and which points of it
+    are named.
 
     `normal` maps its nodes to the normals of the perfect shell, if these are known.
     """
@@ -100,7 +105,9 @@ class Embedded:
     def normal(self, nodes: Array) -> Array:
         """Outward unit normals (n, 3) of the perfect shells; nan where they are not known."""
         number, normals = np.rint(nodes[:, -1]), np.full((len(nodes), 3), np.nan)
-        for i, (normal, (_, size, place)) in enumerate(zip(self.normals, self.embeddings, strict=True)):
+        for i, (normal, (_, size, place)) in enumerate(
+            zip(self.normals, self.embeddings, strict=True)
+        ):
             if normal and (of := number == i).any():
                 normals[of] = normal(nodes[of, 3 : 3 + size]) @ place.Q.T
         return normals
@@ -116,14 +123,16 @@ class Embedded:
 
 @dataclass(eq=False)
 class Assembly:
-    """What stands in place of a mesh file where there are several shells; its mesh is made when it is asked for.
+    """What stands in place of a mesh file where there are several shells; its mesh is made when it
+    is asked for.
 
     Attributes
     ----------
     digest
         A hash of all from which it is made.
     members
-        Makes its shells, each rank the same; a `MeshError` or `CaseError` begins with the key of one that cannot be.
+        Makes its shells, each rank the same; a `MeshError` or `CaseError` begins with the key of
+        one that cannot be.
     joints
         Pairs of names of edges; the first is joined to the second.
     moduli
@@ -133,7 +142,8 @@ class Assembly:
     mirrors
         Planes in which each shell is its own image, see `Outline.mirrors`.
     span
-        The meridians of shells with one axis, see `shape.turning.Span`; or why there are none, in words.
+        The meridians of shells with one axis, see `shape.turning.Span`; or why there are none, in
+        words.
     normal
         Place (3,) -> the outward unit normal (3,) of the nearest perfect shell there.
     half
@@ -149,7 +159,9 @@ class Assembly:
     joints: Sequence[tuple[str, str]] = ()
     moduli: Mapping[str, float] = field(default_factory=dict)
     laws: Mapping[str, str] = field(default_factory=dict)
-    mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(default=lambda *_: [], repr=False)
+    mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = field(
+        default=lambda *_: [], repr=False
+    )
     span: Callable[[], Any] = field(default=lambda: "there are several shells", repr=False)
     normal: Callable[[Array], Array] | None = field(default=None, repr=False)
     half: Callable[[Mirror], "Assembly"] | None = field(default=None, repr=False)
@@ -176,7 +188,8 @@ class Assembly:
 
 
 def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
-    """One triangulation of shells that do not share a node; names of edges and points begin with that of the shell.
+    """One triangulation of shells that do not share a node; names of edges and points begin with
+    that of the shell.
 
     Each shell is a patch with its name. The edges of `halved` ones on their plane are one edge.
     """
@@ -184,7 +197,11 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
     embeddings = tuple((m.patch.embedding, m.patch.nodes.shape[1], m.place) for m in members)
     embedding = Embedded(embeddings, tuple(m.normal for m in members))
     nodes, cells, one = list[Array](), list[NDArray[np.int64]](), list[NDArray[np.int64]]()
-    edges, points, patches = dict[str, NDArray[np.int64]](), dict[str, Array](), dict[str, NDArray[np.bool_]]()
+    edges, points, patches = (
+        dict[str, NDArray[np.int64]](),
+        dict[str, Array](),
+        dict[str, NDArray[np.bool_]](),
+    )
     first, total = 0, sum(len(member.patch.cells) for member in members)
 
     def in_assembly(own: Array, number: int) -> Array:
@@ -203,9 +220,14 @@ def together(members: Sequence[Member], *, halved: bool = False) -> PatchMesh:
         for name, pairs in patch.edges.items():
             on_plane = halved and name in (CUT, SECOND_CUT)
             before = [edges[name]] if on_plane and name in edges else []
-            edges[name if on_plane else f"{member.name}_{name}"] = np.concatenate([*before, pairs + first])
+            edges[name if on_plane else f"{member.name}_{name}"] = np.concatenate(
+                [*before, pairs + first]
+            )
         named = [name for name in patch.points if name in ("pole", *member.points)]
-        points |= {f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0] for name in named}
+        points |= {
+            f"{member.name}_{name}": in_assembly(patch.points[name][None], number)[0]
+            for name in named
+        }
         every = np.ones(len(patch.cells), dtype=bool)
         for name, of in {"": every, **patch.patches}.items():
             inside = np.zeros(total, dtype=bool)
@@ -241,7 +263,9 @@ def joined(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
         None if tee else (_beside(patch, edges[0]), _beside(patch, edges[1]))
         for tee, edges in zip(tees, joints, strict=True)
     ]
-    glued_names = {name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee}
+    glued_names = {
+        name for edges, tee in zip(joints, tees, strict=True) for name in edges if not tee
+    }
     border = {name: pairs for name, pairs in patch.edges.items() if name not in glued_names}
     return replace(patch, edges=border, joints=tuple(sides))
 
@@ -257,19 +281,23 @@ def on_shell(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
     if edges[1] in patch.edges or edges[1] not in patch.patches:
         return False
     if edges[0] not in patch.edges:
-        raise MeshError(f"{key}: {edges[0]}: is no edge; an edge stands first, and then the shell on which it is")
+        raise MeshError(
+            f"{key}: {edges[0]}: is no edge; an edge stands first, and then the shell on which it is"
+        )
     return True
 
 
 def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
-    """With the vertices of the second edge glued to those of the first, which are at the same places.
+    """With the vertices of the second edge glued to those of the first, which are at the same
+    places.
 
     Where one edge has a vertex and the other has none, the triangle there is divided.
 
     Raises
     ------
     MeshError
-        If there is no such edge, the edges do not meet, or have different normals; the message begins with the key.
+        If there is no such edge, the edges do not meet, or have different normals; the message
+        begins with the key.
     """
     for name in edges:
         if name not in patch.edges:
@@ -294,7 +322,9 @@ def glued(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
         )
     to = np.arange(len(patch.one))
     to[away] = kept[nearest]
-    joined = replace(patch, edges={name: to[pairs] for name, pairs in patch.edges.items()}, one=to[patch.one])
+    joined = replace(
+        patch, edges={name: to[pairs] for name, pairs in patch.edges.items()}, one=to[patch.one]
+    )
     try:
         check_orientation(joined)
     except MeshError:
@@ -316,7 +346,9 @@ def _nearest_two(kept: Array, away: Array) -> str:
 
 
 def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tuple[float, Array]]:
-    """With vertices on an edge at places (n, 3), and how far the farthest of these is from it, and where."""
+    """With vertices on an edge at places (n, 3), and how far the farthest of these is from it, and
+    where.
+    """
     pairs, sides = patch.edges[edge], patch.corners[:, SIDES]
     of = {tuple(sorted(sides[c, s])): (c, s) for c, s in np.ndindex(*sides.shape[:2])}
     cell, side = np.array([of[tuple(sorted(pair))] for pair in pairs]).T
@@ -333,7 +365,11 @@ def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tu
 
     for _ in range(ROUNDS):
         off = targets[None] - at(t)
-        t = np.clip(t + np.einsum("sti,si->st", off, chord) / np.einsum("si,si->s", chord, chord)[:, None], 0, 1)
+        t = np.clip(
+            t + np.einsum("sti,si->st", off, chord) / np.einsum("si,si->s", chord, chord)[:, None],
+            0,
+            1,
+        )
     distance = np.linalg.norm(targets[None] - at(t), axis=2)
     nearest, each = distance.argmin(axis=0), np.arange(T)
     worst = int(distance.min(axis=0).argmax())
@@ -347,7 +383,9 @@ def _divided(patch: PatchMesh, edge: str, targets: Array) -> tuple[PatchMesh, tu
 
 
 def _fan(patch: PatchMesh, edge: str, cell: int, side: int, cuts: Array) -> PatchMesh:
-    """With a triangle divided from the corner opposite to a side, at numbers from 0 to 1 along that."""
+    """With a triangle divided from the corner opposite to a side, at numbers from 0 to 1 along
+    that.
+    """
     import basix  # slow to import, and not needed to read a case
     from dolfinx import mesh
     from dolfinx.cpp.io import perm_gmsh
@@ -371,7 +409,12 @@ def _fan(patch: PatchMesh, edge: str, cell: int, side: int, cuts: Array) -> Patc
         inner = a + points[3:] @ np.array([b - a, c - a])
         added.append(_in_cells(patch, np.full(len(inner), cell), inner))
         row = np.empty(count, dtype=np.int64)
-        own = [numbers[k], numbers[k + 1], patch.cells[cell, apex], *range(total, total + len(inner))]
+        own = [
+            numbers[k],
+            numbers[k + 1],
+            patch.cells[cell, apex],
+            *range(total, total + len(inner)),
+        ]
         row[perm_gmsh(mesh.CellType.triangle, count)] = own
         rows.append(row)
         total += len(inner)
@@ -393,7 +436,10 @@ def _fan(patch: PatchMesh, edge: str, cell: int, side: int, cuts: Array) -> Patc
         nodes=nodes,
         cells=cells,
         one=one,
-        edges={**patch.edges, edge: np.concatenate([np.array(kept, dtype=np.int64).reshape(-1, 2), chain])},
+        edges={
+            **patch.edges,
+            edge: np.concatenate([np.array(kept, dtype=np.int64).reshape(-1, 2), chain]),
+        },
         patches={name: parents(inside) for name, inside in patch.patches.items()},
         given=parents(patch.given),
     )
@@ -412,7 +458,11 @@ def _in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Array:
     element = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
     table = element.tabulate(0, X)[0, :, :, 0]
     return np.asarray(
-        np.einsum("nk,nkd->nd", table, patch.nodes[patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]])
+        np.einsum(
+            "nk,nkd->nd",
+            table,
+            patch.nodes[patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]],
+        )
     )
 
 
@@ -439,7 +489,11 @@ def _raised(patch: PatchMesh, count: int) -> PatchMesh:
     places = at_reference_points(patch.nodes, patch.cells, element.points[3:])
     new = len(patch.nodes) + np.arange(places.shape[0] * places.shape[1]).reshape(places.shape[:2])
     cells = np.empty((len(patch.cells), count), dtype=np.int64)
-    cells[:, perm_gmsh(mesh.CellType.triangle, count)] = np.concatenate([patch.cells[:, :3], new], axis=1)
+    cells[:, perm_gmsh(mesh.CellType.triangle, count)] = np.concatenate(
+        [patch.cells[:, :3], new], axis=1
+    )
     nodes = np.concatenate([patch.nodes, places.reshape(-1, patch.nodes.shape[1])])
     one = None if patch.one is None else np.concatenate([patch.one, new.ravel()])
-    return PatchMesh(nodes, cells, patch.embedding, patch.edges, patch.points, one, patch.patches, patch.given)
+    return PatchMesh(
+        nodes, cells, patch.embedding, patch.edges, patch.points, one, patch.patches, patch.given
+    )

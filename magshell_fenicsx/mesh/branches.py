@@ -1,7 +1,7 @@
 """Surfaces whose edges have three and more triangles: sheets that are joined by T-junctions.
 
-Of the triangles at such an edge the two that are nearest to one plane go on; each other one ends there, with nodes of
-its own, and stands on these two.
+Of the triangles at such an edge the two that are nearest to one plane go on; each other one ends
+there, with nodes of its own, and stands on these two.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -42,7 +42,8 @@ def separated(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str, Foot]
     Returns
     -------
     origin
-        (n,) the old node at the place of each node; the new ones stand after the old ones, which are their own.
+        (n,) the old node at the place of each node; the new ones stand after the old ones, which
+        are their own.
     cells
         With new nodes.
     feet
@@ -57,14 +58,19 @@ def separated(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str, Foot]
     by_edge = np.argsort(which.ravel(), kind="stable")
     firsts = np.concatenate([[0], np.cumsum(times)])
     going_on = dict[int, tuple[int, int]]()  # edge -> triangles
-    joined, ending = list[tuple[int, int]](), list[tuple[int, int]]()  # triangles; edges and triangles
+    joined, ending = (
+        list[tuple[int, int]](),
+        list[tuple[int, int]](),
+    )  # triangles; edges and triangles
     for edge in np.flatnonzero(times > 1):
         around = [int(side) % m for side in by_edge[firsts[edge] : firsts[edge + 1]]]
         if len(around) == 2:
             joined.append((around[0], around[1]))
             continue
         away = {cell: _away(nodes, pairs[edge], cells[cell, :3]) for cell in around}
-        flattest = min(combinations(around, 2), key=lambda two: round(float(away[two[0]] @ away[two[1]]), 9))
+        flattest = min(
+            combinations(around, 2), key=lambda two: round(float(away[two[0]] @ away[two[1]]), 9)
+        )
         joined.append(flattest)
         going_on[int(edge)] = flattest
         ending += [(int(edge), cell) for cell in around if cell not in flattest]
@@ -75,7 +81,9 @@ def separated(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str, Foot]
         sides, on = list[list[int]](), np.zeros(m, dtype=bool)
         for edge, cell in ending:
             if sheets[cell] == sheet:
-                sides.append([int(corner) for corner in cells[cell, :3] if origin[corner] in pairs[edge]])
+                sides.append(
+                    [int(corner) for corner in cells[cell, :3] if origin[corner] in pairs[edge]]
+                )
                 on[list(going_on[edge])] = True
         feet[NAME if not feet else f"{NAME}_{len(feet) + 1}"] = Foot(np.array(sides), on)
     return origin, cells, feet
@@ -106,7 +114,8 @@ def _with_own_nodes(
     Returns
     -------
     cells
-        With new nodes, whose numbers begin at `total`, in place of some of these vertices and of nodes between them.
+        With new nodes, whose numbers begin at `total`, in place of some of these vertices and of
+        nodes between them.
     copied
         The old node of each new one.
     """
@@ -152,6 +161,8 @@ def renamed(edges: Mapping[str, Cells], cells: Cells, origin: Cells) -> dict[str
     for side in border:
         new_sides.setdefault(tuple(sorted(int(origin[node]) for node in side)), []).append(side)
     return {
-        name: np.array([new for side in pairs for new in new_sides.get(tuple(sorted(map(int, side))), [side])])
+        name: np.array(
+            [new for side in pairs for new in new_sides.get(tuple(sorted(map(int, side))), [side])]
+        )
         for name, pairs in edges.items()
     }

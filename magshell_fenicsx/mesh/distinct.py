@@ -16,15 +16,19 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, directed_sides
 
 Array = NDArray[np.float64]
 SAME_PLACE = 1e-6  # over R: nearer places are one, and a place so near to an edge is on it
-NEAR = 0.02  # of the element size: nearer vertices make cells too flat; at half of it plates are unstable
+# of the element size: nearer vertices make cells too flat; at half of it plates are unstable
+NEAR = 0.02
 WIDEST = 0.2  # of the element size: places farther apart have grid lines of their own
 MOST_DIGITS = 17  # of a number
-FLAT = 25.0  # `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
+# `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
+FLAT = 25.0
 SHORT = 0.05  # a side over another one, from where its ends are told
 TOO_FLAT = 400.0  # `flatness` that no penalty stands: rounding makes rigid motions of stiffness
 
 
-def grouped_by_distance(coordinates: Array, size: Callable[[float], float], rounding: float) -> list[Array]:
+def grouped_by_distance(
+    coordinates: Array, size: Callable[[float], float], rounding: float
+) -> list[Array]:
     """Return groups of sorted coordinates (n,), each of which has one grid line.
 
     Parameters
@@ -36,23 +40,31 @@ def grouped_by_distance(coordinates: Array, size: Callable[[float], float], roun
     """
     groups = list[Array]()
     for c in np.sort(coordinates):
-        if groups and c - groups[-1][-1] <= max(rounding, NEAR * min(size(float(c)), size(float(groups[-1][-1])))):
+        if groups and c - groups[-1][-1] <= max(
+            rounding, NEAR * min(size(float(c)), size(float(groups[-1][-1])))
+        ):
             groups[-1] = np.append(groups[-1], c)
         else:
             groups.append(np.array([c]))
     return [
-        part for group in groups for part in _narrow_parts(group, max(rounding, WIDEST * size(float(group.mean()))))
+        part
+        for group in groups
+        for part in _narrow_parts(group, max(rounding, WIDEST * size(float(group.mean()))))
     ]
 
 
-def lines_of(coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]) -> list[float]:
+def lines_of(
+    coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]
+) -> list[float]:
     """Return one coordinate for each group of near ones that lies between two ends, and beside none
     of them."""
 
     def is_inside(x: float) -> bool:
         return min(x - ends[0], ends[1] - x) > max(SAME_PLACE, NEAR * size(x))
 
-    groups = grouped_by_distance(np.array([x for x in coordinates if is_inside(float(x))]), size, SAME_PLACE)
+    groups = grouped_by_distance(
+        np.array([x for x in coordinates if is_inside(float(x))]), size, SAME_PLACE
+    )
     return [float(group[0] + group[-1]) / 2 for group in groups]
 
 
@@ -87,14 +99,18 @@ def flatness(patch: PatchMesh) -> Array:
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         heights = (doubled[:, None] / np.linalg.norm(sides, axis=2)).T.ravel()
-        _, edge = np.unique(np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True)
+        _, edge = np.unique(
+            np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True
+        )
         edge = edge.ravel()
         both = np.bincount(edge, weights=heights)[edge]
         ratios = np.where(np.bincount(edge)[edge] > 1, both / (4 * heights), 0.0)
     return np.asarray(np.nan_to_num(ratios, nan=np.inf).reshape(3, -1).sum(axis=0))
 
 
-def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: float, words: str) -> str:
+def flat_triangle(
+    patch: PatchMesh, penalty: float, default: float, length: float, words: str
+) -> str:
     """Say where a triangle is too flat for the penalty of the edges, and what helps; empty if none
     is.
 
@@ -112,7 +128,9 @@ def flat_triangle(patch: PatchMesh, penalty: float, default: float, length: floa
     corners = patch.embedding(patch.nodes[patch.cells[worst, :3]]) * length
     x, y, z = corners.mean(axis=0)
     sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
-    height = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
+    height = (
+        np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])) / sides.max()
+    )
     near_vertices = ""
     if sides.min() < SHORT * sides.max():
         side = int(sides.argmin())

@@ -1,7 +1,9 @@
-"""A dolfinx mesh of triangles in space as a program gives it: its triangles, the fields on it, displacements for it.
+"""A dolfinx mesh of triangles in space as a program gives it: its triangles, the fields on it,
+displacements for it.
 
-Every rank has all triangles, in the order in which they were made, whatever the number of ranks: they are few. A scene
-has a mesh of its own, distributed in its own way; fields go there and displacements come back cell by cell.
+Every rank has all triangles, in the order in which they were made, whatever the number of ranks:
+they are few. A scene has a mesh of its own, distributed in its own way; fields go there and
+displacements come back cell by cell.
 """
 
 from collections.abc import Mapping
@@ -23,7 +25,8 @@ Part = int | NDArray[np.int32]  # a value of tags, or local numbers of facets or
 
 
 class Home:
-    """A mesh to which fields belong and for which displacements are made; all methods are collective.
+    """A mesh to which fields belong and for which displacements are made; all methods are
+    collective.
 
     Parameters
     ----------
@@ -42,7 +45,9 @@ class Home:
         if kind != "triangle":
             raise MeshError(f"mesh: its cells are of the kind {kind}; a mid-surface has triangles")
         if dimension != 3:
-            raise MeshError(f"mesh: its nodes have {dimension} coordinates; a mid-surface is in space: gdim=3")
+            raise MeshError(
+                f"mesh: its nodes have {dimension} coordinates; a mid-surface is in space: gdim=3"
+            )
         self._element = domain.ufl_domain().ufl_coordinate_element().basix_element
         if (order := self._element.degree) not in NODES:
             raise MeshError(f"mesh: its triangles are of order {order}; allowed are 1, 2 and 3")
@@ -58,7 +63,8 @@ class Home:
         facet_tags: mesh.MeshTags | None = None,
         cell_tags: mesh.MeshTags | None = None,
     ) -> Triangles:
-        """Its triangles with named edges and patches, each a value of the tags or local facets or cells.
+        """Its triangles with named edges and patches, each a value of the tags or local facets or
+        cells.
 
         Raises
         ------
@@ -72,8 +78,14 @@ class Home:
         number = np.empty(len(used), dtype=np.int64)
         number[order] = np.arange(len(used))
         given = self._gathered(nodes).reshape(-1, 3)[first[order]]
-        pairs = {name: self._ends(self._chosen(f"edges.{name}", part, facet_tags, 1)) for name, part in edges.items()}
-        inside = {name: self._chosen(f"patches.{name}", part, cell_tags, 2) for name, part in patches.items()}
+        pairs = {
+            name: self._ends(self._chosen(f"edges.{name}", part, facet_tags, 1))
+            for name, part in edges.items()
+        }
+        inside = {
+            name: self._chosen(f"patches.{name}", part, cell_tags, 2)
+            for name, part in patches.items()
+        }
         return Triangles(
             given,
             number[again].reshape(cells.shape),
@@ -124,7 +136,9 @@ class Home:
         degree, owned = V.element.basix_element.degree, V.mesh.topology.index_map(2).size_local
         nodal = u.x.array.reshape(-1, 3)[V.dofmap.list[:owned]] / scale
         number, turned = given[:owned].T
-        nodal = np.where(turned[:, None, None] == 1, nodal[:, swapped(V.element.basix_element)], nodal)
+        nodal = np.where(
+            turned[:, None, None] == 1, nodal[:, swapped(V.element.basix_element)], nodal
+        )
         whole = np.zeros((self.mesh.topology.index_map(2).size_global, *nodal.shape[1:]))
         for numbers, values in self.comm.allgather((number, nodal)):
             whole[numbers] = values
@@ -139,9 +153,14 @@ class Home:
         local = cells.size_local + cells.num_ghosts
         made = compat.original_cells(self.mesh)[:local]
         every = np.concatenate(self.comm.allgather(made[: self._owned]))
-        if len(every) == cells.size_global and (np.sort(every) == np.arange(cells.size_global)).all():
+        if (
+            len(every) == cells.size_global
+            and (np.sort(every) == np.arange(cells.size_global)).all()
+        ):
             return made
-        return np.asarray(cells.local_to_global(np.arange(local, dtype=np.int32)))  # a part of another mesh
+        return np.asarray(
+            cells.local_to_global(np.arange(local, dtype=np.int32))
+        )  # a part of another mesh
 
     def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values of this rank's own cells, of all ranks in their order."""
@@ -150,24 +169,33 @@ class Home:
         return np.asarray(all_values[np.argsort(numbers)])
 
     def _places(self) -> tuple[Array, Numbers]:
-        """Coordinates (cells, nodes, 3) and global numbers of the nodes of this rank's own cells, in gmsh's order."""
+        """Coordinates (cells, nodes, 3) and global numbers of the nodes of this rank's own cells,
+        in gmsh's order.
+        """
         geometry, dofs = self.mesh.geometry, compat.corner_numbers(self.mesh)[: self._owned]
         x = geometry.x[dofs]
         if self._element.lagrange_variant != basix.LagrangeVariant.equispaced:
             degree = self._element.degree
-            even = basix.create_element(basix.ElementFamily.P, TRIANGLE, degree, basix.LagrangeVariant.equispaced)
+            even = basix.create_element(
+                basix.ElementFamily.P, TRIANGLE, degree, basix.LagrangeVariant.equispaced
+            )
             x = np.matmul(self._element.tabulate(0, even.points)[0, :, :, 0], x)
-        ids = geometry.index_map().local_to_global(dofs.ravel().astype(np.int32)).reshape(dofs.shape)
+        ids = (
+            geometry.index_map().local_to_global(dofs.ravel().astype(np.int32)).reshape(dofs.shape)
+        )
         order = np.argsort(perm_gmsh(mesh.CellType.triangle, dofs.shape[1]))
         return np.asarray(x[:, order]), np.asarray(ids[:, order])
 
-    def _chosen(self, key: str, part: Part, tags: mesh.MeshTags | None, dimension: int) -> NDArray[np.int32]:
+    def _chosen(
+        self, key: str, part: Part, tags: mesh.MeshTags | None, dimension: int
+    ) -> NDArray[np.int32]:
         """Local facets or cells.
 
         Raises
         ------
         MeshError
-            On every rank, if there are none on any, or what one rank has is of no part of this mesh.
+            On every rank, if there are none on any, or what one rank has is of no part of this
+            mesh.
         """
         what, named = ("facet_tags", "facets") if dimension == 1 else ("cell_tags", "cells")
         chosen: NDArray[np.int32] = np.empty(0, dtype=np.int32)
@@ -187,7 +215,9 @@ class Home:
         values = [] if tags is None else np.unique(tags.values)
         allowed = sorted({int(value) for each in self.comm.allgather(values) for value in each})
         if not self.comm.allreduce(len(chosen)) and by_value:
-            raise MeshError(f"{key}: {part}: {what} have no such value, only {', '.join(map(str, allowed)) or 'none'}")
+            raise MeshError(
+                f"{key}: {part}: {what} have no such value, only {', '.join(map(str, allowed)) or 'none'}"
+            )
         return chosen
 
     def _strange(self, numbers: NDArray[Any], dimension: int, named: str) -> str:
@@ -206,9 +236,17 @@ class Home:
         topology = self.mesh.topology
         for dimensions in ((1, 2), (1, 0), (2, 1)):
             topology.create_connectivity(*dimensions)
-        ends = mesh.entities_to_geometry(self.mesh, 1, facets)[:, :2] if len(facets) else np.empty((0, 2), np.int32)
-        numbers = self.mesh.geometry.index_map().local_to_global(np.asarray(ends, dtype=np.int32).ravel())
-        pairs = np.concatenate(self.comm.allgather(np.asarray(numbers, dtype=np.int64).reshape(-1, 2)))
+        ends = (
+            mesh.entities_to_geometry(self.mesh, 1, facets)[:, :2]
+            if len(facets)
+            else np.empty((0, 2), np.int32)
+        )
+        numbers = self.mesh.geometry.index_map().local_to_global(
+            np.asarray(ends, dtype=np.int32).ravel()
+        )
+        pairs = np.concatenate(
+            self.comm.allgather(np.asarray(numbers, dtype=np.int64).reshape(-1, 2))
+        )
         return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
 
     def _among(self, cells: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
@@ -222,7 +260,9 @@ class Home:
 def stored(degree: int) -> basix.finite_element.FiniteElement:
     """The element at whose nodes a `GivenField` of a degree has its values."""
     variant = basix.LagrangeVariant.gll_warped
-    return basix.create_element(basix.ElementFamily.P, TRIANGLE, degree, variant, discontinuous=True)
+    return basix.create_element(
+        basix.ElementFamily.P, TRIANGLE, degree, variant, discontinuous=True
+    )
 
 
 def swapped(element: basix.finite_element.FiniteElement) -> Numbers:

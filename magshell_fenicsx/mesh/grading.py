@@ -13,9 +13,17 @@ from magshell_fenicsx.mesh.shapes import DiscShape, Shape
 
 Size = Callable[[NDArray[np.float64]], float]
 PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
-TOWARDS = 0.4  # of the size, from where triangles are seen to take theirs: sizes grow, and they do not overshoot them
-ALIKE, ENOUGH = 0.5, 1e-5  # parts whose numbers of triangles differ less, over their own and over all, are not divided
-MOST_PARTS, MOST_SIZES = 1000, 5_000_000  # parts of an estimate, and sizes that they need from all features
+# of the size, from where triangles are seen to take theirs: sizes grow, and they do not overshoot
+# them
+TOWARDS = 0.4
+ALIKE, ENOUGH = (
+    0.5,
+    1e-5,
+)  # parts whose numbers of triangles differ less, over their own and over all, are not divided
+MOST_PARTS, MOST_SIZES = (
+    1000,
+    5_000_000,
+)  # parts of an estimate, and sizes that they need from all features
 
 
 class Feature(Protocol):
@@ -32,7 +40,9 @@ class Feature(Protocol):
         """Wanted element size at a point of the chart."""
 
     def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Bounds of the sizes at most `away` (n,) from points (n, 2): the largest, of negative ones the least."""
+        """Bounds of the sizes at most `away` (n,) from points (n, 2): the largest, of negative ones
+        the least.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,13 +72,19 @@ class Disc:
         """
         s, g, a = self.size, self.growth, min(self.radius, reach)
         outer = g * (reach - a) / s
-        around = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - outer / (1 + outer)) / g**2)
+        around = (
+            2
+            * pi
+            * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - outer / (1 + outer)) / g**2)
+        )
         return PER_AREA * (pi * a**2 / s**2 + around)
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Elements of some sizes (n,) within squares with `centres` (n, 2) and half sides (n,), growing outside."""
+    """Elements of some sizes (n,) within squares with `centres` (n, 2) and half sides (n,), growing
+    outside.
+    """
 
     centres: NDArray[np.float64]
     halves: NDArray[np.float64]
@@ -140,7 +156,9 @@ class Line:
         return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
 
     def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(self.size + self.growth * np.maximum(np.abs(x[:, self.axis] - self.place) + away, 0.0))
+        return np.asarray(
+            self.size + self.growth * np.maximum(np.abs(x[:, self.axis] - self.place) + away, 0.0)
+        )
 
 
 @dataclass(frozen=True)
@@ -160,7 +178,9 @@ class Grading:
     def _discs(self) -> tuple[NDArray[np.float64], ...]:
         """Centres (n, 2), radii, sizes and growths (n,): there may be hundreds."""
         discs = [f for f in self.features if isinstance(f, Disc)]
-        numbers = np.array([[*f.centre, f.radius, f.size, f.growth] for f in discs]).reshape(-1, 5).T
+        numbers = (
+            np.array([[*f.centre, f.radius, f.size, f.growth] for f in discs]).reshape(-1, 5).T
+        )
         return numbers[:2].T, *numbers[2:]
 
     def across(self, axis: int, x: float) -> float:
@@ -168,12 +188,15 @@ class Grading:
         return min([self.largest, *(feature.across(axis, x) for feature in self.features)])
 
     def cells(self, shape: Shape) -> float:
-        """Approximate number of triangles in a shape: the integral of one over the square of the least size.
+        """Approximate number of triangles in a shape: the integral of one over the square of the
+        least size.
 
         Over parts of the shape, which are divided until the sizes in each are nearly alike.
         """
         most = max(
-            MOST_PARTS, MOST_SIZES // max(1, sum(len(f.halves) if isinstance(f, Squares) else 1 for f in self.features))
+            MOST_PARTS,
+            MOST_SIZES
+            // max(1, sum(len(f.halves) if isinstance(f, Squares) else 1 for f in self.features)),
         )
         parts, cells = _Parts.first(shape), 0.0
         while len(parts.low):
@@ -198,7 +221,9 @@ class Grading:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Parts of a shape between coordinates `low` and `high` (n, 2): of a disc polar ones, else those of the chart."""
+    """Parts of a shape between coordinates `low` and `high` (n, 2): of a disc polar ones, else
+    those of the chart.
+    """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -208,7 +233,11 @@ class _Parts:
     def first(cls, shape: Shape) -> "_Parts":
         polar = isinstance(shape, DiscShape)
         low, high = shape.box
-        number = (8, 12 if shape.half else 24) if polar else np.maximum(1, np.ceil(8 * (high - low) / shape.reach))
+        number = (
+            (8, 12 if shape.half else 24)
+            if polar
+            else np.maximum(1, np.ceil(8 * (high - low) / shape.reach))
+        )
         t = [np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, number, strict=True)]
         low, high = (
             np.stack(np.meshgrid(*each, indexing="ij"), axis=-1).reshape(-1, 2)

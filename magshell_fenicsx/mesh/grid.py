@@ -1,4 +1,6 @@
-"""A grid of quadrilaterals on a rectangular chart, each cut into four triangles; opposite sides may be glued."""
+"""A grid of quadrilaterals on a rectangular chart, each cut into four triangles; opposite sides may
+be glued.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +28,8 @@ class Grid:
     Attributes
     ----------
     size
-        Largest side of a quadrilateral: a number, or a function (axis, coordinate across it) -> side.
+        Largest side of a quadrilateral: a number, or a function (axis, coordinate across it) ->
+        side.
     sides
         Names of x = low, x = high, y = low and y = high.
     glued
@@ -48,12 +51,16 @@ class Grid:
     @property
     def edges(self) -> tuple[str, ...]:
         """Names of the surface's edges: the sides that are not glued."""
-        return tuple(dict.fromkeys(name for i, name in enumerate(self.sides) if not self.glued[i // 2]))
+        return tuple(
+            dict.fromkeys(name for i, name in enumerate(self.sides) if not self.glued[i // 2])
+        )
 
     @property
     def corners(self) -> Array:
         """Chart coordinates (4, 2) of the corners."""
-        return np.array([[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])])
+        return np.array(
+            [[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])]
+        )
 
     @property
     def cells(self) -> float:
@@ -73,7 +80,9 @@ class Grid:
             return np.array([low, high]), np.array([0.0, (high - low) / size])
         x = np.linspace(low, high, SAMPLES, dtype=np.float64)
         per_length = 1 / np.array([size(axis, float(c)) for c in x])
-        return x, np.concatenate([[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))])
+        return x, np.concatenate(
+            [[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))]
+        )
 
     def size_at(self, axis: int, x: float) -> float:
         """Largest distance of grid lines across an axis, at a coordinate."""
@@ -94,9 +103,13 @@ class Grid:
         counts = np.interp(given, x, sides)
         parts = [max(int(np.ceil(b - a - 1e-6)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(parts) < 3:
-            parts = [max(n, -(-3 // len(parts))) for n in parts]  # with fewer, the glued mesh would be degenerate
+            parts = [
+                max(n, -(-3 // len(parts))) for n in parts
+            ]  # with fewer, the glued mesh would be degenerate
         inner = []
-        for a, b, n, first, last in zip(given[:-1], given[1:], parts, counts[:-1], counts[1:], strict=True):
+        for a, b, n, first, last in zip(
+            given[:-1], given[1:], parts, counts[:-1], counts[1:], strict=True
+        ):
             between = np.linspace(a, b, n + 1)[1:]
             if callable(self.size):
                 between[:-1] = np.interp(np.linspace(first, last, n + 1)[1:-1], sides, x)
@@ -164,7 +177,10 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     centre = number.size + np.arange(n * m).reshape(n, m)
     around = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     cells = np.concatenate(
-        [np.stack([around[i], around[(i + 1) % 4], centre], axis=-1).reshape(-1, 3) for i in range(4)]
+        [
+            np.stack([around[i], around[(i + 1) % 4], centre], axis=-1).reshape(-1, 3)
+            for i in range(4)
+        ]
     )
     one = np.arange(len(nodes))
     if grid.glued[0]:
@@ -172,7 +188,9 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     if grid.glued[1]:
         one[number[:, -1]] = one[number[:, 0]]
     edges: dict[str, NDArray[np.int64]] = {}
-    for name, row in zip(grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True):
+    for name, row in zip(
+        grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True
+    ):
         if name in grid.edges:  # two sides may have one name
             line = one[np.stack([row[:-1], row[1:]], axis=-1)]
             edges[name] = np.concatenate([edges[name], line]) if name in edges else line
@@ -197,7 +215,9 @@ def _draw_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
         apart = place - at - np.where(grid.glued, np.round((place - at) / extent) * extent, 0.0)
         if (np.abs(apart) > CLOSE * extent).any():
-            raise MeshError(f"the points {before} and {name} are too near to each other for the elements there")
+            raise MeshError(
+                f"the points {before} and {name} are too near to each other for the elements there"
+            )
         for axis in range(2):
             line = grid.straight_line_at(axis, float(place[axis]))
             end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
@@ -237,25 +257,40 @@ class RimmedGrid:
 
     @property
     def glued(self) -> tuple[Glued, ...]:
-        return tuple((i, self.grid.low[i], self.grid.high[i]) for i in range(2) if self.grid.glued[i])
+        return tuple(
+            (i, self.grid.low[i], self.grid.high[i]) for i in range(2) if self.grid.glued[i]
+        )
 
     def faces(self, occ: Any) -> Faces:
-        """The rectangle, the rims with their images across glued sides, and the lines of the grid's `through`."""
+        """The rectangle, the rims with their images across glued sides, and the lines of the grid's
+        `through`.
+        """
         (x0, y0), (x1, y1) = self.grid.low, self.grid.high
 
         def rectangle() -> tuple[int, int]:
             return 2, occ.addRectangle(x0, y0, 0, x1 - x0, y1 - y0)
 
         steps = [(-1, 0, 1) if glued else (0,) for glued in self.grid.glued]
-        images = [points + np.multiply(step, self.extent) for points in self.rims for step in product(*steps)]
-        near = [p for p in images if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()]
+        images = [
+            points + np.multiply(step, self.extent)
+            for points in self.rims
+            for step in product(*steps)
+        ]
+        near = [
+            p
+            for p in images
+            if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()
+        ]
         surfaces = [rectangle(), *within(occ, near, rectangle)]
         for axis, other in ((0, 1), (1, 0)):
             for across in (*self.grid.through[axis], *self.grid.movable[axis]):
                 if not self.grid.low[axis] < across < self.grid.high[axis]:
                     continue
                 ends = np.array([self.grid.low, self.grid.high])
-                ends[:, axis], ends[:, other] = across, (self.grid.low[other], self.grid.high[other])
+                ends[:, axis], ends[:, other] = (
+                    across,
+                    (self.grid.low[other], self.grid.high[other]),
+                )
                 surfaces.append((1, occ.addLine(*(occ.addPoint(*end, 0) for end in ends))))
         return surfaces
 

@@ -1,7 +1,8 @@
-"""A body around a mid-surface: its triangles in quadrilaterals of degree 2, swept through the thickness.
+"""A body around a mid-surface: its triangles in quadrilaterals of degree 2, swept through the
+thickness.
 
-Each triangle is split into three quadrilaterals, which meet at its centre: they are graded as the triangles are,
-and their edges follow the same circles.
+Each triangle is split into three quadrilaterals, which meet at its centre: they are graded as the
+triangles are, and their edges follow the same circles.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,15 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import create_mesh
-from magshell_fenicsx.mesh.patch import Deviated, Embedding, MeshError, PatchMesh, as_set, directed_sides, place_text
+from magshell_fenicsx.mesh.patch import (
+    Deviated,
+    Embedding,
+    MeshError,
+    PatchMesh,
+    as_set,
+    directed_sides,
+    place_text,
+)
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -41,8 +50,8 @@ class Quadrilaterals:
     nodes, places
         (n, d) nodes in the chart, and (n, 3) in space.
     offsets
-        (n, 3) what the nodes move by when the surface moves outward by one: the unit normal or, at a kink, the
-        vector on which every face moves by one.
+        (n, 3) what the nodes move by when the surface moves outward by one: the unit normal or, at
+        a kink, the vector on which every face moves by one.
     cells
         (m, 9) node numbers in the order of basix; cells 3 t, 3 t + 1 and 3 t + 2 are of triangle t.
     edges
@@ -77,7 +86,9 @@ def split(patch: PatchMesh) -> Quadrilaterals:
         numbers[:, places] = len(vertices) + 3 * side_of[side][:, None] + along
     inner = np.setdiff1d(np.arange(len(reference)), [0, 1, 2, *np.ravel(on_sides)])
     below = len(vertices) + 3 * len(sides)
-    numbers[:, inner] = below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
+    numbers[:, inner] = (
+        below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
+    )
     ordered = patch.cells[:, to_dolfinx]
     x = np.einsum("qk,ckx->cqx", values[0], patch.nodes[ordered])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
@@ -87,7 +98,9 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     else:
         a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[ordered])
         offsets = _mitred(a1, a2, numbers, quads)
-    middle_of = {(int(sides[n, 0]), int(sides[n, 1])): len(vertices) + 3 * n + 1 for n in range(len(sides))}
+    middle_of = {
+        (int(sides[n, 0]), int(sides[n, 1])): len(vertices) + 3 * n + 1 for n in range(len(sides))
+    }
 
     def halves(a: int, b: int) -> list[list[int]]:
         middle = middle_of[min(a, b), max(a, b)]
@@ -95,11 +108,14 @@ def split(patch: PatchMesh) -> Quadrilaterals:
 
     edges: dict[str, Numbers] = {
         name: np.array(
-            [half for a, b in np.searchsorted(vertices, pairs) for half in halves(int(a), int(b))], dtype=np.int64
+            [half for a, b in np.searchsorted(vertices, pairs) for half in halves(int(a), int(b))],
+            dtype=np.int64,
         ).reshape(-1, 2)
         for name, pairs in patch.edges.items()
     }
-    return Quadrilaterals(nodes, patch.embedding(nodes), offsets, numbers[:, quads].reshape(-1, 9), edges)
+    return Quadrilaterals(
+        nodes, patch.embedding(nodes), offsets, numbers[:, quads].reshape(-1, 9), edges
+    )
 
 
 def surface_normal(embedding: Embedding, x: Array) -> Array:
@@ -111,9 +127,9 @@ def surface_normal(embedding: Embedding, x: Array) -> Array:
 def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
     """Offsets (nodes, 3) from the tangents (cells, places, 3) of a surface that may have kinks.
 
-    At corners of quadrilaterals the mean normal, each cell's weighted by its angle there, over its mean cosine with
-    the cells' normals: exact between two faces and between three that are normal to each other. What a cell's own
-    normal lacks of it is interpolated to the nodes between.
+    At corners of quadrilaterals the mean normal, each cell's weighted by its angle there, over its
+    mean cosine with the cells' normals: exact between two faces and between three that are normal
+    to each other. What a cell's own normal lacks of it is interpolated to the nodes between.
     """
     n = _unit(np.cross(a1, a2))
     weights = np.full(n.shape[:2], np.pi)
@@ -138,7 +154,9 @@ def _unit(v: NDArray[Any]) -> Array:
 
 
 def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
-    """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them; those on each side."""
+    """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them;
+    those on each side.
+    """
     s, t = square().T[:, :, None]
     centre = VERTICES.mean(axis=0)
     corners = [*VERTICES]
@@ -146,7 +164,9 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     for i in range(3):
         corner, following, before = (VERTICES[(i + k) % 3] for k in range(3))
         side, other = (corner + following) / 2, (corner + before) / 2
-        quad = (1 - s) * (1 - t) * corner + s * (1 - t) * side + s * t * centre + (1 - s) * t * other
+        quad = (
+            (1 - s) * (1 - t) * corner + s * (1 - t) * side + s * t * centre + (1 - s) * t * other
+        )
         numbers = []
         for x in quad:
             same = [n for n, y in enumerate(corners) if np.allclose(x, y)]
@@ -178,20 +198,25 @@ class Body:
     Attributes
     ----------
     mesh
-        Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs outwards.
+        Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs
+        outwards.
     faces
-        Name -> facets (local numbers): those of `OUTER`, and those above each named edge of the mid-surface.
+        Name -> facets (local numbers): those of `OUTER`, and those above each named edge of the
+        mid-surface.
     points, normals
-        Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal there.
+        Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal
+        there.
     patches
         Name -> whether each local cell is above that part of the mid-surface.
     between
-        (cells, 2) where each local cell begins and ends in the thickness: from 0 inside to 1 outside.
+        (cells, 2) where each local cell begins and ends in the thickness: from 0 inside to 1
+        outside.
     chart, heights, thickness
-        Of each node of the geometry: the chart's coordinates (n, d) under it, where it is in the thickness, from 0 to
-        1, and h(x) over R; see `at_nodes`.
+        Of each node of the geometry: the chart's coordinates (n, d) under it, where it is in the
+        thickness, from 0 to 1, and h(x) over R; see `at_nodes`.
     w0
-        Of each node of the geometry: the deviation over R of the mid-surface under it; None without imperfections.
+        Of each node of the geometry: the deviation over R of the mid-surface under it; None without
+        imperfections.
     """
 
     mesh: mesh.Mesh
@@ -248,7 +273,9 @@ def sweep(
     original = domain.topology.original_cell_index
     triangle, layer = original // (3 * (len(ends) - 1)), original % (len(ends) - 1)
     places = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
-    nearest = {name: np.argmin(np.linalg.norm(quads.places - x, axis=1)) for name, x in places.items()}
+    nearest = {
+        name: np.argmin(np.linalg.norm(quads.places - x, axis=1)) for name, x in places.items()
+    }
     node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
     return Body(
         domain,
@@ -281,7 +308,9 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
 
 
 def _swept(quads: Numbers, layers: int) -> Numbers:
-    """Hexahedra (quads * layers, 27) in the order of basix; node q at level k has the number q levels + k."""
+    """Hexahedra (quads * layers, 27) in the order of basix; node q at level k has the number q
+    levels + k.
+    """
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     ).points
@@ -292,14 +321,18 @@ def _swept(quads: Numbers, layers: int) -> Numbers:
     return np.stack(cells, axis=1).reshape(-1, 27)
 
 
-def _named_faces(domain: mesh.Mesh, quads: Quadrilaterals, levels: int) -> dict[str, NDArray[np.int32]]:
+def _named_faces(
+    domain: mesh.Mesh, quads: Quadrilaterals, levels: int
+) -> dict[str, NDArray[np.int32]]:
     """Outer and side faces, found by the numbers of their nodes."""
     for pair in ((2, 3), (2, 0), (0, 3), (3, 2)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
     vertices = domain.topology.index_map(0)
     # of a vertex its number in the chart and its level
-    ends = mesh.entities_to_geometry(domain, 0, np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32))
+    ends = mesh.entities_to_geometry(
+        domain, 0, np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32)
+    )
     numbers = domain.geometry.input_global_indices[ends[:, 0]]
     corners = domain.topology.connectivity(2, 0).array.reshape(-1, 4)[facets]
     chart, level = np.divmod(numbers[corners], levels)
@@ -322,4 +355,6 @@ def face_measure(domain: mesh.Mesh, parts: Sequence[NDArray[np.int32]]) -> ufl.M
     tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
     order = np.argsort(facets)
     tagged = mesh.meshtags(domain, 2, facets[order], tags[order])
-    return ufl.Measure("ds", domain=domain, subdomain_data=tagged, metadata={"quadrature_degree": WHOLE})
+    return ufl.Measure(
+        "ds", domain=domain, subdomain_data=tagged, metadata={"quadrature_degree": WHOLE}
+    )

@@ -1,8 +1,8 @@
 """The mid-surface: an affine dolfinx mesh and, separate from it, the placement r0.
 
-The kernels use the affine mesh alone. So their Jacobian is constant, and one compiled kernel serves every shape.
-The shape itself is the vector field r0. It is interpolated at the nodes of the displacement's own element, so that
-rigid motions are exact.
+The kernels use the affine mesh alone. So their Jacobian is constant, and one compiled kernel serves
+every shape. The shape itself is the vector field r0. It is interpolated at the nodes of the
+displacement's own element, so that rigid motions are exact.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,24 @@ ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 
 
 def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
-    """Unit normals (n, 3): means over the triangles (m, 3 | 6 | 10) around each node, with their angles as weights."""
+    """Unit normals (n, 3): means over the triangles (m, 3 | 6 | 10) around each node, with their
+    angles as weights.
+    """
     count = cells.shape[1]
     element = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.triangle, ORDERS[count], basix.LagrangeVariant.equispaced
+        basix.ElementFamily.P,
+        basix.CellType.triangle,
+        ORDERS[count],
+        basix.LagrangeVariant.equispaced,
     )
     ordered = cells[:, perm_gmsh(mesh.CellType.triangle, count)]
-    a1, a2 = np.einsum("dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[ordered])
+    a1, a2 = np.einsum(
+        "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[ordered]
+    )
     angles = np.full(ordered.shape, np.pi)
-    for corner, (e, f) in enumerate(((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))):  # vertices come first
+    for corner, (e, f) in enumerate(
+        ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))
+    ):  # vertices come first
         cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
         angles[:, corner] = np.arccos(np.clip(cosine, -1, 1))
     total = np.zeros_like(nodes)
@@ -74,31 +83,44 @@ class Midsurface:
     _patch: PatchMesh
 
     def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart.
+        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its
+        own chart.
 
         Of several shells, and of a mesh file, they are places in space.
         """
         return self._charted(compat.interpolation_points(V))[..., :3]
 
     def charted_by_shell(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """The same, of several shells that have charts in that of each cell's shell, where others may be too."""
+        """The same, of several shells that have charts in that of each cell's shell, where others
+        may be too.
+        """
         if not getattr(self._patch.embedding, "charts", False):
             return self.charted(V)
         return self._charted(compat.interpolation_points(V))[..., 3:5]
 
     def _charted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same at reference points (q, 2), with the normals of a mesh file that has imperfections."""
-        return at_reference_points(self._patch.nodes, self._patch.cells[self._original_cells], points)
+        """The same at reference points (q, 2), with the normals of a mesh file that has
+        imperfections.
+        """
+        return at_reference_points(
+            self._patch.nodes, self._patch.cells[self._original_cells], points
+        )
 
-    def deviation(self, points: NDArray[np.float64], besides: Sequence[Deviation] = ()) -> NDArray[np.float64] | None:
-        """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no imperfections."""
+    def deviation(
+        self, points: NDArray[np.float64], besides: Sequence[Deviation] = ()
+    ) -> NDArray[np.float64] | None:
+        """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no
+        imperfections.
+        """
         embedding = self._patch.embedding
         if not isinstance(embedding, Deviated):
             return None
         return self.at(points, replace(embedding, deviations=(*embedding.deviations, *besides)).w0)
 
     def at(self, points: NDArray[np.float64], of: Embedding) -> NDArray[np.float64]:
-        """A function of nodes of the triangulation at reference points (q, 2) of each cell, (cells, q, ...)."""
+        """A function of nodes of the triangulation at reference points (q, 2) of each cell, (cells,
+        q, ...).
+        """
         chart = self._charted(points)
         values = of(chart.reshape(-1, chart.shape[-1]))
         return np.asarray(values.reshape(*chart.shape[:2], *values.shape[1:]))
@@ -135,13 +157,17 @@ class Midsurface:
 
     @property
     def kinked(self) -> bool:
-        """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and at joints."""
+        """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and
+        at joints.
+        """
         charts = getattr(self._patch.embedding, "charts", not self.read)
         return any(self._patch.joints) or not charts
 
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
-        """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
+        """Name -> whether each cell of this rank, ghosts included, belongs to that part of the
+        surface.
+        """
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
 
     @property
@@ -150,30 +176,42 @@ class Midsurface:
         return self._patch.shells
 
     def beside(self, point: str) -> NDArray[np.bool_] | None:
-        """Whether each cell of this rank, ghosts too, is of the shell of a named point; None if there is one shell.
+        """Whether each cell of this rank, ghosts too, is of the shell of a named point; None if
+        there is one shell.
 
-        Another shell may have a vertex at the same place, or a sheet that stands on this one at a T-junction.
+        Another shell may have a vertex at the same place, or a sheet that stands on this one at a
+        T-junction.
         """
         if self._patch.feet:
-            standing = np.unique(np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet]))
+            standing = np.unique(
+                np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet])
+            )
             stands = np.asarray(np.isin(self._patch.corners, standing).any(axis=1))
             return np.asarray(~stands[self._original_cells])
         if not hasattr(self._patch.embedding, "charts"):
             return None
-        shells = np.rint(self._patch.nodes[self._patch.cells[:, 0], -1])  # the last number of a node is its shell's
+        shells = np.rint(
+            self._patch.nodes[self._patch.cells[:, 0], -1]
+        )  # the last number of a node is its shell's
         return np.asarray((shells == np.rint(self._patch.points[point][-1]))[self._original_cells])
 
     @cached_property
     def joints(self) -> list[NDArray[np.float64] | None]:
-        """For each joint a number of each cell of this rank, ghosts too: 1 on its one edge, -1 on the other, else 0.
+        """For each joint a number of each cell of this rank, ghosts too: 1 on its one edge, -1 on
+        the other, else 0.
 
         A T-junction has None.
         """
-        return [both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells] for both in self._patch.joints]
+        return [
+            both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells]
+            for both in self._patch.joints
+        ]
 
     @cached_property
     def feet(self) -> dict[str, NDArray[np.bool_]]:
-        """Name of an edge at a T-junction of a mesh file -> whether it stands on each cell of this rank."""
+        """Name of an edge at a T-junction of a mesh file -> whether it stands on each cell of this
+        rank.
+        """
         return {name: on[self._original_cells] for name, on in self._patch.feet.items()}
 
     @cached_property
@@ -188,7 +226,9 @@ class Midsurface:
 
     def function(self, field: GivenField) -> fem.Function:
         """The same as a function on this mesh, of the shape (size,)."""
-        f = fem.Function(fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name)
+        f = fem.Function(
+            fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name
+        )
         f.x.array.reshape(-1, field.size)[f.function_space.dofmap.list] = self.in_cells(field)
         return f
 
@@ -196,7 +236,9 @@ class Midsurface:
     def _original_cells(self) -> NDArray[np.int64]:
         """This rank's cells, ghosts included, in the numbers of the triangulation."""
         cell_map = self.mesh.topology.index_map(self.mesh.topology.dim)
-        return np.asarray(self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts])
+        return np.asarray(
+            self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts]
+        )
 
 
 def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
@@ -211,12 +253,16 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3).astype(np.int64)
     xyz = patch.embedding(patch.nodes[vertices])
-    domain = create_mesh(comm, basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)), corners, xyz)
+    domain = create_mesh(
+        comm, basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)), corners, xyz
+    )
     position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
     return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)
 
 
-def create_mesh(comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]) -> mesh.Mesh:
+def create_mesh(
+    comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]
+) -> mesh.Mesh:
     """A mesh on all ranks, from cells and node positions (n, 3) that every rank has."""
     first = comm.rank == 0
     return mesh.create_mesh(
@@ -231,23 +277,34 @@ def create_mesh(comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArr
 def at_reference_points(
     nodes: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coordinates (m, q, d) of reference points (q, 2) in triangles (m, 3 | 6 | 10) in gmsh's order."""
+    """Coordinates (m, q, d) of reference points (q, 2) in triangles (m, 3 | 6 | 10) in gmsh's
+    order.
+    """
     count = cells.shape[1]
     geometry = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.triangle, ORDERS[count], basix.LagrangeVariant.equispaced
+        basix.ElementFamily.P,
+        basix.CellType.triangle,
+        ORDERS[count],
+        basix.LagrangeVariant.equispaced,
     )
     values = geometry.tabulate(0, points)[0, :, :, 0]
     to_dolfinx = perm_gmsh(mesh.CellType.triangle, count)
     return np.asarray(np.einsum("qk,ckd->cqd", values, nodes[cells[:, to_dolfinx]]))
 
 
-def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]) -> dict[str, NDArray[np.int32]]:
+def _named_facets(
+    domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]
+) -> dict[str, NDArray[np.int32]]:
     """Find the facets of each named edge by the vertex numbers of the triangulation."""
     domain.topology.create_connectivity(1, 2)
     domain.topology.create_connectivity(1, 0)
     facets = mesh.exterior_facet_indices(domain.topology)
     # a rank may have no part of any edge, and dolfinx divides by their number
-    ends = mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty((0, 2), dtype=np.int32)
+    ends = (
+        mesh.entities_to_geometry(domain, 1, facets)
+        if len(facets)
+        else np.empty((0, 2), dtype=np.int32)
+    )
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
     named = {}
     for name, pairs in patch.edges.items():

@@ -6,11 +6,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, border_pairs, directed_sides, on_border
+from magshell_fenicsx.mesh.patch import (
+    MeshError,
+    PatchMesh,
+    as_set,
+    border_pairs,
+    directed_sides,
+    on_border,
+)
 
 
 def rotation(azimuth: float) -> NDArray[np.float64]:
-    """Q (3, 3) of a frame turned by an azimuth (rad): Q v are the components of v in it, and w Q turns rows w back."""
+    """Q (3, 3) of a frame turned by an azimuth (rad): Q v are the components of v in it, and w Q
+    turns rows w back.
+    """
     c, s = np.cos(azimuth), np.sin(azimuth)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -39,7 +48,9 @@ class Mirror:
     lost: Mapping[str, str] = field(default_factory=dict)
 
     def __eq__(self, other: object) -> bool:
-        """Whether it is the same plane with the same edges: the parts of an array are compared one by one."""
+        """Whether it is the same plane with the same edges: the parts of an array are compared one
+        by one.
+        """
         if not isinstance(other, Mirror):
             return NotImplemented
         same = (self.offset, self.lost) == (other.offset, other.lost)
@@ -49,7 +60,9 @@ class Mirror:
         return hash((*self.normal, self.offset))
 
     @classmethod
-    def of(cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None) -> "Mirror":
+    def of(
+        cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None
+    ) -> "Mirror":
         """The plane with a normal of any length."""
         unit = np.asarray(normal) / np.linalg.norm(normal)
         unit = np.where(np.abs(unit) < ROUNDING, 0.0, unit)
@@ -93,7 +106,10 @@ class Mirror:
     @property
     def images(self) -> list["Image"]:
         """The copies that make the whole; the first is what is modelled itself."""
-        return [Image(np.eye(3), np.zeros(3), 1.0), Image(self.reflection, 2 * self.offset * self.normal, -1.0)]
+        return [
+            Image(np.eye(3), np.zeros(3), 1.0),
+            Image(self.reflection, 2 * self.offset * self.normal, -1.0),
+        ]
 
     def everywhere(self, x: Array) -> Array:
         """Places (n, 3) and all their images, (copies n, 3)."""
@@ -101,10 +117,14 @@ class Mirror:
 
     def summed(self, v: Array, parity: float = 1.0) -> Array:
         """The sum (3,) of the images of a vector; mirrored ones count `parity` times."""
-        return np.asarray(sum(image.Q @ v * (parity if image.sign < 0 else 1.0) for image in self.images))
+        return np.asarray(
+            sum(image.Q @ v * (parity if image.sign < 0 else 1.0) for image in self.images)
+        )
 
     def turned(self, azimuth: float) -> "Mirror":
-        """This plane, given in a frame turned about e3 by an azimuth (rad), in the frame that is not turned."""
+        """This plane, given in a frame turned about e3 by an azimuth (rad), in the frame that is
+        not turned.
+        """
         return replace(self, normal=self.normal @ rotation(azimuth))
 
     @property
@@ -122,12 +142,17 @@ class Mirror:
         return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
 
     def keeps_lines(self, along: Array | None) -> bool:
-        """Whether images of lines along a vector (3,), or if None of meridians about e3, are such lines."""
+        """Whether images of lines along a vector (3,), or if None of meridians about e3, are such
+        lines.
+        """
         if along is None:
             through = abs(self.offset) < STRAIGHT or abs(float(self.normal[2])) > STRAIGHT
             return through and self.keeps_lines(np.eye(3)[2])
         unit = along / np.linalg.norm(along)
-        cosine, sine = abs(float(unit @ self.normal)), float(np.linalg.norm(np.cross(unit, self.normal)))
+        cosine, sine = (
+            abs(float(unit @ self.normal)),
+            float(np.linalg.norm(np.cross(unit, self.normal))),
+        )
         return min(cosine, sine) < STRAIGHT
 
     def beyond(self, x: Array) -> Array:
@@ -166,7 +191,8 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Sector(Mirror):
-    """Two planes through e3, this one and one that is turned by 180/m degrees; what lies between them is modelled.
+    """Two planes through e3, this one and one that is turned by 180/m degrees; what lies between
+    them is modelled.
 
     Waves cos(m theta) around e3 have both as planes of symmetry. A half is the sector of m = 1.
 
@@ -246,7 +272,9 @@ def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
     used, cells = np.unique(cells, return_inverse=True)
     cells = cells.reshape(-1, patch.cells.shape[1])
     one = np.arange(len(patch.nodes)) if patch.one is None else patch.one
-    first = np.full(len(patch.nodes), -1, dtype=np.int64)  # for each vertex, its first node that is kept
+    first = np.full(
+        len(patch.nodes), -1, dtype=np.int64
+    )  # for each vertex, its first node that is kept
     first[one[used][::-1]] = np.arange(len(used))[::-1]
     edges = {edge: first[one[pairs]] for edge, pairs in patch.edges.items()}
     border = border_pairs(first[one[used[directed_sides(cells)]]])

@@ -42,9 +42,11 @@ TIE = 1e-6  # of the area: a difference that decides nothing
 
 
 def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
-    """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger area, or of a rule.
+    """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger
+    area, or of a rule.
 
-    An edge has two at most. Nodes from `first_copy` on stand at places of others: see `branches.separated`.
+    An edge has two at most. Nodes from `first_copy` on stand at places of others: see
+    `branches.separated`.
 
     Raises
     ------
@@ -57,14 +59,19 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     if len(flat):
         raise MeshError(f"the triangle at {place_text(a[flat[0]])} has no area")
     edges = directed_sides(cells)
-    _, which, times = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, which, times = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     order = np.argsort(which.ravel(), kind="stable")
     first = np.cumsum(times)[times == 2] - 2
     one, other = order[first], order[first + 1]
-    agree = edges[one, 0] != edges[other, 0]  # neighbours run through their edge in opposite directions
+    agree = (
+        edges[one, 0] != edges[other, 0]
+    )  # neighbours run through their edge in opposite directions
     m = len(cells)
     left, right = one % m, other % m
-    # each triangle counts twice, once in each orientation: an orientable surface then has two separate copies
+    # each triangle counts twice, once in each orientation: an orientable surface then has two
+    # separate copies
     rows = np.concatenate([left, left + m])
     columns = np.concatenate([np.where(agree, right, right + m), np.where(agree, right + m, right)])
     graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
@@ -87,8 +94,8 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
 def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
     """Whether the normals are those of the triangles that are not `as_first`: of the larger area.
 
-    Halves of the same size, as refined meshes have them, do not depend on the numbers of triangles: their normals point
-    upwards on the whole, else along e2 or e1, else out of the volume.
+    Halves of the same size, as refined meshes have them, do not depend on the numbers of triangles:
+    their normals point upwards on the whole, else along e2 or e1, else out of the volume.
     """
     same, whole = areas[as_first].sum(), areas.sum()
     if abs(2 * same - whole) > TIE * whole:
@@ -102,7 +109,9 @@ def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.b
     return False
 
 
-def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32], first_copy: int | None) -> None:
+def _refuse_torn(
+    nodes: Array, cells: Cells, copy: NDArray[np.int32], first_copy: int | None
+) -> None:
     """See that pieces which are not connected lie apart."""
     if (copy == copy[0]).all():
         return
@@ -113,17 +122,20 @@ def _refuse_torn(nodes: Array, cells: Cells, copy: NDArray[np.int32], first_copy
     )
     if len(near):
         place = place_text(nodes[vertices[near[0, 0]]])
-        raise MeshError(f"the surface is torn: there are two nodes at {place}, and its parts are not connected")
+        raise MeshError(
+            f"the surface is torn: there are two nodes at {place}, and its parts are not connected"
+        )
 
 
 def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict[str, Cells]:
-    """The part of each named curve (e, 2) that is a border of the surface; every border edge needs a name.
+    """The part of each named curve (e, 2) that is a border of the surface; every border edge needs
+    a name.
 
     Raises
     ------
     MeshError
-        If a border edge has no name (a hole, or a node that stands twice in the file), or if the surface touches
-        itself in a vertex.
+        If a border edge has no name (a hole, or a node that stands twice in the file), or if the
+        surface touches itself in a vertex.
     """
     border = border_pairs(directed_sides(cells))
     listed = {pair for lines in named.values() for pair in as_set(lines)}
@@ -135,14 +147,18 @@ def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict
         corner = nodes[unnamed[0][0]]
         twice = np.sum(np.linalg.norm(nodes[vertices] - corner, axis=1) < SAME_PLACE * extent) > 1
         if twice:
-            raise MeshError(f"there are two nodes at {place_text(corner)}: the triangles beside it are not connected")
+            raise MeshError(
+                f"there are two nodes at {place_text(corner)}: the triangles beside it are not connected"
+            )
         raise MeshError(
             f"the surface ends at the edge around {place_text(place)}, which belongs to no physical curve: "
             "close the hole, or name the edge (an edge without a condition is free)"
         )
     ends, times = np.unique(border, return_counts=True)
     if (times > 2).any():
-        raise MeshError(f"the surface touches itself in the vertex {place_text(nodes[ends[times > 2][0]])}")
+        raise MeshError(
+            f"the surface touches itself in the vertex {place_text(nodes[ends[times > 2][0]])}"
+        )
     return on_border(named, border)
 
 
@@ -159,7 +175,8 @@ class MeshFile:
     scale
         Factor from its coordinates to lengths over R.
     normals
-        Whether nodes are places followed by normals, (n, 6), which the triangles around a node have on average.
+        Whether nodes are places followed by normals, (n, 6), which the triangles around a node have
+        on average.
     files
         What has its content.
     given
@@ -200,18 +217,22 @@ def normals(x: Array) -> Array:
 
 
 def read_msh(
-    file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None, held: Collection[str] = ()
+    file: MeshFile,
+    points: Mapping[str, Array],
+    mirror: Mirror | None = None,
+    held: Collection[str] = (),
 ) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
-    Physical groups of surfaces become named patches, those of curves named edges. Triangles whose orientation
-    differs from that of the larger area are turned over.
+    Physical groups of surfaces become named patches, those of curves named edges. Triangles whose
+    orientation differs from that of the larger area are turned over.
 
     Parameters
     ----------
     points
-        Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is the pole; of
-        several that are, one on no `held` edge, and best the pole of one of several shells.
+        Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is
+        the pole; of several that are, one on no `held` edge, and best the pole of one of several
+        shells.
     mirror
         The plane whose half is read; None for the whole surface.
     held
@@ -225,23 +246,35 @@ def read_msh(
     """
     if isinstance(file.given, Assembly):
         patch = file.given.patch
-        on_alike = {name: patch.points[like] for like in patch.points for name in _alike(points, like)}
+        on_alike = {
+            name: patch.points[like] for like in patch.points for name in _alike(points, like)
+        }
         others = {name: x for name, x in points.items() if name not in on_alike}
-        own = [patch.points[name] for name in map("{}_pole".format, patch.shells) if name in patch.points]
-        return replace(patch, points={**_vertices(patch, others, file.scale, held, own), **on_alike})
+        own = [
+            patch.points[name]
+            for name in map("{}_pole".format, patch.shells)
+            if name in patch.points
+        ]
+        return replace(
+            patch, points={**_vertices(patch, others, file.scale, held, own), **on_alike}
+        )
     try:
         patch = _whole(file)
     except MeshError as e:
         raise MeshError(f"shell: {e}" if file.given else f"shell.file: {e}") from None
     if isinstance(mirror, Sector) and patch.feet:
-        raise MeshError(f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half")
+        raise MeshError(
+            f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half"
+        )
     patch = cut(patch, mirror) if mirror else patch
     return replace(patch, points=_vertices(patch, points, file.scale, held))
 
 
 def _alike(points: Mapping[str, Array], name: str) -> list[str]:
     """The names of points at the place of one."""
-    return [other for other, x in points.items() if name in points and np.array_equal(x, points[name])]
+    return [
+        other for other, x in points.items() if name in points and np.array_equal(x, points[name])
+    ]
 
 
 def _whole(file: MeshFile) -> PatchMesh:
@@ -261,7 +294,9 @@ def _whole(file: MeshFile) -> PatchMesh:
     nodes, edges = nodes[origin], renamed(edges, cells, origin) if feet else edges
     for name, foot in feet.items():
         if name in edges:
-            raise MeshError(f"{file.path}: the physical curve {name}: is how a T-junction is called: take another")
+            raise MeshError(
+                f"{file.path}: the physical curve {name}: is how a T-junction is called: take another"
+            )
         edges[name] = foot.pairs
     before, cells = cells, oriented(nodes, cells, first_copy if feet else None)
     turned = (cells[:, 1] != before[:, 1]).astype(np.int64)
@@ -286,7 +321,11 @@ def cell_count(file: MeshFile) -> int:
 
 
 def _vertices(
-    patch: PatchMesh, points: Mapping[str, Array], scale: float, held: Collection[str], own: Sequence[Array] = ()
+    patch: PatchMesh,
+    points: Mapping[str, Array],
+    scale: float,
+    held: Collection[str],
+    own: Sequence[Array] = (),
 ) -> dict[str, Array]:
     """Named ones, and the highest as "pole": of several that are, a free one, best of the poles that shells have of
     their `own`."""
@@ -331,7 +370,9 @@ def _content(file: MeshFile) -> Triangles:
     patches = {name: np.isin(entity, entities) for name, entities in held.groups[2].items()}
     edges = {}
     for name, entities in held.groups[1].items():
-        lines = [nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities]
+        lines = [
+            nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities
+        ]
         if lines:  # a curve of the geometry may have no elements
             edges[name] = _places(file, held, np.concatenate(lines))
     return Triangles(held.places, cells, edges, patches)
@@ -345,7 +386,9 @@ def _elements(
     for name, dim, entity, nodes in held.blocks:
         if dim == dimension:
             if name not in passed_over:
-                raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
+                raise MeshError(
+                    f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3"
+                )
             blocks.append((entity, nodes))
     return blocks
 
@@ -353,7 +396,11 @@ def _elements(
 def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Indices of the nodes with these numbers."""
     order = np.argsort(held.tags)
-    positions: NDArray[np.int64] = order[np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)]
+    positions: NDArray[np.int64] = order[
+        np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)
+    ]
     if (missing := held.tags[positions] != numbers).any():
-        raise MeshError(f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there")
+        raise MeshError(
+            f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there"
+        )
     return positions

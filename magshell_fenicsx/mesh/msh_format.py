@@ -1,8 +1,10 @@
-"""The content of a file in gmsh's mesh format (MSH 2 to 4, text or binary), read by gmsh without running anything.
+"""The content of a file in gmsh's mesh format (MSH 2 to 4, text or binary), read by gmsh without
+running anything.
 
-gmsh chooses how to read a file from its first line. It runs scripts (SystemCall "..."), and it also runs a file of the
-same name with .opt at its end. So gmsh gets a copy in an empty folder, and only if the first line is that of a mesh.
-gmsh crashes on some damaged files, so it runs in a process of its own: this module as a program.
+gmsh chooses how to read a file from its first line. It runs scripts (SystemCall "..."), and it also
+runs a file of the same name with .opt at its end. So gmsh gets a copy in an empty folder, and only
+if the first line is that of a mesh. gmsh crashes on some damaged files, so it runs in a process of
+its own: this module as a program.
 """
 
 import os
@@ -36,7 +38,8 @@ class Content:
     tags, places
         Numbers (n,) and coordinates (n, 3) of the nodes.
     blocks
-        Elements of one type on one entity: gmsh's name of the type, dimension, entity, node numbers (m, k).
+        Elements of one type on one entity: gmsh's name of the type, dimension, entity, node numbers
+        (m, k).
     groups
         Dimension -> name of a physical group, or its number where it has none -> its entities.
     """
@@ -65,21 +68,36 @@ def parsed(content: bytes) -> Content:
         alone = Path(folder) / "part.msh"
         alone.write_bytes(content)
         command = [sys.executable, "-m", __name__, str(alone)]
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])}
-        done = subprocess.run(command, env=env, cwd=folder, capture_output=True, text=True, check=False)
+        env = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(
+                [str(Path(__file__).parents[2]), *filter(None, sys.path)]
+            ),
+        }
+        done = subprocess.run(
+            command, env=env, cwd=folder, capture_output=True, text=True, check=False
+        )
         if done.returncode == UNUSABLE:
             raise Unusable(done.stderr.strip())
         if done.returncode:
-            reason = (done.stderr.strip().splitlines() or ["nothing"])[-1] if done.returncode > 0 else "it crashed"
+            reason = (
+                (done.stderr.strip().splitlines() or ["nothing"])[-1]
+                if done.returncode > 0
+                else "it crashed"
+            )
             reason = reason.replace(str(alone), "the file").removeprefix("Exception: ").strip()
-            raise MeshError(f"is damaged, or of a version that gmsh does not read, which says: {reason}")
+            raise MeshError(
+                f"is damaged, or of a version that gmsh does not read, which says: {reason}"
+            )
         mesh: Content = Content(*pickle.loads((Path(folder) / FOUND).read_bytes()))
     if not np.isfinite(mesh.places).all():
         raise MeshError("a coordinate is not a number")
     return mesh
 
 
-def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:
+def _held(
+    model: Any,
+) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:
     """The fields of `Content`."""
     tags, xyz, _ = model.mesh.getNodes()
     blocks, groups = Blocks(), dict[int, dict[str, list[int]]]({1: {}, 2: {}})
@@ -87,7 +105,9 @@ def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, 
         for kind, _, nodes in zip(*model.mesh.getElements(dim, entity), strict=True):
             name, _, _, width, *_ = model.mesh.getElementProperties(kind)
             each = nodes.astype(np.int64).reshape(-1, width)
-            first = np.unique(each, axis=0, return_index=True)[1]  # MSH 2 repeats an element for each of its groups
+            first = np.unique(each, axis=0, return_index=True)[
+                1
+            ]  # MSH 2 repeats an element for each of its groups
             blocks.append((name, dim, entity, each[np.sort(first)]))
     for dim, group in model.getPhysicalGroups():
         if dim in groups:

@@ -49,13 +49,18 @@ class Triangles:
     @cached_property
     def digest(self) -> str:
         """A hash of all that it has."""
-        named = [each for name, part in {**self.edges, **self.patches}.items() for each in (np.array(name), part)]
+        named = [
+            each
+            for name, part in {**self.edges, **self.patches}.items()
+            for each in (np.array(name), part)
+        ]
         return _digest(self.nodes, self.cells, *named)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GivenField:
-    """Numbers that vary over `Triangles` as a program gives them, polynomials in each; nobody changes it.
+    """Numbers that vary over `Triangles` as a program gives them, polynomials in each; nobody
+    changes it.
 
     Attributes
     ----------
@@ -64,7 +69,8 @@ class GivenField:
     degree
         Of the polynomials.
     nodal
-        (m, nodes, size) values at the nodes of Basix's Lagrange element of the degree, in the order of each triangle.
+        (m, nodes, size) values at the nodes of Basix's Lagrange element of the degree, in the order
+        of each triangle.
     swapped
         (nodes,) for each node that with the second and third vertex exchanged.
     home
@@ -134,19 +140,19 @@ class PatchMesh:
     points
         Name -> (d,) coordinates of a vertex of the mesh.
     one
-        (n,) for each node the node that it is glued to, or itself: glued nodes have the same place in space
-        and are one vertex. `edges` has these numbers. None where nothing is glued.
+        (n,) for each node the node that it is glued to, or itself: glued nodes have the same place
+        in space and are one vertex. `edges` has these numbers. None where nothing is glued.
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
     given
-        (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1 where it has been
-        turned over; None without.
+        (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1
+        where it has been turned over; None without.
     joints
-        Of each two edges that are glued: whether each triangle has one, and whether it has the other. None for an edge
-        on another shell, of which nothing is glued.
+        Of each two edges that are glued: whether each triangle has one, and whether it has the
+        other. None for an edge on another shell, of which nothing is glued.
     feet
-        Of a mesh file in which an edge has three triangles: name of an edge that stands on another sheet -> whether
-        each triangle is one on which it does.
+        Of a mesh file in which an edge has three triangles: name of an edge that stands on another
+        sheet -> whether each triangle is one on which it does.
     shells
         Names of the patches that are shells, of which there are several.
     """
@@ -193,7 +199,9 @@ def place_text(x: NDArray[np.float64]) -> str:
 
 
 def directed_sides(cells: NDArray[np.int64]) -> Pairs:
-    """Sides (3 m, 2) in the direction of their triangles (m, 3 or more): all first sides, all second, all third."""
+    """Sides (3 m, 2) in the direction of their triangles (m, 3 or more): all first sides, all
+    second, all third.
+    """
     return np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
 
 
@@ -211,7 +219,10 @@ def as_set(pairs: Pairs) -> set[tuple[int, int]]:
 def on_border(named: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
     """The part of each named edge that lies on the border; names without such a part are left out."""
     ends = as_set(border)
-    kept = {name: pairs[[(a, b) in ends for a, b in np.sort(pairs, axis=1)]] for name, pairs in named.items()}
+    kept = {
+        name: pairs[[(a, b) in ends for a, b in np.sort(pairs, axis=1)]]
+        for name, pairs in named.items()
+    }
     return {name: pairs for name, pairs in kept.items() if len(pairs)}
 
 
@@ -261,4 +272,6 @@ class Deviated:
     def w0(self, chart: Array) -> Array:
         """w0 over R at places of the chart, (n,)."""
         places = self.perfect(chart)
-        return np.asarray(sum((deviation(places) for deviation in self.deviations), np.zeros(len(places))))
+        return np.asarray(
+            sum((deviation(places) for deviation in self.deviations), np.zeros(len(places)))
+        )

@@ -1,7 +1,9 @@
-"""Surfaces of revolution about e3, charted by (rho theta, s) or, up to their pole, by s (cos theta, sin theta).
+"""Surfaces of revolution about e3, charted by (rho theta, s) or, up to their pole, by s (cos theta,
+sin theta).
 
-A profile is a curve in the plane (r, z) with the coordinate s. With r to the right and z upwards, the normal of the
-surface points to the right of the direction of s: on a cylinder with s upwards it points outwards.
+A profile is a curve in the plane (r, z) with the coordinate s. With r to the right and z upwards,
+the normal of the surface points to the right of the direction of s: on a cylinder with s upwards it
+points outwards.
 """
 
 from dataclasses import dataclass
@@ -12,7 +14,8 @@ import scipy
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-ROUNDS = 4  # iterations for a spline's parameter, which converges to the arc length as the square of its steps
+# iterations for a spline's parameter, which converges to the arc length as the square of its steps
+ROUNDS = 4
 
 
 class Profile(Protocol):
@@ -44,7 +47,9 @@ class Segment:
         return float(np.hypot(*np.subtract(self.end, self.start)))
 
     def __call__(self, s: Array) -> Array:
-        return np.asarray(self.start + np.asarray(s)[..., None] / self.length * np.subtract(self.end, self.start))
+        return np.asarray(
+            self.start + np.asarray(s)[..., None] / self.length * np.subtract(self.end, self.start)
+        )
 
     def tangent(self, s: Array) -> Array:
         return np.broadcast_to(np.subtract(self.end, self.start) / self.length, (*np.shape(s), 2))
@@ -78,7 +83,9 @@ class Arc:
     def foot(self, rz: Array) -> float:
         turn = np.arctan2(rz[1], rz[0] - self.centre) - self.start
         beyond = 2 * np.pi - (self.end - self.start)
-        turn = (turn + beyond / 2) % (2 * np.pi) - beyond / 2  # a point beyond the arc belongs to the nearer end
+        turn = (turn + beyond / 2) % (
+            2 * np.pi
+        ) - beyond / 2  # a point beyond the arc belongs to the nearer end
         return float(np.clip(turn, 0.0, self.end - self.start) * self.radius)
 
 
@@ -107,7 +114,10 @@ class Spline:
         nearest = int(np.argmin(np.linalg.norm(self(coarse) - rz, axis=1)))
         around = coarse[max(nearest - 1, 0)], coarse[min(nearest + 1, 400)]
         least = scipy.optimize.minimize_scalar(
-            lambda s: np.sum((self(s) - rz) ** 2), bounds=around, method="bounded", options={"xatol": 1e-13}
+            lambda s: np.sum((self(s) - rz) ** 2),
+            bounds=around,
+            method="bounded",
+            options={"xatol": 1e-13},
         )
         ends = [float(least.x), *(float(s) for s in around)]
         return min(ends, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
@@ -133,7 +143,9 @@ class Revolved:
         """Chart (2,) of a point (3,), theta in [first, first + 2 pi)."""
         theta = np.arctan2(x[1], x[0])
         theta = first + (theta - first + 1e-9) % (2 * np.pi) - 1e-9
-        return np.array([theta * self.rho, self.profile.foot(np.array([np.hypot(x[0], x[1]), x[2]]))])
+        return np.array(
+            [theta * self.rho, self.profile.foot(np.array([np.hypot(x[0], x[1]), x[2]]))]
+        )
 
 
 @dataclass(frozen=True)
@@ -159,7 +171,11 @@ class Capped:
         coarse = np.linspace(0, self.profile.length, 2001, dtype=np.float64)
         s = coarse[scipy.spatial.cKDTree(self.profile(coarse)).query(rz)[1]]
         for _ in range(ROUNDS):  # Newton's method, whose residual vanishes on the surface
-            s = np.clip(s + np.sum((rz - self.profile(s)) * self.profile.tangent(s), axis=1), 0, self.profile.length)
+            s = np.clip(
+                s + np.sum((rz - self.profile(s)) * self.profile.tangent(s), axis=1),
+                0,
+                self.profile.length,
+            )
         return np.asarray(self.profile.length - s)
 
     def inverse(self, x: Array) -> Array:

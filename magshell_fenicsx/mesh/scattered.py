@@ -1,9 +1,10 @@
 """A smooth function of place through values at scattered places, noise included.
 
-Each patch of the surface has a spline of its own that minimises sum (f - w)^2 + lambda |f|^2 in the seminorm of the
-kernel -r^5 (Duchon 1977). The weights of the patches add up to one (Wendland, *Scattered Data Approximation*, 2005,
-chapter 15), so that the function is twice continuously differentiable. Generalised cross-validation over all patches
-estimates the noise (Craven and Wahba 1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
+Each patch of the surface has a spline of its own that minimises sum (f - w)^2 + lambda |f|^2 in the
+seminorm of the kernel -r^5 (Duchon 1977). The weights of the patches add up to one (Wendland,
+*Scattered Data Approximation*, 2005, chapter 15), so that the function is twice continuously
+differentiable. Generalised cross-validation over all patches estimates the noise (Craven and Wahba
+1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 NEIGHBOURS = 80  # values in a patch
 TRIED = 60  # patches that estimate the noise
-ACROSS = 2.5  # radius of a patch in a hole over the distance of the nearest value: it reaches across
+ACROSS = (
+    2.5  # radius of a patch in a hole over the distance of the nearest value: it reaches across
+)
 INNER = 0.7  # part of its radius up to which a patch covers the surface
 SAME = 1e-9  # distance over R of one place
 FLAT = 0.1  # height of a patch over its width, below which polynomials along the surface are enough
@@ -49,7 +52,9 @@ class Scattered:
         """Values (n,) at places (n, 3); NaN where no patch reaches."""
         total, weights = np.zeros(len(x)), np.zeros(len(x))
         members = scipy.spatial.cKDTree(x).query_ball_point(self.centres, self.radii)
-        for centre, radius, spline, inside in zip(self.centres, self.radii, self.splines, members, strict=True):
+        for centre, radius, spline, inside in zip(
+            self.centres, self.radii, self.splines, members, strict=True
+        ):
             if inside:
                 weight = _wendland(np.linalg.norm(x[inside] - centre, axis=1) / radius)
                 total[inside] += weight * spline(x[inside])
@@ -58,8 +63,11 @@ class Scattered:
             return np.asarray(total / weights)
 
 
-def scattered(places: Array, values: Array, cover: Array, *, noise: float | None = None) -> Scattered:
-    """A smooth function through values (n,) at places (n, 3); of several values at one place the first counts.
+def scattered(
+    places: Array, values: Array, cover: Array, *, noise: float | None = None
+) -> Scattered:
+    """A smooth function through values (n,) at places (n, 3); of several values at one place the
+    first counts.
 
     Parameters
     ----------
@@ -75,7 +83,9 @@ def scattered(places: Array, values: Array, cover: Array, *, noise: float | None
     centres, radii = _balls(tree, np.vstack([cover, places]))
     parts = [
         (_Part.of(places[inside], np.asarray(centre)), values[inside])
-        for centre, inside in zip(centres, map(_some, tree.query_ball_point(centres, radii)), strict=True)
+        for centre, inside in zip(
+            centres, map(_some, tree.query_ball_point(centres, radii)), strict=True
+        )
     ]
     if noise is None:
         noise = _noise(parts[:: max(1, len(parts) // TRIED)])
@@ -115,7 +125,9 @@ class _Spline:
 
     def __call__(self, x: Array) -> Array:
         y = np.asarray((x - self.centre) / self.scale)
-        return np.asarray(_kernel(y, self.places) @ self.kernel + _quadratics(y, self.axes) @ self.polynomial)
+        return np.asarray(
+            _kernel(y, self.places) @ self.kernel + _quadratics(y, self.axes) @ self.polynomial
+        )
 
 
 @dataclass(frozen=True)
@@ -142,7 +154,9 @@ class _Part:
 
     @cached_property
     def modes(self) -> tuple[Array, Array]:
-        """Eigenvalues of the kernel beside the polynomials, in lengths of R, and its eigenvectors (n, n - q)."""
+        """Eigenvalues of the kernel beside the polynomials, in lengths of R, and its eigenvectors
+        (n, n - q).
+        """
         free = np.linalg.qr(self.polynomials, mode="complete")[0][:, self.polynomials.shape[1] :]
         sizes, vectors = np.linalg.eigh(free.T @ _kernel(self.places, self.places) @ free)
         return np.maximum(sizes, 1e-15 * sizes[-1]) * self.scale**5, free @ vectors
@@ -155,13 +169,19 @@ class _Part:
             left = tried[:, None] / (tried[:, None] + sizes)
             smoothing = tried[np.argmin(left**2 @ parts**2 - 2 * noise**2 * left.sum(axis=1))]
         kernel = modes @ (parts / (sizes + smoothing)) * self.scale**5
-        rest = values - _kernel(self.places, self.places) @ kernel - smoothing / self.scale**5 * kernel
-        polynomial = np.asarray(np.linalg.lstsq(_quadratics(self.places, self.axes), rest, rcond=DEPENDENT)[0])
+        rest = (
+            values - _kernel(self.places, self.places) @ kernel - smoothing / self.scale**5 * kernel
+        )
+        polynomial = np.asarray(
+            np.linalg.lstsq(_quadratics(self.places, self.axes), rest, rcond=DEPENDENT)[0]
+        )
         return _Spline(self.places, self.centre, self.scale, self.axes, kernel, polynomial)
 
 
 def _noise(parts: Sequence[tuple[_Part, Array]]) -> float:
-    """Standard deviation of the noise where one lambda for all patches has the least score of cross-validation."""
+    """Standard deviation of the noise where one lambda for all patches has the least score of
+    cross-validation.
+    """
     sizes = np.concatenate([part.modes[0] for part, _ in parts])
     components = np.concatenate([part.modes[1].T @ values for part, values in parts])
     tried = sizes.max() * LAMBDAS

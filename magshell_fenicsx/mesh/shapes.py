@@ -1,4 +1,5 @@
-"""The plane shapes that gmsh triangulates, the chart of the mid-surface or half of it; sphere and plane over a chart.
+"""The plane shapes that gmsh triangulates, the chart of the mid-surface or half of it; sphere and
+plane over a chart.
 
 The sphere of radius 1 is charted by (x, y) = phi (cos theta, sin theta).
 """
@@ -27,7 +28,9 @@ class Shape(Protocol):
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the coordinates of the modelled part: of a disc of radius and angle."""
+        """Lower and upper bounds of the coordinates of the modelled part: of a disc of radius and
+        angle.
+        """
 
     @property
     def half(self) -> bool: ...
@@ -41,7 +44,9 @@ class Shape(Protocol):
         """The pairs of opposite sides that are one line of the surface."""
 
     def faces(self, occ: Any) -> Faces:
-        """Make the shape's faces with gmsh's OpenCASCADE kernel; elements follow their common edges."""
+        """Make the shape's faces with gmsh's OpenCASCADE kernel; elements follow their common
+        edges.
+        """
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
         """Which of the points (n, 2) lie on each named boundary edge."""
@@ -58,7 +63,8 @@ class DiscShape:
     circles
         Radii of inner circles that element edges follow (rims of dimples).
     rims
-        Other closed curves that they follow, points (n, 2) each; parts beyond the edge are left out.
+        Other closed curves that they follow, points (n, 2) each; parts beyond the edge are left
+        out.
     edge
         Name of its outer edge.
     waves
@@ -120,7 +126,9 @@ class DiscShape:
 
 @dataclass(frozen=True)
 class StripShape:
-    """0 <= x <= 1, |y| <= width/2; edges "root" (x = 0), "tip", "sides", and "symmetry" of the half with y >= 0."""
+    """0 <= x <= 1, |y| <= width/2; edges "root" (x = 0), "tip", "sides", and "symmetry" of the half
+    with y >= 0.
+    """
 
     width: float
     half: bool
@@ -137,7 +145,9 @@ class StripShape:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        return np.array([0.0, 0.0 if self.half else -self.width / 2]), np.array([1.0, self.width / 2])
+        return np.array([0.0, 0.0 if self.half else -self.width / 2]), np.array(
+            [1.0, self.width / 2]
+        )
 
     def faces(self, occ: Any) -> Faces:
         below = 0 if self.half else -self.width / 2
@@ -159,7 +169,9 @@ class StripShape:
 
 
 def within(occ: Any, rims: Sequence[Array], whole: Callable[[], tuple[int, int]]) -> Faces:
-    """The faces within closed curves, points (n, 2) each, as far as they belong to a face that `whole` makes."""
+    """The faces within closed curves, points (n, 2) each, as far as they belong to a face that
+    `whole` makes.
+    """
     pieces: Faces = []
     for points in rims:
         tags = [occ.addPoint(x, y, 0) for x, y in points]

@@ -18,11 +18,16 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 BOX = 1e-6  # gmsh's boxes are larger than what is in them by 1e-7
 ATTEMPTS, GROWTH = 7, 0.4
-WIDER, WIDEN = 2, 3e-3  # after how many attempts rims are made wider, and by how much: no part of the error
+WIDER, WIDEN = (
+    2,
+    3e-3,
+)  # after how many attempts rims are made wider, and by how much: no part of the error
 ORDER, TRIANGLE10, LINE4 = 3, 21, 26  # gmsh's numbers of the cubic elements
 
 
-def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding: Embedding) -> PatchMesh:
+def triangulate(
+    shape: Shape, size: Size, points: Mapping[str, Array], embedding: Embedding
+) -> PatchMesh:
     """Triangulate a shape with gmsh; call it on one rank only.
 
     Parameters
@@ -58,11 +63,15 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
     return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one if shape.glued else None)
 
 
-def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Array, Numbers, Numbers]:
+def _meshed(
+    shape: Shape, size: Size, points: Mapping[str, Array]
+) -> tuple[Array, Numbers, Numbers]:
     """Nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
     gmsh = gmsh_module()
 
-    gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may change meshes, and run commands
+    gmsh.initialize(
+        readConfigFiles=False, interruptible=False
+    )  # ~/.gmshrc may change meshes, and run commands
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         for rule in ("MeshSizeExtendFromBoundary", "MeshSizeFromPoints", "MeshSizeFromCurvature"):
@@ -83,14 +92,19 @@ def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Arra
         number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
         number[tags.astype(np.int64)] = np.arange(len(tags))
         nodes = xyz.reshape(-1, 3)[:, :2].copy()
-        cells = number[gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)].reshape(-1, 10)
-        lines = number[gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)].reshape(-1, 4)[:, :2]
+        cells = number[gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)].reshape(
+            -1, 10
+        )
+        lines = number[gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)].reshape(-1, 4)[
+            :, :2
+        ]
     except Exception as e:  # gmsh's own errors have no class of their own
         raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
     finally:
         gmsh.finalize()
-    # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale, and with it
-    # an order of convergence in h; this place reproduces quadratics (Lenoir, SIAM J. Numer. Anal. 23, 1986)
+    # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale,
+    # and with it an order of convergence in h; this place reproduces quadratics (Lenoir, SIAM J.
+    # Numer. Anal. 23, 1986)
     nodes[cells[:, 9]] = nodes[cells[:, 3:9]].sum(axis=1) / 4 - nodes[cells[:, :3]].sum(axis=1) / 6
     return nodes, cells, lines
 
@@ -125,17 +139,25 @@ def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
     first, second = side(low), side(high)
     shift = np.eye(4)
     shift[axis, 3] = high - low
-    model.mesh.setPeriodic(1, [tag for _, tag in second], [tag for _, tag in first], shift.ravel().tolist())
+    model.mesh.setPeriodic(
+        1, [tag for _, tag in second], [tag for _, tag in first], shift.ravel().tolist()
+    )
 
 
 def _glue(shape: Shape, nodes: Array) -> NDArray[np.int64]:
     """For each node the node that it is glued to, or itself."""
     one = np.arange(len(nodes))
     for axis, low, high in shape.glued:
-        first, second = (np.flatnonzero(np.abs(nodes[:, axis] - end) < CLOSE) for end in (low, high))
-        distance, nearest = scipy.spatial.cKDTree(nodes[first, 1 - axis, None]).query(nodes[second, 1 - axis, None])
+        first, second = (
+            np.flatnonzero(np.abs(nodes[:, axis] - end) < CLOSE) for end in (low, high)
+        )
+        distance, nearest = scipy.spatial.cKDTree(nodes[first, 1 - axis, None]).query(
+            nodes[second, 1 - axis, None]
+        )
         if len(first) != len(second) or distance.max() > 1e3 * CLOSE:
-            raise MeshError("gmsh cannot mesh this surface: the two sides that are glued have different nodes")
+            raise MeshError(
+                "gmsh cannot mesh this surface: the two sides that are glued have different nodes"
+            )
         one[second] = one[first[nearest]]
     return one
 
@@ -144,7 +166,11 @@ def _overturned(nodes: Array) -> Array:
     """The corners (k, 2) of cubic triangles (m, 10, 2) that are turned over there."""
     x = nodes.transpose(1, 0, 2)
     sides = ((0, 3, 4, 1), (1, 5, 6, 2), (2, 7, 8, 0))  # nodes along each, in its direction
-    out = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides]  # derivatives at the beginning
+    out = [
+        -5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides
+    ]  # derivatives at the beginning
     into = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
-    turned = [into[i - 1][:, 0] * out[i][:, 1] - into[i - 1][:, 1] * out[i][:, 0] <= 0 for i in range(3)]
+    turned = [
+        into[i - 1][:, 0] * out[i][:, 1] - into[i - 1][:, 1] * out[i][:, 0] <= 0 for i in range(3)
+    ]
     return np.concatenate([x[sides[i][0]][turned[i]] for i in range(3)])

@@ -20,7 +20,8 @@ TURNED_OVER = {
 
 
 class Folding:
-    """Copies of a sector side by side: copy k lies between the azimuths k and k + 1 times its angle.
+    """Copies of a sector side by side: copy k lies between the azimuths k and k + 1 times its
+    angle.
 
     Parameters
     ----------
@@ -29,7 +30,8 @@ class Folding:
     count
         Of the copies, the first of which is the sector itself.
     patch
-        Its triangulation, in the chart of a disc around the axis, or of a rectangle whose first axis goes around e3.
+        Its triangulation, in the chart of a disc around the axis, or of a rectangle whose first
+        axis goes around e3.
     """
 
     def __init__(self, angle: float, count: int, patch: PatchMesh) -> None:
@@ -54,7 +56,9 @@ class Folding:
 
     def copies(self, chart: Array) -> NDArray[np.int64]:
         """In which copy each place (n, 2) of the half lies."""
-        along = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]  # at pi rounding has a sign
+        along = (
+            np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]
+        )  # at pi rounding has a sign
         return np.asarray(np.clip(np.floor(along / self.end), 0, self.count - 1), dtype=np.int64)
 
     def embedding(self, of: Embedding) -> Embedding:
@@ -80,7 +84,9 @@ class Folding:
 
 
 class FoldingInSpace:
-    """The same for a triangulation in space: that of a mesh file, or of several shells, whose nodes are not shared."""
+    """The same for a triangulation in space: that of a mesh file, or of several shells, whose nodes
+    are not shared.
+    """
 
     def __init__(self, sector: Sector, patch: PatchMesh) -> None:
         self.count, self._sector = sector.waves, sector
@@ -88,7 +94,10 @@ class FoldingInSpace:
 
     def image(self, nodes: Array, k: int) -> Array:
         """Copy k of nodes; those of several shells get k as their last number but one."""
-        images, vectors = nodes.copy(), 1 if self._several else nodes.shape[1] // 3  # places, and normals if any
+        images, vectors = (
+            nodes.copy(),
+            1 if self._several else nodes.shape[1] // 3,
+        )  # places, and normals if any
         for i in range(vectors):
             images[:, 3 * i : 3 * i + 3] = nodes[:, 3 * i : 3 * i + 3] @ self.turn(k).T
         return np.insert(images, -1, k, axis=1) if self._several else images
@@ -97,14 +106,20 @@ class FoldingInSpace:
         """See `Folding`."""
         begin = rotation(self._sector.azimuth)
         angle = self._sector.angle
-        Q = rotation(-(k + 1) * angle) @ np.diag([1.0, -1.0, 1.0]) if k % 2 else rotation(-k * angle)
+        Q = (
+            rotation(-(k + 1) * angle) @ np.diag([1.0, -1.0, 1.0])
+            if k % 2
+            else rotation(-k * angle)
+        )
         return np.asarray(begin.T @ Q @ begin)
 
     def copies(self, x: Array) -> NDArray[np.int64]:
         """In which copy each place (n, 3) of the half lies."""
         at = x @ rotation(self._sector.azimuth).T
         along = np.abs(np.arctan2(at[:, 1], at[:, 0]))
-        return np.asarray(np.clip(np.floor(along / self._sector.angle), 0, self.count - 1), dtype=np.int64)
+        return np.asarray(
+            np.clip(np.floor(along / self._sector.angle), 0, self.count - 1), dtype=np.int64
+        )
 
     def back(self, x: Array) -> Array:
         """The places of the sector whose copies these are."""
@@ -113,7 +128,11 @@ class FoldingInSpace:
 
     def embedding(self, of: Embedding) -> Embedding:
         """That of all copies."""
-        return CopiesEmbedded(of, tuple(self.turn(k) for k in range(self.count))) if self._several else of
+        return (
+            CopiesEmbedded(of, tuple(self.turn(k) for k in range(self.count)))
+            if self._several
+            else of
+        )
 
     def key(self, nodes: Array) -> Array:
         """What nodes of copies have in common that are one: the place, and the shell."""
@@ -122,7 +141,9 @@ class FoldingInSpace:
 
 @dataclass(frozen=True)
 class CopiesEmbedded:
-    """Nodes of copies of several shells -> places (n, 3), each by the nodes of the sector and its matrix (3, 3)."""
+    """Nodes of copies of several shells -> places (n, 3), each by the nodes of the sector and its
+    matrix (3, 3).
+    """
 
     of: Embedding
     turns: tuple[Array, ...]
@@ -144,12 +165,18 @@ def folding_of(sector: Sector, patch: PatchMesh) -> "Folding | FoldingInSpace":
     return Folding(sector.angle, sector.waves, patch)
 
 
-def unfolded(patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[str, str]) -> PatchMesh:
-    """The triangulation of all copies, from that of the sector; the edges where it begins and ends have these names."""
+def unfolded(
+    patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[str, str]
+) -> PatchMesh:
+    """The triangulation of all copies, from that of the sector; the edges where it begins and ends
+    have these names.
+    """
     n, count = len(patch.nodes), folding.count
     nodes = np.concatenate([folding.image(patch.nodes, k) for k in range(count)])
     over = TURNED_OVER[patch.cells.shape[1]]
-    cells = np.concatenate([k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(count)])
+    cells = np.concatenate(
+        [k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(count)]
+    )
     keys = folding.key(nodes)
     near = scipy.spatial.cKDTree(keys).query_ball_point(keys, CLOSE * np.ptp(keys, axis=0).max())
     same = np.array([min(each) for each in near])
@@ -164,10 +191,14 @@ def unfolded(patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[st
         return np.concatenate([new[glued[k * n + patch.edges[name]]] for k in ks])
 
     last = count - 1
-    edges = {name: copied(name, range(count)) for name in patch.edges if name not in (CUT, SECOND_CUT)}
+    edges = {
+        name: copied(name, range(count)) for name in patch.edges if name not in (CUT, SECOND_CUT)
+    }
     first, second = copied(CUT, [0]), copied(CUT if last % 2 else SECOND_CUT, [last])
     edges |= (
-        {CUT: np.concatenate([first, second])} if ends == (CUT, CUT) else dict(zip(ends, (first, second), strict=True))
+        {CUT: np.concatenate([first, second])}
+        if ends == (CUT, CUT)
+        else dict(zip(ends, (first, second), strict=True))
     )
     return replace(
         patch,
@@ -179,7 +210,9 @@ def unfolded(patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[st
         one=new[glued[used]] if apart or patch.one is not None else None,
         patches={name: np.tile(inside, count) for name, inside in patch.patches.items()},
         given=None if patch.given is None else np.tile(patch.given, (count, 1)),
-        joints=tuple(both and (np.tile(both[0], count), np.tile(both[1], count)) for both in patch.joints),
+        joints=tuple(
+            both and (np.tile(both[0], count), np.tile(both[1], count)) for both in patch.joints
+        ),
     )
 
 

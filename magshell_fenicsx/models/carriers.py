@@ -1,11 +1,14 @@
-"""Where the densities of a shell are integrated: its mid-surface, or the meridian of what is closed around e3.
+"""Where the densities of a shell are integrated: its mid-surface, or the meridian of what is closed
+around e3.
 
-A carrier gives the jets of fields, the measures of cells, of the edges between them and of the boundary's edges, and
-how wide the cells are there. Whoever writes an energy writes its density alone.
+A carrier gives the jets of fields, the measures of cells, of the edges between them and of the
+boundary's edges, and how wide the cells are there. Whoever writes an energy writes its density
+alone.
 
-On a surface of revolution the coordinates are (s, theta), s the meridian's parameter; jets are those at theta = 0.
-Their components are along (e_rho, e_theta, e_z), which turn with theta: e_rho' = e_theta, e_theta' = -e_rho. In this
-order a_1 x a_2 points outward where s grows away from the pole.
+On a surface of revolution the coordinates are (s, theta), s the meridian's parameter; jets are
+those at theta = 0. Their components are along (e_rho, e_theta, e_z), which turn with theta: e_rho'
+= e_theta, e_theta' = -e_rho. In this order a_1 x a_2 points outward where s grows away from the
+pole.
 """
 
 from collections.abc import Callable, Sequence
@@ -97,12 +100,14 @@ def _vector(*components: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Energy:
-    """An energy as a function of the displacement's jet, so that waves may be added to a displacement; see `Term`.
+    """An energy as a function of the displacement's jet, so that waves may be added to a
+    displacement; see `Term`.
 
     Attributes
     ----------
     of
-        Of the jet of u: the energy on the carrier, of which `Carrier.whole` times as much is modelled.
+        Of the jet of u: the energy on the carrier, of which `Carrier.whole` times as much is
+        modelled.
     work
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
     density
@@ -127,7 +132,9 @@ class Energy:
     column: str = ""
 
     def added(self, u: Jet, v: Jet) -> ufl.Form:
-        """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its symmetric part."""
+        """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its
+        symmetric part.
+        """
         if self.work is None:
             return self.of(u + v)
         return 0.25 * (self.work(u + v, v) - self.work(u - v, v))
@@ -163,10 +170,11 @@ class Carrier:
     widths
         h_e of edges between cells and at the boundary, see `edges.two_sided`.
     rule, edge_rule, contact_rule
-        Degrees of the quadrature on cells, along edges (None where these are points) and under contact.
+        Degrees of the quadrature on cells, along edges (None where these are points) and under
+        contact.
     tables
-        Of the space of the placement and places in the reference cell, away from singular ones: a function from nodal
-        values, with ghosts, to jets (6, cells, places, 3).
+        Of the space of the placement and places in the reference cell, away from singular ones: a
+        function from nodal values, with ghosts, to jets (6, cells, places, 3).
     variant
         Of discontinuous fields, which are known at places where the coordinates are regular.
     whole
@@ -200,7 +208,8 @@ class Carrier:
         """Fields of so many numbers, discontinuous and as rich as the placement."""
         cell, degree = self.mesh.basix_cell(), self.r0.function_space.element.basix_element.degree
         return fem.functionspace(
-            self.mesh, basix.ufl.element("DG", cell, degree, lagrange_variant=self.variant, shape=(size,))
+            self.mesh,
+            basix.ufl.element("DG", cell, degree, lagrange_variant=self.variant, shape=(size,)),
         )
 
     def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
@@ -209,7 +218,9 @@ class Carrier:
 
     def dx(self, rule: int | None = None) -> ufl.Measure:
         """Of the cells, in the surface's coordinates."""
-        return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": rule or self.rule})
+        return ufl.Measure(
+            "dx", domain=self.mesh, metadata={"quadrature_degree": rule or self.rule}
+        )
 
     def dS(self) -> ufl.Measure:
         """Of the edges between cells."""
@@ -220,10 +231,17 @@ class Carrier:
         return self.each_ds([facets])[0]
 
     def each_ds(self, parts: Sequence[Facets]) -> list[ufl.Measure]:
-        """Of some parts of the boundary that do not overlap, each of one measure: a form may have one alone."""
+        """Of some parts of the boundary that do not overlap, each of one measure: a form may have
+        one alone.
+        """
         facets = np.concatenate(parts)
-        numbers, order = np.repeat(np.arange(1, len(parts) + 1), [len(each) for each in parts]), np.argsort(facets)
-        tags = mesh.meshtags(self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32))
+        numbers, order = (
+            np.repeat(np.arange(1, len(parts) + 1), [len(each) for each in parts]),
+            np.argsort(facets),
+        )
+        tags = mesh.meshtags(
+            self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32)
+        )
         ds = ufl.Measure("ds", domain=self.mesh, subdomain_data=tags, metadata=self._along_edges)
         return [ds(number) for number in range(1, len(parts) + 1)]
 
@@ -248,7 +266,9 @@ class Carrier:
         return drawn, self.j0 + u - drawn
 
     def measure(self, density: Density) -> ufl.Measure:
-        """Of the cells or edges where a density lives; a form takes a single one for the same edges."""
+        """Of the cells or edges where a density lives; a form takes a single one for the same
+        edges.
+        """
         if density.sides == 2:
             return self.dS()
         return self.dx(density.quadrature) if density.facets is None else self.ds(density.facets)
@@ -259,7 +279,9 @@ class Carrier:
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
             m = self.covector("+"), self.covector("-")
-            sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters]
+            sided = [
+                (p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters
+            ]
             return density.of(*pairs, m, self.widths[0], *sided)
         if density.facets is not None:
             return density.of(r0, u, self.covector, self.widths[1], *density.parameters)
@@ -270,7 +292,13 @@ class Carrier:
         return self.value(density, u) * self.measure(density)
 
     def energy(
-        self, name: str, density: Density, amplitude: str | None = None, *, drawn: bool = False, **others: Any
+        self,
+        name: str,
+        density: Density,
+        amplitude: str | None = None,
+        *,
+        drawn: bool = False,
+        **others: Any,
     ) -> Energy:
         """That of a density; `drawn` as of `value`, `others` are attributes of `Energy`."""
         virtual, over = density.work, self.measure(density)
@@ -282,7 +310,15 @@ class Carrier:
             assert virtual
             return virtual(self.j0, u, v, *density.parameters) * over
 
-        return Energy(name, of, amplitude, work=work if virtual else None, density=density, drawn=drawn, **others)
+        return Energy(
+            name,
+            of,
+            amplitude,
+            work=work if virtual else None,
+            density=density,
+            drawn=drawn,
+            **others,
+        )
 
 
 def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
@@ -307,13 +343,18 @@ def on_meridian(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
     """The meridian, a mesh of intervals."""
     domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
     along = revolved(r0).r1
-    width = ufl.CellVolume(domain) / 2 * ufl.sqrt(ufl.dot(along, along))  # triangles have half their height
+    width = (
+        ufl.CellVolume(domain) / 2 * ufl.sqrt(ufl.dot(along, along))
+    )  # triangles have half their height
     return Carrier(
         r0,
         revolved,
-        ufl.as_vector([ufl.FacetNormal(domain)[0], 0]),  # the length of an edge is then that per radian
+        ufl.as_vector(
+            [ufl.FacetNormal(domain)[0], 0]
+        ),  # the length of an edge is then that per radian
         (ufl.avg(width), width),
-        rule=2 * degree + 2,  # one point more than the surface's: on the axis the densities are rational
+        rule=2 * degree
+        + 2,  # one point more than the surface's: on the axis the densities are rational
         edge_rule=None,
         contact_rule=6 * degree,  # points are cheap here
         tables=_tables_on_meridian,

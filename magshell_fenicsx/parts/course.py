@@ -1,4 +1,6 @@
-"""How a step is driven, as data: what it holds and how it ends, where it begins, what it prescribes, how it goes on."""
+"""How a step is driven, as data: what it holds and how it ends, where it begins, what it
+prescribes, how it goes on.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,11 +29,15 @@ Until = Annotated[
 ]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
-Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]  # of several amplitudes, see `Along`
+Curves = Mapping[
+    str, Callable[[float], tuple[float, float, float]]
+]  # of several amplitudes, see `Along`
 
 
 class GasSection(Section):
-    """An ideal gas at constant temperature under the shell: its pressure times its volume is constant."""
+    """An ideal gas at constant temperature under the shell: its pressure times its volume is
+    constant.
+    """
 
     ambient: Pressure | None = Field(default=None, gt=0, le=1e12)
     """Pressure outside, with a unit"""
@@ -61,9 +67,11 @@ Hold = Annotated[
 
 
 class SearchSection(Section):
-    """Other equilibria at the last point of a step, such as snapped shapes, by deflation: no path leads to them.
+    """Other equilibria at the last point of a step, such as snapped shapes, by deflation: no path
+    leads to them.
 
-    Everything that the step holds stays held. What is found depends on the guesses: there may be more.
+    Everything that the step holds stays held. What is found depends on the guesses: there may be
+    more.
     """
 
     solutions: Annotated[int, Field(ge=1, le=100)] = 3
@@ -95,7 +103,9 @@ class SnapSection(Section):
 
 
 class Target(NamedTuple):
-    """What the value of a key prescribes: the amplitude or its conjugate, and the column of path.csv with it."""
+    """What the value of a key prescribes: the amplitude or its conjugate, and the column of
+    path.csv with it.
+    """
 
     quantity: Prescribed
     column: str
@@ -235,11 +245,13 @@ class Course:
     steps
         The largest number of steps; None: the walk's own.
     curves
-        Amplitudes that are functions of the step's own, and its value; None where the model has it itself.
+        Amplitudes that are functions of the step's own, and its value; None where the model has it
+        itself.
     finer
         The lengths of steps of a path, from those that follow from the first one.
     forbidden
-        What is said of an instability that must not be on the way, by its amplitudes and its name; None if it may.
+        What is said of an instability that must not be on the way, by its amplitudes and its name;
+        None if it may.
     at_once
         Whether that ends the step, or it goes on to its end first.
     label

@@ -1,4 +1,6 @@
-"""An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses that may vary."""
+"""An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses
+that may vary.
+"""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Self
@@ -26,10 +28,11 @@ MOST_FACTOR = 1e6
 
 
 class Foundation(Part):
-    """Winkler foundation: springs with the energy k w²/2 per undeformed area, w = -u·n0 the inward displacement.
+    """Winkler foundation: springs with the energy k w²/2 per undeformed area, w = -u·n0 the inward
+    displacement.
 
-    The springs resist tension and compression. On a solid they act on the outer face. Others lie in the surface, with
-    the energy k_t |u_t|²/2 of the displacement u_t = u - (u·n0) n0.
+    The springs resist tension and compression. On a solid they act on the outer face. Others lie in
+    the surface, with the energy k_t |u_t|²/2 of the displacement u_t = u - (u·n0) n0.
     """
 
     stiffness: Stiffness | None = None
@@ -40,7 +43,14 @@ class Foundation(Part):
     """Multiplies k and k_t: a formula of x, y, z over R, not negative"""
 
     quantities = (
-        Quantity("foundation", "stiffness", "Stiffness k of the foundation.", "load", "k R²/(E h)", (STIFFNESS,)),
+        Quantity(
+            "foundation",
+            "stiffness",
+            "Stiffness k of the foundation.",
+            "load",
+            "k R²/(E h)",
+            (STIFFNESS,),
+        ),
         Quantity(
             "foundation_force",
             "reaction",
@@ -67,7 +77,11 @@ class Foundation(Part):
         return self
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        return [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)] if self.factor else []
+        return (
+            [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)]
+            if self.factor
+            else []
+        )
 
     def terms(self, scales: Scales) -> list[OwnTerm]:
         k, springs = self._dimensionless(scales), list[OwnTerm]()
@@ -80,12 +94,18 @@ class Foundation(Part):
         return springs
 
     def account(self, scales: Scales) -> str:
-        of = ", ".join(f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items())
+        of = ", ".join(
+            f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items()
+        )
         return f"Winkler foundation, {of}{', times a formula' if self.factor else ''}"
 
     def _dimensionless(self, scales: Scales) -> dict[str, float]:
         given = {"k": self.stiffness, "k_t": self.tangential}
-        return {name: k * scales.R**2 / (scales.E * scales.h) for name, k in given.items() if k is not None}
+        return {
+            name: k * scales.R**2 / (scales.E * scales.h)
+            for name, k in given.items()
+            if k is not None
+        }
 
 
 def energy(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":

@@ -38,16 +38,24 @@ ACCELERATION = Unit(
 
 
 class GravityStep(BodyForceStep):
-    """The shell's own weight, or that of a steady acceleration: the forces ρ g per volume along a direction.
+    """The shell's own weight, or that of a steady acceleration: the forces ρ g per volume along a
+    direction.
 
-    The weight follows the thickness where this varies, and acts in all of a solid. Steps in different directions have
-    weights of their own, which add up: gravity, gravity_2.
+    The weight follows the thickness where this varies, and acts in all of a solid. Steps in
+    different directions have weights of their own, which add up: gravity, gravity_2.
     """
 
     amplitude: ClassVar[str] = "gravity"
     targets: ClassVar[dict[str, Target]] = {"acceleration": Target("load", "gravity")}
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("gravity", "gravity", "Weight ρ g R/E of the shell; in SI g.", "load", "ρ g R/E", (ACCELERATION,)),
+        Quantity(
+            "gravity",
+            "gravity",
+            "Weight ρ g R/E of the shell; in SI g.",
+            "load",
+            "ρ g R/E",
+            (ACCELERATION,),
+        ),
     )
     kind: Literal["gravity"]
     direction: Along = Field(default=[0.0, 0.0, -1.0])

@@ -1,8 +1,10 @@
-"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a rotational spring, as creases are.
+"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a rotational spring, as
+creases are.
 
-The vertices of both edges are glued, so that displacements agree. What is left is the energy of the edge between two
-cells, which C0 interior penalty has on every one: of a rigid joint it is that, of a hinge there is none, and of a
-spring it is (k/2) (theta - theta_0)^2 per undeformed length, with the angle theta between the normals.
+The vertices of both edges are glued, so that displacements agree. What is left is the energy of the
+edge between two cells, which C0 interior penalty has on every one: of a rigid joint it is that, of
+a hinge there is none, and of a spring it is (k/2) (theta - theta_0)^2 per undeformed length, with
+the angle theta between the normals.
 """
 
 from collections.abc import Sequence
@@ -31,7 +33,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 AMPLITUDE = "fold"
-STIFFEST = 1e6  # over E h²/(12 (1 - ν²)), D/h: within 1e-6 of a rigid joint, and rounding costs as much
+STIFFEST = (
+    1e6  # over E h²/(12 (1 - ν²)), D/h: within 1e-6 of a rigid joint, and rounding costs as much
+)
 
 
 class JointSection(Section):
@@ -52,7 +56,9 @@ class JointSection(Section):
     @model_validator(mode="after")
     def _of_a_spring(self) -> Self:
         if (self.stiffness is not None) != (self.kind == "spring"):
-            raise ValueError(f"stiffness belongs to kind: spring, and must be given there; the kind is {self.kind}")
+            raise ValueError(
+                f"stiffness belongs to kind: spring, and must be given there; the kind is {self.kind}"
+            )
         if self.angle is not None and self.kind != "spring":
             raise ValueError(f"angle: belongs to kind: spring; the kind is {self.kind}")
         return self
@@ -87,7 +93,9 @@ class Joined(KeyAbility[Sequence[JointSection]]):
     key = "joints"
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that the edges are of several shells, each joined once, and that all else goes with joints."""
+        """See that the edges are of several shells, each joined once, and that all else goes with
+        joints.
+        """
         shells = context.sections.get("shells")
         if not shells:
             raise ValueError("joints: join edges of several shells: give shells")
@@ -111,7 +119,9 @@ class Joined(KeyAbility[Sequence[JointSection]]):
                 if name in shells:
                     continue  # on which several edges may be
                 if name in taken:
-                    raise ValueError(f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other")
+                    raise ValueError(
+                        f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other"
+                    )
                 taken.add(name)
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
@@ -141,7 +151,9 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
         owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
         for shell in (shells[name].shell for name in sorted(owners, key=len)[-1:]):
             thickness = shell.reference / shell.R_over_h
-            softest = min(softest, (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2)))
+            softest = min(
+                softest, (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2))
+            )
     stiffness = section.stiffness or 0.0
     if stiffness > STIFFEST * softest:
         raise ValueError(
@@ -164,13 +176,20 @@ def _words(joint: Joint) -> str:
 
 
 class FoldStep(FactorStep):
-    """The angles at which springs of joints rest grow from those of the shells where they are (0) to their own (1)."""
+    """The angles at which springs of joints rest grow from those of the shells where they are (0)
+    to their own (1).
+    """
 
     amplitude: ClassVar[str] = AMPLITUDE
     section: ClassVar[str] = "joints"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity(AMPLITUDE, "fold", "How far the rest angles of joints have grown to those of the case.", "load"),
+        Quantity(
+            AMPLITUDE,
+            "fold",
+            "How far the rest angles of joints have grown to those of the case.",
+            "load",
+        ),
     )
     kind: Literal["fold"]
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
@@ -228,9 +247,14 @@ class Creases:
             return None
         Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))
         marks = fem.Function(Q, name="joints")
-        marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack([of for _, of in some])
+        marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack(
+            [of for _, of in some]
+        )
         numbers = [(j.stiffness, j.angle or 0.0, float(j.angle is not None)) for j, _ in some]
-        return cls(marks, *(fem.Constant(midsurface.mesh, np.array(each)) for each in zip(*numbers, strict=True)))
+        return cls(
+            marks,
+            *(fem.Constant(midsurface.mesh, np.array(each)) for each in zip(*numbers, strict=True)),
+        )
 
     @property
     def grow(self) -> bool:
@@ -238,7 +262,9 @@ class Creases:
         return bool(self.given.value.any())
 
     def added(self, density: "Density", factor: "fem.Constant") -> "Density":
-        """The density of edges between cells, with springs in its place at joints, whose angles have grown so far."""
+        """The density of edges between cells, with springs in its place at joints, whose angles
+        have grown so far.
+        """
         import ufl
 
         from magshell_fenicsx.models.shell import kinematics as kin
@@ -250,7 +276,9 @@ class Creases:
             *given, (plus, minus), k, angle, has, grown = arguments
             r0, u, m = given[:3]
             within, springs, joined = density.of(*given, **options), 0, 0
-            stretch = sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
+            stretch = (
+                sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
+            )
             first = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):

@@ -1,4 +1,5 @@
-"""The kinds of bodies, imperfections and sources: each is a file of its room, with its section and what that makes.
+"""The kinds of bodies, imperfections and sources: each is a file of its room, with its section and
+what that makes.
 
 A new kind is such a file, named after it, and its name here.
 """
@@ -30,9 +31,13 @@ REGISTERED: dict[str, tuple[str, ...]] = {
 def section_of(room: str, kind: str) -> type[Section]:
     """The section of a kind: the one class in its file with this value of the key `kind`."""
     module = import_module(f"{__package__}.{room}.{kind}")
-    own = (each for each in vars(module).values() if getattr(each, "__module__", "") == module.__name__)
+    own = (
+        each for each in vars(module).values() if getattr(each, "__module__", "") == module.__name__
+    )
     sections = [each for each in own if isinstance(each, type) and issubclass(each, Section)]
-    (section,) = (each for each in sections if kind in get_args(each.model_fields["kind"].annotation))
+    (section,) = (
+        each for each in sections if kind in get_args(each.model_fields["kind"].annotation)
+    )
     return section
 
 
@@ -70,12 +75,19 @@ class ShellKeys(LawKeys):
     @model_validator(mode="after")
     def _laminate_fits(self) -> Self:
         if self.laminate and self.law != "koiter":
-            raise ValueError(f"laminate: needs law: koiter: its strains are small; here the law is {self.law}")
+            raise ValueError(
+                f"laminate: needs law: koiter: its strains are small; here the law is {self.law}"
+            )
         return self
 
     @classmethod
     def note_sizes(
-        cls, data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool
+        cls,
+        data: Any,
+        handler: ModelWrapValidatorHandler[Any],
+        info: ValidationInfo,
+        *,
+        with_units: bool,
     ) -> None:
         """See `imperfection.note_sizes`; a shell calls it before its own validation."""
         note_sizes(data, handler, info, with_units=with_units)

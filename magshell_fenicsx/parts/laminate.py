@@ -1,7 +1,9 @@
-"""Plies of a shell: their section, the stiffnesses of a laminate, the symmetry that it leaves, and its words.
+"""Plies of a shell: their section, the stiffnesses of a laminate, the symmetry that it leaves, and
+its words.
 
-Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapters 2 and 4): each ply is in
-plane stress and orthotropic, and the layer at the height z above the middle has the strain E - z K.
+Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapters 2 and
+4): each ply is in plane stress and orthotropic, and the layer at the height z above the middle has
+the strain E - z K.
 """
 
 from dataclasses import dataclass
@@ -55,7 +57,9 @@ class PlySection(Section):
     def _units(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
         if isinstance(data, dict):
-            section._with_units = frozenset(isinstance(data[key], str) for key in ("E1", "E2", "G12"))
+            section._with_units = frozenset(
+                isinstance(data[key], str) for key in ("E1", "E2", "G12")
+            )
         return section
 
     @model_validator(mode="after")
@@ -71,22 +75,29 @@ class PlySection(Section):
     def stiffness(self) -> Array:
         """Q (3, 3) with S = Q (E_11, E_22, 2 E_12) in the directions of `along` and across it."""
         nu21 = self.nu12 * self.E2 / self.E1
-        own = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (1 - self.nu12 * nu21)
+        own = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (
+            1 - self.nu12 * nu21
+        )
         own[2, 2] = self.G12
         c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
-        strain = np.array([[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]])
+        strain = np.array(
+            [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
+        )
         return np.asarray(strain.T @ own @ strain)
 
 
 class LaminateSection(Section):
-    """Orthotropic plies in place of one isotropic material, in Koiter's law: membrane, bending, and both coupled.
+    """Orthotropic plies in place of one isotropic material, in Koiter's law: membrane, bending, and
+    both coupled.
 
-    youngs_modulus and poisson_ratio of the shell are then those of its units alone: energies over E h R², p/p_c, forces
-    over 2πD/R, moments over D/R.
+    youngs_modulus and poisson_ratio of the shell are then those of its units alone: energies over E
+    h R², p/p_c, forces over 2πD/R, moments over D/R.
     """
 
-    along: Literal["meridian"] | Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    along: (
+        Literal["meridian"] | Annotated[list[float], Field(min_length=3, max_length=3)] | None
+    ) = None
     """Direction of the angle 0: away from the pole on the meridians of e3, or the part in the surface of a vector; by
     default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
     plies: list[PlySection] = Field(min_length=1, max_length=200)
@@ -120,7 +131,9 @@ class LaminateSection(Section):
         return not self.twists and bool(np.all(np.abs(off) <= NONE * np.abs(every).max()))
 
     def matrices(self, E: float) -> Array:
-        """A, B and D (3, 6) over E h, E h² and E h³ as 11, 12, 22, 16, 26, 66; B of the strain E + z k."""
+        """A, B and D (3, 6) over E h, E h² and E h³ as 11, 12, 22, 16, 26, 66; B of the strain E +
+        z k.
+        """
         fractions = np.array([ply.fraction for ply in self.plies])
         ends = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
         Q = np.array([ply.stiffness[KEPT] for ply in self.plies]) / E
@@ -129,7 +142,9 @@ class LaminateSection(Section):
         return np.where(np.abs(stiffnesses) <= NONE * sizes, 0.0, stiffnesses)
 
     def direction(self, geometry: str) -> Array | None:
-        """The unit vector (3,) along whose part in the surface the angle 0 is; None for the meridians."""
+        """The unit vector (3,) along whose part in the surface the angle 0 is; None for the
+        meridians.
+        """
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
         return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))
@@ -174,13 +189,19 @@ class Laminated(Ability):
         return cls(context.shell.laminate) if context.shell.laminate else None
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that moduli and youngs_modulus go together, and that a mirror plane mirrors the plies."""
+        """See that moduli and youngs_modulus go together, and that a mirror plane mirrors the
+        plies.
+        """
         section = self.section
         if section.with_units == isnan(given(context.shell).E):
             moduli = (
-                "have a unit: youngs_modulus has none" if section.with_units else "have none: youngs_modulus has one"
+                "have a unit: youngs_modulus has none"
+                if section.with_units
+                else "have none: youngs_modulus has one"
             )
-            raise ValueError(f"shell.laminate.plies: their moduli {moduli}: give all of them a unit, or none")
+            raise ValueError(
+                f"shell.laminate.plies: their moduli {moduli}: give all of them a unit, or none"
+            )
         section.refuse_unfit_sizes(context.shell.youngs_modulus or 1.0)
         context.needs("shell.laminate", "a mid-surface")
         if section.twists:
@@ -202,9 +223,15 @@ def _leaves(section: LaminateSection, geometry: str) -> Leaves:
     if section.twists:
         reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"
     elif along is not None and np.hypot(*along[:2]) > NONE:
-        reason = "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
+        reason = (
+            "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
+        )
 
-    beside = () if along is None else tuple(float(np.arctan2(along[1], along[0])) + turn for turn in (0.0, np.pi / 2))
+    beside = (
+        ()
+        if along is None
+        else tuple(float(np.arctan2(along[1], along[0])) + turn for turn in (0.0, np.pi / 2))
+    )
     if section.twists:
         return Leaves(reason, mirrors=nothing)
     return Leaves(reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside)
@@ -213,7 +240,9 @@ def _leaves(section: LaminateSection, geometry: str) -> Leaves:
 def laminate_account(section: LaminateSection, shell: Any) -> str:
     """The words of `magshell check`."""
     A, B, D = section.matrices(shell.youngs_modulus or 1.0)
-    angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + ("/..." if len(section.plies) > 12 else "")
+    angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + (
+        "/..." if len(section.plies) > 12 else ""
+    )
     vector = section.direction(shell.geometry)
     along = "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
     coupled = f"B up to {np.abs(B).max():.4g} E h^2 couples both" if B.any() else "not coupled"

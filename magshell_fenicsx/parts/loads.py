@@ -35,7 +35,8 @@ class Loads:
     Attributes
     ----------
     pressed
-        Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from outside.
+        Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from
+        outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
     growing
@@ -78,7 +79,9 @@ class Loads:
 
     @property
     def displaced(self) -> str | None:
-        """The amplitude with the displacement that the column w_over_h has; None if that is the pole's."""
+        """The amplitude with the displacement that the column w_over_h has; None if that is the
+        pole's.
+        """
         return next(iter((*self.forces, *self.dead)), None)
 
 
@@ -93,5 +96,7 @@ def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
 
 
 def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
-    """The forces among dead loads: each does the work of its size times a displacement along itself."""
+    """The forces among dead loads: each does the work of its size times a displacement along
+    itself.
+    """
     return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]

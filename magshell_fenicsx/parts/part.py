@@ -43,7 +43,8 @@ class Scales:
 
 @dataclass(frozen=True)
 class Context:
-    """What is around a part in its case: it takes from this what it needs, and each room knows its own section.
+    """What is around a part in its case: it takes from this what it needs, and each room knows its
+    own section.
 
     Attributes
     ----------
@@ -68,7 +69,9 @@ class Context:
 
     def of(self, kind: type[Kind]) -> Kind | None:
         """The section of a class; None without one."""
-        return next((section for section in self.sections.values() if isinstance(section, kind)), None)
+        return next(
+            (section for section in self.sections.values() if isinstance(section, kind)), None
+        )
 
     @property
     def abilities(self) -> "list[Ability]":
@@ -151,20 +154,30 @@ class Context:
         edge = self.shell.edge_polar
         if edge is not None and not 0 <= polar < edge - 1:
             least = getattr(self.shell, "hole", None) or 0
-            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed {least:g} to {edge - 1:g}")
+            raise ValueError(
+                f"{key}.at.polar: {polar:g} is not on the shell: allowed {least:g} to {edge - 1:g}"
+            )
 
     @property
     def scales(self) -> Scales:
         """What forces and stiffnesses are over; there is a modulus where something needs it."""
         shell = self.shell
         assert shell.modulus is not None
-        return Scales(shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio)
+        return Scales(
+            shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio
+        )
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
+        """R √(ρ/E), that times are over: in seconds where the case has units; None without a
+        density.
+        """
         density, modulus = self.shell.density, self.shell.youngs_modulus
-        return float(self.shell.reference * np.sqrt(density / modulus)) if density and modulus else None
+        return (
+            float(self.shell.reference * np.sqrt(density / modulus))
+            if density and modulus
+            else None
+        )
 
 
 @dataclass(frozen=True)
@@ -178,8 +191,9 @@ class Modelled:
     turn
         Azimuth of the model's frame (rad).
     mirror
-        Plane, in the model's frame, of the half that is modelled; None for all. A force on the plane, or on an edge
-        across it, is shared by the halves; the loads of an edge of the other half are left out.
+        Plane, in the model's frame, of the half that is modelled; None for all. A force on the
+        plane, or on an edge across it, is shared by the halves; the loads of an edge of the other
+        half are left out.
     plane
         The same plane in the frame of the case.
     axisymmetric
@@ -213,8 +227,8 @@ class Formulas:
     length
         R in the unit of the places.
     load
-        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
-        elements of any size. Strains follow all else down to its last detail.
+        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its
+        moments are exact on elements of any size. Strains follow all else down to its last detail.
     deformed
         Whether it is of the deformed place, where nothing but the points of integration see it.
     """
@@ -260,9 +274,11 @@ class InTime:
 
 
 class Ability:
-    """What adds something to a problem, mostly a section of the case file; by default it adds nothing.
+    """What adds something to a problem, mostly a section of the case file; by default it adds
+    nothing.
 
-    One that is no section finds itself in a case (`of`). All stand in `ABILITIES` of `registered.py`.
+    One that is no section finds itself in a case (`of`). All stand in `ABILITIES` of
+    `registered.py`.
     """
 
     @classmethod
@@ -280,11 +296,15 @@ class Ability:
         """
 
     def withdraws(self, context: Context) -> "dict[Offer, str]":
-        """What abilities may need and a case with this one has not -> what takes it away, and what to do."""
+        """What abilities may need and a case with this one has not -> what takes it away, and what
+        to do.
+        """
         return {}
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
-        """Its load that may be a function of time, after steps that have driven amplitudes; None without."""
+        """Its load that may be a function of time, after steps that have driven amplitudes; None
+        without.
+        """
         return None
 
     def patches(self) -> dict[str, Iterable[str]]:
@@ -347,14 +367,15 @@ class KeyAbility(Ability, Generic[Kind]):
 class Part(Section, Ability):
     """A section of the case file whose energies are integrals over the mid-surface.
 
-    A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys appear in
-    docs/case.md. `OwnTerm` finds the arguments, the symmetry and the derivatives of its densities, so a part works in
-    every model.
+    A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys
+    appear in docs/case.md. `OwnTerm` finds the arguments, the symmetry and the derivatives of its
+    densities, so a part works in every model.
 
     Attributes
     ----------
     quantities
-        The columns that it adds to path.csv: the amplitude of each term under its name, and the observed integrals.
+        The columns that it adds to path.csv: the amplitude of each term under its name, and the
+        observed integrals.
     absent
         The line of `magshell check` for a case without the part.
     """
@@ -367,7 +388,9 @@ class Part(Section, Ability):
         register(cls.quantities)
 
     def refuse_unfit(self, context: Context) -> None:
-        context.has_modulus(next(key for key, section in context.sections.items() if section is self))
+        context.has_modulus(
+            next(key for key, section in context.sections.items() if section is self)
+        )
 
     def terms(self, scales: Scales) -> Sequence[OwnTerm]:
         """The energies, with the values of their amplitudes."""

@@ -1,4 +1,6 @@
-"""The base of the steps that follow a path: their controls, targets, and what comes after an instability."""
+"""The base of the steps that follow a path: their controls, targets, and what comes after an
+instability.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,7 +24,9 @@ from magshell_fenicsx.parts.course import (
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import LEAST_TARGET, Step
 
-Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
+Count = Annotated[
+    int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")
+]
 
 
 class PathStep(Step):
@@ -60,11 +64,15 @@ class PathStep(Step):
     @model_validator(mode="before")
     @classmethod
     def _control_of_the_target(cls, data: Any) -> Any:
-        """A target that is a load is reached by load control, where the default prescribes its conjugate."""
+        """A target that is a load is reached by load control, where the default prescribes its
+        conjugate.
+        """
         default = cls.model_fields["control"].default
         if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
             return data
-        quantities = {each.quantity for key, each in cls.targets.items() if data.get(key) is not None}
+        quantities = {
+            each.quantity for key, each in cls.targets.items() if data.get(key) is not None
+        }
         way = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
         return {**data, "control": way} if quantities == {"load"} else data
 
@@ -75,8 +83,12 @@ class PathStep(Step):
         fitting = [key for key, (quantity, _) in self.targets.items() if by in ("arc", quantity)]
         for key, value in given.items():
             if 0 < abs(value) < LEAST_TARGET:
-                raise ValueError(f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size")
-        if self.until == "target" and (len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)):
+                raise ValueError(
+                    f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size"
+                )
+        if self.until == "target" and (
+            len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)
+        ):
             names = " or ".join(fitting) or "another control"
             raise ValueError(
                 f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
@@ -88,11 +100,17 @@ class PathStep(Step):
         if self.until == "zero" and given:
             raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
         if self.until == "bifurcation" and given and not onward:
-            raise ValueError(f"{next(iter(given))} is a target: it goes with until: target or limit")
+            raise ValueError(
+                f"{next(iter(given))} is a target: it goes with until: target or limit"
+            )
         if self.until == "limit" and given:
             self._refuse_unfit_bound(list(given), fitting)
         if self.until in ("points", "zero") and by != "arc":
-            why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
+            why = (
+                "counts steps by arc length"
+                if self.until == "points"
+                else "passes the largest load"
+            )
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
         if self.then == "snap" and self.until not in ("limit", "bifurcation"):
             raise ValueError("then: snap: goes with until: limit or until: bifurcation")
@@ -169,7 +187,8 @@ class PathStep(Step):
         return next(((self.targets[key], value) for key, value in self._given.items()), None)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        """Change of the amplitude in the first step, by default one of equal parts; its sign is that of `change`.
+        """Change of the amplitude in the first step, by default one of equal parts; its sign is
+        that of `change`.
 
         Parameters
         ----------
@@ -187,8 +206,8 @@ class PathStep(Step):
     def drive(self, now: Now) -> Drive:
         """How the step drives its amplitude from here.
 
-        Targets are equal parts of the way: from zero if the amplitude is driven for the first time, without those
-        that earlier steps have passed.
+        Targets are equal parts of the way: from zero if the amplitude is driven for the first time,
+        without those that earlier steps have passed.
         """
         goal = self.target or self.bound
         quantity: Prescribed = goal[0].quantity if goal else "load"
@@ -203,7 +222,10 @@ class PathStep(Step):
             targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":
             targets = [0.0]
-        first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
+        first, step = (
+            self.first(change, now, by_load=by_load),
+            self.step(None if goal is None else change, now),
+        )
         return Drive(self.prescribed, quantity, end, targets, first, self.scale(now), step)
 
     def course(self, here: Here) -> Course:
@@ -225,7 +247,9 @@ class PathStep(Step):
 
     def by_conjugate(self, *, at_target: bool) -> bool:
         goal = self.target if at_target and self.until == "target" else None
-        return self.control == self.conjugate_control or (goal is not None and goal[0].quantity == "conjugate")
+        return self.control == self.conjugate_control or (
+            goal is not None and goal[0].quantity == "conjugate"
+        )
 
     def begin(self, here: float) -> float:
         """Where the equal parts of the first way to a target begin."""
@@ -237,7 +261,9 @@ class PathStep(Step):
 
 
 class LoadStep(PathStep):
-    """The base of loads that the amplitude or the arc length leads to their target: no displacement is prescribed."""
+    """The base of loads that the amplitude or the arc length leads to their target: no displacement
+    is prescribed.
+    """
 
     control: Literal["load", "arc"] = "arc"
     """What is prescribed step by step: the load's amplitude, or arc length, which passes every fold"""
@@ -258,7 +284,8 @@ class BodyForceStep(LoadStep):
 class FactorStep(LoadStep):
     """The base of what grows to a factor, 1 by default.
 
-    Where no step drives it, it grows before the one load of a case, up to the first instability at most.
+    Where no step drives it, it grows before the one load of a case, up to the first instability at
+    most.
 
     Attributes
     ----------
@@ -293,7 +320,11 @@ class FactorStep(LoadStep):
 
     def drive(self, now: Now) -> Drive:
         size = now.size
-        return Drive("arc", "load", size, [size], size / 2, size) if self._alone else super().drive(now)
+        return (
+            Drive("arc", "load", size, [size], size / 2, size)
+            if self._alone
+            else super().drive(now)
+        )
 
     def course(self, here: Here) -> Course:
         course = super().course(here)

@@ -1,4 +1,6 @@
-"""The lists of all parts, of all kinds of steps and of what rooms observe; and the base of a case that they make."""
+"""The lists of all parts, of all kinds of steps and of what rooms observe; and the base of a case
+that they make.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -39,7 +41,12 @@ KINDS_OF_STEPS: dict[str, str] = {
     "interaction": "magnetism.interaction.InteractionStep",
     "fold": "joints.FoldStep",
 }
-FIRST = ("natural", "fold", "interaction", "field")  # kinds of steps that may come before the one load, in order
+FIRST = (
+    "natural",
+    "fold",
+    "interaction",
+    "field",
+)  # kinds of steps that may come before the one load, in order
 
 ABILITIES = (  # module here and class in it, of those without a key and a line in REGISTERED
     "supports.boundary.BoundarySection",
@@ -127,7 +134,10 @@ class WithOwnTerms(Section):
         A name after the key, as that of a patch, is looked for below it.
         """
         about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
-        if not (about and self._origin.place) or about[1].split(".")[0] not in type(self).model_fields:
+        if (
+            not (about and self._origin.place)
+            or about[1].split(".")[0] not in type(self).model_fields
+        ):
             return message
         keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
         return f"{self._origin.place(tuple(int(key) if key.isdecimal() else key for key in keys))}: {message}"
@@ -138,7 +148,9 @@ class WithOwnTerms(Section):
         return self._own_terms
 
     def with_terms(self, terms: Sequence[OwnTerm]) -> Self:
-        """A copy of the case with these energies, for `run`, `Scene` and whatever else takes a case."""
+        """A copy of the case with these energies, for `run`, `Scene` and whatever else takes a
+        case.
+        """
         copied = self.model_copy()
         copied._own_terms = tuple(terms)
         return copied
@@ -192,5 +204,8 @@ else:  # an optional key for each part
     WithParts = create_model(
         "WithParts",
         __base__=WithOwnTerms,
-        **{key: (part | None, Field(default=None, description=_meaning(part))) for key, part in PARTS.items()},
+        **{
+            key: (part | None, Field(default=None, description=_meaning(part)))
+            for key, part in PARTS.items()
+        },
     )

@@ -1,4 +1,6 @@
-"""The law of a shell's material: small strains, or rubber of three kinds, with what each is not for, and its words."""
+"""The law of a shell's material: small strains, or rubber of three kinds, with what each is not
+for, and its words.
+"""
 
 from dataclasses import dataclass
 from math import isfinite
@@ -39,9 +41,13 @@ class LawKeys(Section):
             )
         for i, (one, exponent) in enumerate(zip(mu, alpha, strict=True)):
             if not (isfinite(one) and one * exponent > 0):
-                raise ValueError(f"mu.{i}: {one:g}: mu alpha must be positive; here alpha is {exponent:g}")
+                raise ValueError(
+                    f"mu.{i}: {one:g}: mu alpha must be positive; here alpha is {exponent:g}"
+                )
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
-            raise ValueError(f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter")
+            raise ValueError(
+                f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter"
+            )
         return self
 
     @property
@@ -73,7 +79,9 @@ class Rubber(Ability):
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Rubber keeps its volume."""
-        return {"a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"}
+        return {
+            "a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"
+        }
 
 
 def laws_of(context: Context) -> list[str]:

@@ -1,4 +1,6 @@
-"""What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate to amplitudes."""
+"""What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate
+to amplitudes.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -77,7 +79,8 @@ class Slope:
     by_u, by_mu
         By the displacement, zero at supports, and by amplitudes where it contains them itself.
     field, by_field
-        A field of the terms, and the column's own derivatives by its values (cells, nodes, components) in own cells.
+        A field of the terms, and the column's own derivatives by its values (cells, nodes,
+        components) in own cells.
     """
 
     value: float
@@ -89,7 +92,8 @@ class Slope:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """A rectangle or a box in space with vectors at its points, in the frame of the case; lengths are over R.
+    """A rectangle or a box in space with vectors at its points, in the frame of the case; lengths
+    are over R.
 
     Attributes
     ----------
@@ -171,7 +175,9 @@ class Seen:
         return ()
 
     def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        """Of amplitudes that are motions: whether it turns, and how far it goes at one, over R or in rad."""
+        """Of amplitudes that are motions: whether it turns, and how far it goes at one, over R or
+        in rad.
+        """
         return {}
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:

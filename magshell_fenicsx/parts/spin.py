@@ -17,7 +17,9 @@ from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 if TYPE_CHECKING:
     from ufl.core.expr import Expr
 
-SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)
+SPEED = Unit(
+    "√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO
+)
 SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2), symbol="ω²")
 
 
@@ -29,19 +31,30 @@ def _of_angles(value: Any) -> Any:
 
 
 class SpinStep(BodyForceStep):
-    """The shell spins about e3 through the origin: the forces ρ ω² r away from the axis, where it has moved to.
+    """The shell spins about e3 through the origin: the forces ρ ω² r away from the axis, where it
+    has moved to.
 
-    Points are equal parts of ω²; a `history` in time is of ω itself, over √(E/ρ)/R. Forces of Coriolis are left out:
-    the shell rests beside its axis, and frequencies of such a shell are those without them.
+    Points are equal parts of ω²; a `history` in time is of ω itself, over √(E/ρ)/R. Forces of
+    Coriolis are left out: the shell rests beside its axis, and frequencies of such a shell are
+    those without them.
     """
 
     amplitude: ClassVar[str] = "spin"
     targets: ClassVar[dict[str, Target]] = {"speed": Target("load", "spin")}
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("spin", "spin squared", "Centrifugal load ρ ω² R²/E; in SI ω².", "load", "ρ ω² R²/E", (SQUARED,)),
+        Quantity(
+            "spin",
+            "spin squared",
+            "Centrifugal load ρ ω² R²/E; in SI ω².",
+            "load",
+            "ρ ω² R²/E",
+            (SQUARED,),
+        ),
     )
     kind: Literal["spin"]
-    speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(default=None, ge=0, le=1e3)
+    speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(
+        default=None, ge=0, le=1e3
+    )
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
 
     @property
@@ -58,7 +71,9 @@ class SpinStep(BodyForceStep):
         return [OwnTerm(step.name, energy, of_volume=True)]
 
     def account(self, step: ProgrammeStep, context: Context) -> str:
-        return f"centrifugal forces of a shell that spins about e3, amplitude {step.name} = ρ ω² R²/E"
+        return (
+            f"centrifugal forces of a shell that spins about e3, amplitude {step.name} = ρ ω² R²/E"
+        )
 
 
 def energy(r0: Jet, u: Jet) -> "Expr":

@@ -169,7 +169,9 @@ class Step(Section):
         """See `Course`, from any state of the step."""
         return None
 
-    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead | None:
+    def ahead(
+        self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
+    ) -> Ahead | None:
         """Its end, if its target does not say it."""
         return None
 
@@ -182,7 +184,9 @@ class Step(Section):
         return False
 
     def on_perfect(self, *, last: bool) -> "Step | None":
-        """The step on the shell without imperfections, to the first instability if it is the last; None without."""
+        """The step on the shell without imperfections, to the first instability if it is the last;
+        None without.
+        """
         return self
 
     @property
@@ -197,11 +201,15 @@ class Step(Section):
 
     @classmethod
     def before(cls, context: Context, loading: "Step | None") -> list[tuple[str, "Step"]]:
-        """The steps of this kind that come before the only load of a case, each with the key that asks for it."""
+        """The steps of this kind that come before the only load of a case, each with the key that
+        asks for it.
+        """
         return []
 
     def name_in(self, context: Context, loads: Sequence["Step"]) -> str | None:
-        """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number from the second on."""
+        """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number
+        from the second on.
+        """
         return None
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
@@ -234,7 +242,8 @@ class Step(Section):
         return []
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array | None:
-        """The one place (3,) over R where it is, in the frame of the case; None if it is not at one.
+        """The one place (3,) over R where it is, in the frame of the case; None if it is not at
+        one.
 
         Raises
         ------
@@ -248,7 +257,9 @@ class Step(Section):
         chart = outline.inverse(rotation(turn) @ place)
         return outline.on_half(chart) if half else chart
 
-    def refuse_unfit_place(self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array) -> None:
+    def refuse_unfit_place(
+        self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
+    ) -> None:
         """See that there is room for it around its place in the chart.
 
         Raises

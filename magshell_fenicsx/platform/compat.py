@@ -29,15 +29,23 @@ if np.issubdtype(PETSc.ScalarType, np.complexfloating):
     )
 _Reason = PETSc.SNES.ConvergedReason
 NOT_A_NUMBER = (  # renamed by PETSc 3.25
-    _Reason.DIVERGED_FNORM_NAN if hasattr(_Reason, "DIVERGED_FNORM_NAN") else _Reason.DIVERGED_FUNCTION_NANORINF
+    _Reason.DIVERGED_FNORM_NAN
+    if hasattr(_Reason, "DIVERGED_FNORM_NAN")
+    else _Reason.DIVERGED_FUNCTION_NANORINF
 )
 
 
 Field = TypeVar("Field")
 
 
-FORMS = cffi.FFI()  # the declarations of UFCx; pointers to complex numbers, which cffi lacks, are none of ours
-FORMS.cdef((jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL).replace("_Complex", ""))
+FORMS = (
+    cffi.FFI()
+)  # the declarations of UFCx; pointers to complex numbers, which cffi lacks, are none of ours
+FORMS.cdef(
+    (jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL).replace(
+        "_Complex", ""
+    )
+)
 
 
 @cache
@@ -53,7 +61,9 @@ def form_signature(form: ufl.Form) -> str:
 def form_code(form: ufl.Form) -> str:
     """The code of a form in C, as FFCx makes it."""
     made = compiler.compile_ufl_objects([form], _form_options())
-    source = made[1] if isinstance(made[1], str) else made[0][1]  # lists of files, and their endings, from FFCx 0.10
+    source = (
+        made[1] if isinstance(made[1], str) else made[0][1]
+    )  # lists of files, and their endings, from FFCx 0.10
     return str(source)
 
 
@@ -86,7 +96,9 @@ class Kernels:
         return [fields[places[i]] for i in range(self.ufcx.num_coefficients)]
 
     def marked(self, kind: Any) -> list[int]:
-        """The marks of the parts of the mesh that integrals of a kind are over; those over all of it have none."""
+        """The marks of the parts of the mesh that integrals of a kind are over; those over all of
+        it have none.
+        """
         first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
         return [mark for i in range(first, last) if (mark := self.ufcx.form_integral_ids[i]) != -1]
 
@@ -109,7 +121,10 @@ def bound(
         The mesh in C++.
     """
     kinds = {getattr(fem.IntegralType, name): tags for name, tags in marks.items()}
-    parts = {kind: get_integration_domains(kind, tags, kernels.marked(kind)) for kind, tags in kinds.items()}
+    parts = {
+        kind: get_integration_domains(kind, tags, kernels.marked(kind))
+        for kind, tags in kinds.items()
+    }
     address = int(FORMS.cast("uintptr_t", FORMS.addressof(kernels.ufcx)))
     objects = ([each._cpp_object for each in of] for of in (spaces, fields, numbers))
     make, given = form_cpp_class(np.float64), (*objects, parts)
@@ -137,12 +152,16 @@ def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
 
 def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
     """Rows of `geometry.x` at each cell's nodes; (cells, nodes)."""
-    dofmaps = getattr(domain.geometry, "dofmaps", None)  # a list since dolfinx 0.11, where `dofmap` is deprecated
+    dofmaps = getattr(
+        domain.geometry, "dofmaps", None
+    )  # a list since dolfinx 0.11, where `dofmap` is deprecated
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 
 def original_cells(domain: mesh.Mesh) -> NDArray[np.int64]:
-    """The number of each local cell in the order in which they were made; none of a part of another mesh."""
+    """The number of each local cell in the order in which they were made; none of a part of another
+    mesh.
+    """
     try:
         return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
     except RuntimeError:  # in dolfinx 0.9
@@ -159,7 +178,9 @@ def tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:
     """Add a bilinear form to a matrix, skipping the rows and columns of `clamped`."""
     cpp = form._cpp_object
-    _assemble_matrix(K, cpp, pack_constants(cpp), pack_coefficients(cpp), [bc._cpp_object for bc in clamped])
+    _assemble_matrix(
+        K, cpp, pack_constants(cpp), pack_coefficients(cpp), [bc._cpp_object for bc in clamped]
+    )
 
 
 def finish_matrix(K: PETSc.Mat, V: fem.FunctionSpace, clamped: list[fem.DirichletBC]) -> None:

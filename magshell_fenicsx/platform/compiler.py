@@ -1,10 +1,13 @@
-"""The C compiler, and shared libraries of C, compiled once, side by side, and kept for later processes.
+"""The C compiler, and shared libraries of C, compiled once, side by side, and kept for later
+processes.
 
-The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's, which PyPI has.
+The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's,
+which PyPI has.
 
-Of several processes that ask for a library one compiles it. A process holds the lock of a library only while it makes
-its code and a compiler runs, and waits for none meanwhile: whoever waits for another one's library waits for no more
-than that. So ranks share the work without a message: each takes what no other one has.
+Of several processes that ask for a library one compiles it. A process holds the lock of a library
+only while it makes its code and a compiler runs, and waits for none meanwhile: whoever waits for
+another one's library waits for no more than that. So ranks share the work without a message: each
+takes what no other one has.
 """
 
 import fcntl
@@ -31,17 +34,25 @@ from magshell_fenicsx.platform.kept import keep, kept_file, kernel_cache, recall
 from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
-FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
+FULL = re.compile(
+    "No space left on device|Disk quota exceeded|File too large|Read-only file system"
+)
 POLL = 0.02  # s between two looks whether another process has made a library
 RENEWED = 0.5  # s after which it is told again how many there are
 VECTORS = ("avx2", "fma")  # of x86: what vectors of four numbers need to be one register
 
 USUAL = ("cc", "gcc", "clang")
-# For any processor, as the kernels may be shared; and without traps for undefined behaviour, which it adds by default.
+# For any processor, as the kernels may be shared; and without traps for undefined behaviour, which
+# it adds by default.
 ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
 HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
 SMALLEST = "#include <math.h>\ndouble root(double x) { return sqrt(x); }\n"
-USED = ("-O3", "-ffast-math", "-fno-strict-overflow", "-std=gnu17")  # what kernels ask of any compiler, by kind
+USED = (
+    "-O3",
+    "-ffast-math",
+    "-fno-strict-overflow",
+    "-std=gnu17",
+)  # what kernels ask of any compiler, by kind
 CHECKED = "magshell_compiler_checked"  # of a cache for which a compiler has compiled
 
 
@@ -78,12 +89,15 @@ def c_compiler() -> tuple[str, ...]:
 def is_gnu(compiler: tuple[str, ...]) -> bool:
     """Whether a compiler is GCC itself; others say so too, but are Clang."""
     command = [*compiler, "-dM", "-E", "-x", "c", os.devnull]
-    macros = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False).stdout
+    macros = subprocess.run(
+        command, capture_output=True, text=True, errors="replace", check=False
+    ).stdout
     return "__GNUC__" in macros and "__clang__" not in macros
 
 
 def check_compiler() -> None:
-    """Refuse a compiler that cannot compile kernels, before any is compiled; a cache that has some needs none.
+    """Refuse a compiler that cannot compile kernels, before any is compiled; a cache that has some
+    needs none.
 
     Raises
     ------
@@ -110,8 +124,12 @@ def refuse_unusable() -> None:
         done = _compiler_run(command, (*USED, *processor_options()), code, made)
     if done.returncode and not FULL.search(done.stderr):
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        error = next((line for line in lines if "error" in line), lines[0]).replace(f"{scratch}/", "")
-        raise NoCompiler(f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}")
+        error = next((line for line in lines if "error" in line), lines[0]).replace(
+            f"{scratch}/", ""
+        )
+        raise NoCompiler(
+            f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}"
+        )
 
 
 class Library:
@@ -128,9 +146,15 @@ class Library:
     """
 
     def __init__(
-        self, name: str, source: Callable[[], str], options: tuple[str, ...], gnu_options: tuple[str, ...] = ()
+        self,
+        name: str,
+        source: Callable[[], str],
+        options: tuple[str, ...],
+        gnu_options: tuple[str, ...] = (),
     ) -> None:
-        depends = hashlib.sha256("\n".join((name, *options, *gnu_options)).encode()).hexdigest()[:40]
+        depends = hashlib.sha256("\n".join((name, *options, *gnu_options)).encode()).hexdigest()[
+            :40
+        ]
         self.file = f"libmagshell_{depends}.so"
         self._source, self._options, self._gnu_options = source, options, gnu_options
         self._work: Future[Path] | None = None
@@ -190,14 +214,20 @@ class Library:
 
     def _compile(self, source: str) -> Path:
         try:
-            options = (*self._options, *(self._gnu_options if self._gnu_options and is_gnu(c_compiler()) else ()))
+            options = (
+                *self._options,
+                *(self._gnu_options if self._gnu_options and is_gnu(c_compiler()) else ()),
+            )
             _compile(source, options, file := kernel_cache() / self.file)
             return file
         finally:
             self._release_lock()
 
     def _take_lock(self) -> bool:
-        """Lock out other processes; False if one has the lock. Where files cannot be locked, go on."""
+        """Lock out other processes; False if one has the lock.
+
+        Where files cannot be locked, go on.
+        """
         folder = kernel_cache()
         with written_into(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -217,10 +247,13 @@ class Library:
         Path(self._lock.name).unlink(missing_ok=True)
 
 
-def side_by_side(libraries: Sequence[Library], tell: Callable[[int], None] = lambda _: None) -> None:
+def side_by_side(
+    libraries: Sequence[Library], tell: Callable[[int], None] = lambda _: None
+) -> None:
     """Compile libraries in their order, several at once, and return when all are there.
 
-    While compilers run, the code of one more is made; no more than that, so that other ranks find work.
+    While compilers run, the code of one more is made; no more than that, so that other ranks find
+    work.
 
     Parameters
     ----------
@@ -280,7 +313,9 @@ def processor_options() -> tuple[str, ...]:
     if platform.machine() != "x86_64":
         return ()
     with suppress(OSError):
-        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        flags = re.search(
+            r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
+        )
         if flags and {*VECTORS} <= {*flags[1].split()}:
             return tuple(f"-m{vector}" for vector in VECTORS)
     return ()
@@ -291,15 +326,19 @@ def _compiler_run(
 ) -> subprocess.CompletedProcess[str]:
     """Compile a file of C and link its library; return the process that failed, or the last one.
 
-    They are linked apart and without options: with -ffast-math older compilers link code that flushes denormal numbers
-    of the whole process to zero as the library is loaded.
+    They are linked apart and without options: with -ffast-math older compilers link code that
+    flushes denormal numbers of the whole process to zero as the library is loaded.
     """
     to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
     to_library = [*compiler, "-shared", f"{code}.o", "-o", str(library), "-lm"]
-    compiled = subprocess.run(to_object, capture_output=True, text=True, errors="replace", check=False)
+    compiled = subprocess.run(
+        to_object, capture_output=True, text=True, errors="replace", check=False
+    )
     if compiled.returncode:
         return compiled
-    linked = subprocess.run(to_library, capture_output=True, text=True, errors="replace", check=False)
+    linked = subprocess.run(
+        to_library, capture_output=True, text=True, errors="replace", check=False
+    )
     linked.stderr = compiled.stderr + linked.stderr
     return linked
 
@@ -312,12 +351,17 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     compiler = c_compiler()
     for left in file.parent.glob(f"{file.stem}????????/"):
         shutil.rmtree(left, ignore_errors=True)
-    with written_into(file.parent), tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch:
+    with (
+        written_into(file.parent),
+        tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch,
+    ):
         code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")
         done = _compiler_run(compiler, options, code, made)
         print(done.stderr, end="", file=sys.stderr)
-        if done.returncode and (full := FULL.search(done.stderr)):  # of its own, or of the folder for temporary files
+        if done.returncode and (
+            full := FULL.search(done.stderr)
+        ):  # of its own, or of the folder for temporary files
             raise OSError(0, full[0])
         if done.returncode:
             refuse_unusable()

@@ -48,11 +48,15 @@ def fast_blas() -> str | None:
 
 
 def fingerprint() -> dict[str, Any]:
-    """Processor, usable cores, memory, BLAS and versions; times are comparable if all of these are equal."""
+    """Processor, usable cores, memory, BLAS and versions; times are comparable if all of these are
+    equal.
+    """
     return {
         "cpu": _first_group(Path("/proc/cpuinfo"), r"^model name\s*:\s*(.+)$"),
         "cores": len(os.sched_getaffinity(0)),
-        "memory_gb": round(int(_first_group(Path("/proc/meminfo"), r"^MemTotal:\s*(\d+) kB$") or 0) / 2**20, 1),
+        "memory_gb": round(
+            int(_first_group(Path("/proc/meminfo"), r"^MemTotal:\s*(\d+) kB$") or 0) / 2**20, 1
+        ),
         "blas": fast_blas() or "reference",
         "versions": versions(),
     }
@@ -72,7 +76,8 @@ def _first_group(file: Path, pattern: str) -> str:
 
 
 def available_memory(root: Path = Path("/")) -> float:
-    """Bytes that are left to new processes and their control group, or to this one by `ulimit -v`; inf if unknown.
+    """Bytes that are left to new processes and their control group, or to this one by `ulimit -v`;
+    inf if unknown.
 
     Raises
     ------
@@ -83,7 +88,9 @@ def available_memory(root: Path = Path("/")) -> float:
         try:
             return 1e9 * _positive(given)
         except ValueError:
-            raise ValueError(f"MAGSHELL_MEMORY={given}: give the GB to count on, such as MAGSHELL_MEMORY=64") from None
+            raise ValueError(
+                f"MAGSHELL_MEMORY={given}: give the GB to count on, such as MAGSHELL_MEMORY=64"
+            ) from None
     return min([*_of_machine(root), *_of_groups(root), *_of_limit(root)], default=float("inf"))
 
 
@@ -101,12 +108,18 @@ def _of_machine(root: Path) -> Iterator[float]:
 
 
 def _of_groups(root: Path) -> Iterator[float]:
-    """What the limits of the control groups leave, of version 2 and 1, each up to the outermost group."""
+    """What the limits of the control groups leave, of version 2 and 1, each up to the outermost
+    group.
+    """
     for line in _text(root / "proc/self/cgroup").splitlines():
         _, controllers, own = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
             continue
-        names = ("memory.limit_in_bytes", "memory.usage_in_bytes") if controllers else ("memory.max", "memory.current")
+        names = (
+            ("memory.limit_in_bytes", "memory.usage_in_bytes")
+            if controllers
+            else ("memory.max", "memory.current")
+        )
         top = root / "sys/fs/cgroup" / ("memory" if controllers else "")
         for group in (top / own.lstrip("/"), *(top / own.lstrip("/")).parents):
             if not group.is_relative_to(top):
@@ -119,7 +132,14 @@ def _of_groups(root: Path) -> Iterator[float]:
 def _cached(group: Path) -> int:
     """Bytes of files that the kernel gives back when they are needed."""
     lines = (line.split() for line in _text(group / "memory.stat").splitlines())
-    return next((int(line[1]) for line in lines if line[:1] in (["inactive_file"], ["total_inactive_file"])), 0)
+    return next(
+        (
+            int(line[1])
+            for line in lines
+            if line[:1] in (["inactive_file"], ["total_inactive_file"])
+        ),
+        0,
+    )
 
 
 def _of_limit(root: Path) -> Iterator[float]:
@@ -137,7 +157,9 @@ def _text(file: Path) -> str:
 
 
 def version_of(folder: Path) -> str:
-    """Version and hash of a package's files, comments included, independent of where it is installed."""
+    """Version and hash of a package's files, comments included, independent of where it is
+    installed.
+    """
     digest, root = hashlib.sha256(), str(folder)
     for file in sorted(f"{inner}/{name}" for inner, _, names in os.walk(root) for name in names):
         if file.endswith(SUFFIXES):
@@ -146,7 +168,9 @@ def version_of(folder: Path) -> str:
     return f"{__version__}+{digest.hexdigest()[:16]}"
 
 
-_RUNNING = version_of(Path(__file__).parents[1])  # hashed at import: files may be edited during a run
+_RUNNING = version_of(
+    Path(__file__).parents[1]
+)  # hashed at import: files may be edited during a run
 
 
 def code_version() -> str:

@@ -1,7 +1,8 @@
-"""Compiled kernels, and what else takes long to find and is the same for every run: kept in a folder.
+"""Compiled kernels, and what else takes long to find and is the same for every run: kept in a
+folder.
 
-What is there is executed. So it is only taken from folders and files that the user or root owns and nobody else may
-change; where the usual folder is none, a private one takes its place.
+What is there is executed. So it is only taken from folders and files that the user or root owns and
+nobody else may change; where the usual folder is none, a private one takes its place.
 """
 
 import grp
@@ -31,7 +32,9 @@ def kernel_cache() -> Path:
 
 
 def kept_file(name: str) -> Path | None:
-    """A file of this name that may be trusted, in the folder of the kernels or in a shared one; None without."""
+    """A file of this name that may be trusted, in the folder of the kernels or in a shared one;
+    None without.
+    """
     folders = dict.fromkeys([kernel_cache(), *_folders(_usual())])
     return next((folder / name for folder in folders if trusted(folder / name)), None)
 
@@ -72,13 +75,17 @@ def _usual() -> Path:
 
     usual, base = Path(get_options()["cache_dir"]), os.environ.get("XDG_CACHE_HOME")
     if base is not None and not Path(base).is_absolute() and usual == Path(base) / "fenics":
-        return Path.home() / ".cache" / "fenics"  # its specification: what is empty or relative is ignored
+        return (
+            Path.home() / ".cache" / "fenics"
+        )  # its specification: what is empty or relative is ignored
     return usual.absolute()
 
 
 @cache
 def _folders(usual: Path) -> tuple[Path, ...]:
-    """Where new kernels go, and the usual folder if that can be trusted too but not written, as that of an image."""
+    """Where new kernels go, and the usual folder if that can be trusted too but not written, as
+    that of an image.
+    """
     also = (usual,) if usual.is_dir() and _is_private(usual) else ()
     for folder in _candidates(usual):
         with suppress(OSError):
@@ -104,7 +111,9 @@ def _candidates(usual: Path) -> Iterator[Path]:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether nobody but the user and root may change what is in a folder, or put another in its place."""
+    """Whether nobody but the user and root may change what is in a folder, or put another in its
+    place.
+    """
     folder = folder.resolve()
     about = folder.stat()
     if about.st_uid not in (0, os.getuid()) or _writable_by_others(about):

@@ -10,7 +10,10 @@ from magshell_fenicsx.platform.compiler import Library
 from magshell_fenicsx.platform.processes import raised_by_all
 
 OPTIONS = ("-O3", "-g0", "-DNDEBUG", "-fno-strict-overflow", "-std=gnu17")
-GNU_OPTIONS = ("-fschedule-insns", "-fsched-pressure")  # of GCC alone: sums over pairs are a sixth faster
+GNU_OPTIONS = (
+    "-fschedule-insns",
+    "-fsched-pressure",
+)  # of GCC alone: sums over pairs are a sixth faster
 PRELUDE = """#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -25,7 +28,8 @@ PRELUDE = """#include <math.h>
 
 
 def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tuple[Any, Any]:
-    """Return the cffi objects (ffi, lib) of a C file and of what is `behind` it, compiled on first use. Collective.
+    """Return the cffi objects (ffi, lib) of a C file and of what is `behind` it, compiled on first
+    use. Collective.
 
     Raises
     ------
@@ -34,7 +38,9 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
     RuntimeError
         On all ranks, if the folder of the kernels cannot be written.
     """
-    texts = (f'#line 1 "{each.name}"\n{each.read_text(encoding="utf-8")}\n' for each in (source, *behind))
+    texts = (
+        f'#line 1 "{each.name}"\n{each.read_text(encoding="utf-8")}\n' for each in (source, *behind)
+    )
     text = PRELUDE + "".join(texts)
     library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
     raised_by_all(comm, library.path)

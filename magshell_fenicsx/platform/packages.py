@@ -1,7 +1,8 @@
-"""The packages that no pip dependency names: dolfinx, PETSc and MPI, from PyPI's wheels or from the system.
+"""The packages that no pip dependency names: dolfinx, PETSc and MPI, from PyPI's wheels or from the
+system.
 
-PyPI's wheel of dolfinx and PETSc links the MPI library that `mpi4py.MPI` has loaded, wherever that is; it finds none
-itself. So MPI comes first, whatever asks for dolfinx.
+PyPI's wheel of dolfinx and PETSc links the MPI library that `mpi4py.MPI` has loaded, wherever that
+is; it finds none itself. So MPI comes first, whatever asks for dolfinx.
 """
 
 import sys

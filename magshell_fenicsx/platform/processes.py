@@ -1,10 +1,12 @@
-"""Work of rank 0 for all ranks; a command in a separate process, with its wall time, CPU time and peak memory.
+"""Work of rank 0 for all ranks; a command in a separate process, with its wall time, CPU time and
+peak memory.
 
 If the work of rank 0 fails, all ranks fail together.
 
-`python3 -m magshell_fenicsx.platform.processes FOLDER MODULE ARGUMENT...` runs a module as `python3 -m` does, and
-writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM. getrusage is no substitute: a process
-inherits the peak of its parent, and the parent of several ranks gets only the largest.
+`python3 -m magshell_fenicsx.platform.processes FOLDER MODULE ARGUMENT...` runs a module as `python3
+-m` does, and writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM.
+getrusage is no substitute: a process inherits the peak of its parent, and the parent of several
+ranks gets only the largest.
 """
 
 import os
@@ -40,7 +42,10 @@ class Alone:
 
 
 def world() -> Any:
-    """All ranks. A process that no launcher started has `Alone` until MPI is imported, which takes 0.1 s."""
+    """All ranks.
+
+    A process that no launcher started has `Alone` until MPI is imported, which takes 0.1 s.
+    """
     if not LAUNCHERS & os.environ.keys() and "mpi4py.MPI" not in sys.modules:
         return Alone()
     from mpi4py import MPI
@@ -79,21 +84,35 @@ class Usage:
 
 @cache
 def mpirun_itself() -> str | None:
-    """The launcher of ranks: that beside this Python, as PyPI's MPI has it, or that of the system; None without."""
+    """The launcher of ranks: that beside this Python, as PyPI's MPI has it, or that of the system;
+    None without.
+    """
     beside = Path(sys.executable).parent
     return shutil.which("mpirun", path=f"{beside}{os.pathsep}{os.environ.get('PATH', os.defpath)}")
 
 
 @cache
 def mpirun(ranks: int) -> tuple[str, ...]:
-    """The words that start so many ranks, even if there are fewer cores; Open MPI must be told that."""
+    """The words that start so many ranks, even if there are fewer cores; Open MPI must be told
+    that.
+    """
     launcher = mpirun_itself() or "mpirun"
-    about = subprocess.run([launcher, "--version"], capture_output=True, text=True, check=False).stdout
-    return (launcher, *(("--map-by", ":OVERSUBSCRIBE") if "Open MPI" in about else ()), "-n", str(ranks))
+    about = subprocess.run(
+        [launcher, "--version"], capture_output=True, text=True, check=False
+    ).stdout
+    return (
+        launcher,
+        *(("--map-by", ":OVERSUBSCRIBE") if "Open MPI" in about else ()),
+        "-n",
+        str(ranks),
+    )
 
 
 def measure(
-    module: str, arguments: Sequence[str], ranks: int = 1, environment: Mapping[str, str] | None = None
+    module: str,
+    arguments: Sequence[str],
+    ranks: int = 1,
+    environment: Mapping[str, str] | None = None,
 ) -> Usage:
     """Run `python3 -m MODULE ARGUMENT...` and wait for it; one thread per rank.
 
@@ -106,7 +125,15 @@ def measure(
     """
     launcher = mpirun(ranks) if ranks > 1 else []
     with TemporaryDirectory() as scratch:
-        command = [*launcher, sys.executable, "-m", "magshell_fenicsx.platform.processes", scratch, module, *arguments]
+        command = [
+            *launcher,
+            sys.executable,
+            "-m",
+            "magshell_fenicsx.platform.processes",
+            scratch,
+            module,
+            *arguments,
+        ]
         output, errors = Path(scratch) / "output", Path(scratch) / "errors"
         with output.open("wb") as stdout, errors.open("wb") as stderr:
             start = time.perf_counter()

@@ -1,7 +1,9 @@
-"""Reading the files that a case names: each once, whole, of a limited size, and what it declares before it is unpacked.
+"""Reading the files that a case names: each once, whole, of a limited size, and what it declares
+before it is unpacked.
 
-A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a million times its
-size, or may change while it is read; a message then says so before memory or time is spent.
+A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a
+million times its size, or may change while it is read; a message then says so before memory or time
+is spent.
 """
 
 import hashlib
@@ -28,11 +30,15 @@ LARGEST = 500_000_000  # bytes of a file
 UNPACKED = 500_000_000  # bytes of numbers that a packed file may declare
 LONGEST = 10_000  # characters in a line of a table
 EXTENT = re.compile(rb"""\b(?:Whole)?Extent\s*=\s*["']([^"']*)["']""")
-COUNT = re.compile(rb"""\bNumberOf(?:Points|Cells|Tuples|Verts|Lines|Strips|Polys)\s*=\s*["']\s*(\d+)""")
+COUNT = re.compile(
+    rb"""\bNumberOf(?:Points|Cells|Tuples|Verts|Lines|Strips|Polys)\s*=\s*["']\s*(\d+)"""
+)
 WIDTH = re.compile(rb"""<\s*(?:P?DataArray|Array)\b[^>]*""")
 COMPONENTS = re.compile(rb"""\bNumberOfComponents\s*=\s*["']\s*(\d+)""")
 LEGACY_GRID = re.compile(rb"^[ \t]*DIMENSIONS\s+(\d+)\s+(\d+)\s+(\d+)", re.M)
-LEGACY = re.compile(rb"^[ \t]*(?:POINTS|POINT_DATA|CELL_DATA|[XYZ]_COORDINATES|CELLS|CELL_TYPES)\s+(\d+)", re.M)
+LEGACY = re.compile(
+    rb"^[ \t]*(?:POINTS|POINT_DATA|CELL_DATA|[XYZ]_COORDINATES|CELLS|CELL_TYPES)\s+(\d+)", re.M
+)
 LEGACY_ARRAY = re.compile(rb"^[ \t]*\S+[ \t]+(\d+)[ \t]+(\d+)[ \t]+[a-z_]+[ \t]*\r?$", re.M)
 
 
@@ -61,7 +67,9 @@ def open_regular(file: Path) -> BinaryIO:
     """
     try:
         _refuse_special(file, file.stat().st_mode)
-        number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # never waits for a writer
+        number = os.open(
+            file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+        )  # never waits for a writer
     except ValueError:
         raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
     stream = os.fdopen(number, "rb")
@@ -147,7 +155,9 @@ def text_of(content: bytes) -> str:
         If one of its lines is longer than any row of numbers.
     """
     text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", errors="replace").read()
-    if long := next((number for number, line in enumerate(io.StringIO(text), 1) if len(line) > LONGEST), None):
+    if long := next(
+        (number for number, line in enumerate(io.StringIO(text), 1) if len(line) > LONGEST), None
+    ):
         raise ValueError(f"line {long} has more than {LONGEST} characters")
     return text
 
@@ -172,11 +182,17 @@ def arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
 
 
 def _declared(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """The bytes of an array as floats, from its head alone; at least those that the archive declares."""
+    """The bytes of an array as floats, from its head alone; at least those that the archive
+    declares.
+    """
     format_of_numpy: Any = np.lib.format
     with archive.open(member) as stream:
         version = format_of_numpy.read_magic(stream)
-        head = format_of_numpy.read_array_header_1_0 if version == (1, 0) else format_of_numpy.read_array_header_2_0
+        head = (
+            format_of_numpy.read_array_header_1_0
+            if version == (1, 0)
+            else format_of_numpy.read_array_header_2_0
+        )
         shape, _, kind = head(stream)
     return max(member.file_size, prod(map(int, shape)) * max(int(kind.itemsize), 8))
 
@@ -211,14 +227,24 @@ def vtk_data(content: bytes, suffix: str) -> "pyvista.DataSet":
 
 
 def _declared_by_vtk(content: bytes) -> int:
-    """Bytes of the numbers that the heads in a VTK file declare: of its points and of all arrays at them."""
+    """Bytes of the numbers that the heads in a VTK file declare: of its points and of all arrays at
+    them.
+    """
     if b"<VTKFile" not in content[:4096]:
         counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
         counts += [int(numbers) for numbers in LEGACY.findall(content)]
         fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
         return 8 * (3 * max(counts, default=0) + sum(fields))
-    extents = [[int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)]
-    points = [prod(abs(b - a) + 1 for a, b in zip(each[::2], each[1::2], strict=False)) for each in extents]
+    extents = [
+        [int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)
+    ]
+    points = [
+        prod(abs(b - a) + 1 for a, b in zip(each[::2], each[1::2], strict=False))
+        for each in extents
+    ]
     most = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
-    widths = [int(numbers[1]) if (numbers := COMPONENTS.search(tag)) else 1 for tag in WIDTH.findall(content)]
+    widths = [
+        int(numbers[1]) if (numbers := COMPONENTS.search(tag)) else 1
+        for tag in WIDTH.findall(content)
+    ]
     return 8 * most * (3 + sum(widths))

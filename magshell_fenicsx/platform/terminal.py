@@ -27,7 +27,10 @@ def print_line(line: str) -> None:
 
 
 def write(text: str) -> None:
-    """Write to standard output at once. If that fails, as on a full disk, say so once, and go on without it."""
+    """Write to standard output at once.
+
+    If that fails, as on a full disk, say so once, and go on without it.
+    """
     try:
         print(text, end="", flush=True)
     except BrokenPipeError:
@@ -42,7 +45,9 @@ def write(text: str) -> None:
 
 
 def open_standard_streams() -> None:
-    """Give the process those of the descriptors 0 to 2 that its parent has closed: files would take their numbers."""
+    """Give the process those of the descriptors 0 to 2 that its parent has closed: files would take
+    their numbers.
+    """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(number)
@@ -54,7 +59,10 @@ def open_standard_streams() -> None:
 def plain(ranks: int) -> bool:
     """Whether no line can be rewritten: standard output is no terminal, or there are several ranks."""
     return (
-        ranks > 1 or bool(LAUNCHERS & os.environ.keys()) or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb"
+        ranks > 1
+        or bool(LAUNCHERS & os.environ.keys())
+        or not sys.stdout.isatty()
+        or os.environ.get("TERM") == "dumb"
     )
 
 
@@ -126,7 +134,8 @@ def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
 
 
 def fitting(parts: Sequence[str], columns: int) -> str:
-    """The first parts of a line that fit, two spaces between them; none is cut but a first one that is too long.
+    """The first parts of a line that fit, two spaces between them; none is cut but a first one that
+    is too long.
 
     Examples
     --------

@@ -47,7 +47,9 @@ def account(
         else:
             left_out.append(part.absent)
     if model == "meridian":
-        between = "; where shells touch, not those that come and go between two" if loads.pairs else ""
+        between = (
+            "; where shells touch, not those that come and go between two" if loads.pairs else ""
+        )
         left_out.append(f"waves around the axis (they are looked for at each point{between})")
     if isinstance(mirror, Sector):
         begin = degrees(mirror.azimuth) + 0.0
@@ -86,7 +88,9 @@ def _of_shell(context: Context) -> str:
     laminate, laws = context.shell.laminate, laws_of(context)
     if {*laws} - {context.shell.law}:
         return f"membrane and bending energy, each of its own law: {', '.join(laws)}"
-    return laminate_account(laminate, context.shell) if laminate else law_account(context.shell.rubber)
+    return (
+        laminate_account(laminate, context.shell) if laminate else law_account(context.shell.rubber)
+    )
 
 
 def _elastic(body: Body) -> str:

@@ -1,4 +1,6 @@
-"""The columns of path.csv that a case has besides those of every run, in one place, and that no two have one name."""
+"""The columns of path.csv that a case has besides those of every run, in one place, and that no two
+have one name.
+"""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -18,20 +20,34 @@ from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 def sizes_in_units(problem: Problem) -> Sizes:
     """The sizes of the case's units."""
-    sizes = sizes_of(problem.context, {column for room in SEEN for column in room.moments(problem.loads)})
+    sizes = sizes_of(
+        problem.context, {column for room in SEEN for column in room.moments(problem.loads)}
+    )
     if sizes.given is None or isnan(sizes.given.R):
         return sizes
     ways = {name: way for room in SEEN for name, way in room.ways(problem.loads).items()}
-    lengths = {name: (WAY, 1e3 * sizes.given.R * way) for name, (turns, way) in ways.items() if way and not turns}
-    angles = {name: (TURN, float(np.degrees(way))) for name, (turns, way) in ways.items() if way and turns}
+    lengths = {
+        name: (WAY, 1e3 * sizes.given.R * way)
+        for name, (turns, way) in ways.items()
+        if way and not turns
+    }
+    angles = {
+        name: (TURN, float(np.degrees(way))) for name, (turns, way) in ways.items() if way and turns
+    }
     return replace(sizes, ways=lengths | angles)
 
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:
-    """Amplitudes that have columns of their own name, of rooms and of one's own energies, with initial values."""
+    """Amplitudes that have columns of their own name, of rooms and of one's own energies, with
+    initial values.
+    """
     grown = {name: 0.0 for room in SEEN for name in room.named(loads)}
     terms = [term for term in loads.own if term.density]
-    return grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+    return (
+        grown
+        | {term.name: term.value for term in terms}
+        | {p.name: p.value for term in terms for p in term.free}
+    )
 
 
 def extra_columns(problem: Problem) -> tuple[str, ...]:
@@ -40,8 +56,15 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     named = tuple(f"{point}_u{axis}" for point in problem.context.points for axis in "xyz")
     own = (*own_amplitudes(loads), *(column for term in loads.own for column in term.observed))
     reported = problem.supports if problem.reactions else ()
-    first = (column for room in SEEN if room.before_points for column in room.columns(loads, reported))
-    then = (column for room in SEEN if not room.before_points for column in room.columns(loads, reported))
+    first = (
+        column for room in SEEN if room.before_points for column in room.columns(loads, reported)
+    )
+    then = (
+        column
+        for room in SEEN
+        if not room.before_points
+        for column in room.columns(loads, reported)
+    )
     moves = any(step.load.in_time or step.load.released_by for step in problem.programme)
     clock = tuple(q.name for q in IN_TIME) if moves else ()
     extra = (*first, *named, *own, *then, *clock)
@@ -61,15 +84,23 @@ def refuse_twice(problem: Problem) -> None:
     written = [*(q.name for q in OF_EVERY_RUN), *extra_columns(problem)]
     for names, what in ((varied, "amplitude"), (written, "column of path.csv")):
         if twice := next((name for name in names if names.count(name) > 1), None):
-            steps = (f"{step.key}.name" for step in problem.programme if getattr(step.load, "name", None) == twice)
+            steps = (
+                f"{step.key}.name"
+                for step in problem.programme
+                if getattr(step.load, "name", None) == twice
+            )
             key = next(steps, None) or next(
                 (f"points.{point}" for point in problem.context.points if point in twice), "names"
             )
-            raise CaseError(f"{key}: {twice}: another {what} of this case has this name; choose another")
+            raise CaseError(
+                f"{key}: {twice}: another {what} of this case has this name; choose another"
+            )
 
 
 def sizes_of(context: Context, moments: Collection[str] = ()) -> Sizes:
-    """The sizes of what a case gives with units; `moments` are columns of reactions that are moments."""
+    """The sizes of what a case gives with units; `moments` are columns of reactions that are
+    moments.
+    """
     shell = context.shell
     units = given(shell)
     for section in context.abilities:

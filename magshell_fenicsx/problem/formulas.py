@@ -1,4 +1,6 @@
-"""The formulas of a case in the undeformed place: that they have sensible values, and where elements must be small."""
+"""The formulas of a case in the undeformed place: that they have sensible values, and where
+elements must be small.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,20 +32,40 @@ from magshell_fenicsx.shape.outline import ANY, Outline
 Array = NDArray[np.float64]
 THICKNESS = "shell.thickness_factor"
 SAMPLES = 20  # along each side of a square of the chart
-COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
+COARSEST, MOST_FIRST, MOST_SQUARES = (
+    0.2,
+    800,
+    3000,
+)  # side of the first squares over R, how many, and how many later
 DEGREE = 4  # of the polynomials that are compared
-SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this size show loads, and all else
+SHOWN, SMALLEST_SQUARE = (
+    0.25,
+    0.1,
+)  # of sqrt(Rh) and of h: elements of this size show loads, and all else
 SMALLEST_FLAW = 0.25  # of h
-TOTAL, SQUARE = 1e-3, 0.02  # of the integrals of a formula's size and of its square, which cells may miss
+TOTAL, SQUARE = (
+    1e-3,
+    0.02,
+)  # of the integrals of a formula's size and of its square, which cells may miss
 CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
 SMALLEST_EXTENT = 1e-9  # over R, of a surface along an axis
 STIFFNESS = 1e-3  # of it, which cells may miss by a thickness that varies within them
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
-SEEN, HALF = 6, 0.5  # places along each side of a part of the surface; of a formula's square, which samples miss
-NARROW, PLACES = 0.02, 300  # over R, parts that samples may miss, and how many of each formula are looked at
-LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
+SEEN, HALF = (
+    6,
+    0.5,
+)  # places along each side of a part of the surface; of a formula's square, which samples miss
+NARROW, PLACES = (
+    0.02,
+    300,
+)  # over R, parts that samples may miss, and how many of each formula are looked at
+LOCAL = (
+    np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5
+) / SAMPLES - 0.5
 _POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
-BASIS = np.linalg.qr(np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1))[0]
+BASIS = np.linalg.qr(
+    np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1)
+)[0]
 
 
 @dataclass(frozen=True)
@@ -77,7 +99,11 @@ def written(context: Context) -> list[Written]:
 def _written(context: Context) -> Iterator[Written]:
     factor = context.shell.thickness_factor
     for each in (
-        *([Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)] if isinstance(factor, str) else []),
+        *(
+            [Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)]
+            if isinstance(factor, str)
+            else []
+        ),
         *(formulas for section in context.abilities for formulas in section.formulas(context)),
         *(formulas for step in context.steps for formulas in step.load.formulas(step.key, context)),
     ):
@@ -108,24 +134,32 @@ def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
             )
 
 
-def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", finest: float) -> Squares | None:
-    """Squares of the chart in which elements must be small; None if there are none, or the chart is a mesh file's.
+def squares(
+    places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", finest: float
+) -> Squares | None:
+    """Squares of the chart in which elements must be small; None if there are none, or the chart is
+    a mesh file's.
 
-    Squares are divided until the elements that they need are no smaller than they, or as small as `finest`.
+    Squares are divided until the elements that they need are no smaller than they, or as small as
+    `finest`.
 
     Parameters
     ----------
     places
         Chart (n, 2) -> places (n, 3) over R in the frame of the case.
     sizes
-        Places (squares, n, 3), which of them are inside, and the side of the squares -> size of elements of each.
+        Places (squares, n, 3), which of them are inside, and the side of the squares -> size of
+        elements of each.
     """
     shape = outline.chart(None, ANY)
     if isinstance(shape, MeshFile):
         return None
     low, high = extent(shape)
     side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
-    t = [a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5) for a, b in zip(low, high, strict=True)]
+    t = [
+        a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5)
+        for a, b in zip(low, high, strict=True)
+    ]
     centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
     chosen, largest = list[tuple[Array, float, Array]](), side
     while len(centres) and len(centres) <= MOST_SQUARES:
@@ -145,7 +179,11 @@ def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", 
     if not sum(len(each) for each, _, _ in chosen):
         return None
     sides = np.concatenate([np.full(len(each), s) for each, s, _ in chosen])
-    return Squares(np.concatenate([c for c, _, _ in chosen]), sides / 2, np.concatenate([s for _, _, s in chosen]))
+    return Squares(
+        np.concatenate([c for c, _, _ in chosen]),
+        sides / 2,
+        np.concatenate([s for _, _, s in chosen]),
+    )
 
 
 Sizes = Callable[[Array, NDArray[np.bool_], float], Array]
@@ -169,9 +207,11 @@ def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
 
 
 def looked_at(formulas: Together, outline: Outline) -> Leaves:
-    """Parts of the perfect surface in which a formula has no values that their places do not show, in the case's frame.
+    """Parts of the perfect surface in which a formula has no values that their places do not show,
+    in the case's frame.
 
-    They divide triangles of the chart, of a disc those of a square that is mapped onto it, or of a mesh file.
+    They divide triangles of the chart, of a disc those of a square that is mapped onto it, or of a
+    mesh file.
     """
     shape = outline.chart(None, ANY)
     if isinstance(shape, MeshFile):
@@ -180,10 +220,14 @@ def looked_at(formulas: Together, outline: Outline) -> Leaves:
     else:
         low, high = extent(shape)
         radius = shape.reach if isinstance(shape, DiscShape) else None
-        t = [np.linspace(a, b, ceil((b - a) / COARSEST) + 1) for a, b in zip(low, high, strict=True)]
+        t = [
+            np.linspace(a, b, ceil((b - a) / COARSEST) + 1) for a, b in zip(low, high, strict=True)
+        ]
         corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
         a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
-        triangles = np.concatenate([np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))])
+        triangles = np.concatenate(
+            [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
+        )
 
         def embedded(x: Array) -> Array:
             return outline.perfect(x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x)
@@ -191,13 +235,18 @@ def looked_at(formulas: Together, outline: Outline) -> Leaves:
     lattice = Lattice.of(basix.CellType.triangle, SEEN)
 
     def look(parts: Parts) -> tuple[Array, Array]:
-        X, three = parts.rule(lattice.places, np.ones(len(lattice.places)))[0], triangles[parts.cell]
+        X, three = (
+            parts.rule(lattice.places, np.ones(len(lattice.places)))[0],
+            triangles[parts.cell],
+        )
         x = three[:, None, 0] + np.matmul(X, three[:, 1:] - three[:, :1])
         x = embedded(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:2], 3)
         area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
         return x, area
 
-    first = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2))).of(np.arange(len(triangles)))
+    first = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2))).of(
+        np.arange(len(triangles))
+    )
     return leaves_of(formulas, first, look, lattice, len(triangles))
 
 
@@ -207,12 +256,16 @@ def narrow_places(leaves: Sequence[Leaves]) -> Array:
     for each in leaves:
         small = np.flatnonzero(each.size < NARROW)
         order = small[np.argsort(-each.area[small] * each.away[small])]
-        few += [each.centre[order[:PLACES]], each.centre[order[PLACES :: max(1, len(order) // PLACES)]]]
+        few += [
+            each.centre[order[:PLACES]],
+            each.centre[order[PLACES :: max(1, len(order) // PLACES)]],
+        ]
     return np.concatenate(few)
 
 
 def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None = None) -> Sizes:
-    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it.
+    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials
+    miss most of it.
 
     What samples of a square do not have and the leaves in it have is missed too.
     """
@@ -237,7 +290,9 @@ def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None
         squared = area * (missed**2).sum(axis=(1, 2))
         if leaves:
             middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]
-            squared = np.maximum(squared, _unsampled(leaves, middle, side, area * (f**2).sum(axis=(1, 2))))
+            squared = np.maximum(
+                squared, _unsampled(leaves, middle, side, area * (f**2).sum(axis=(1, 2)))
+            )
         order = np.argsort(squared)
         fine = np.empty(len(f), dtype=bool)
         fine[order] = np.cumsum(squared[order]) <= MISSED * whole
@@ -247,7 +302,9 @@ def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None
 
 
 def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
-    """The squares' integrals of the square of a formula, less those of samples that have not half of it."""
+    """The squares' integrals of the square of a formula, less those of samples that have not half
+    of it.
+    """
     away, square = scipy.spatial.cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
     missed = np.isfinite(away) & (leaves.size < side)
     whole = np.bincount(square[missed], (leaves.area * leaves.away)[missed], len(middle))
@@ -255,7 +312,11 @@ def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Ar
 
 
 def refinements(
-    formulas: Sequence[Written], narrow: Sequence[Leaves | None], drawn: Outline, turn: float, h: float
+    formulas: Sequence[Written],
+    narrow: Sequence[Leaves | None],
+    drawn: Outline,
+    turn: float,
+    h: float,
 ) -> list[Squares]:
     """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad).
 
@@ -274,8 +335,12 @@ def refinements(
     return [each for each in areas if each]
 
 
-def of_imperfections(flaws: Iterable[Flaw], perfect: Outline, turn: float, h: float) -> tuple[list[Squares], float]:
-    """Where imperfections without a centre need small elements, and the size that shows the others everywhere."""
+def of_imperfections(
+    flaws: Iterable[Flaw], perfect: Outline, turn: float, h: float
+) -> tuple[list[Squares], float]:
+    """Where imperfections without a centre need small elements, and the size that shows the others
+    everywhere.
+    """
     Q, everywhere, local = rotation(turn), inf, list[Squares]()
     shape = perfect.chart(None, ANY)
 
@@ -298,12 +363,18 @@ def of_imperfections(flaws: Iterable[Flaw], perfect: Outline, turn: float, h: fl
 
 
 def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
-    """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places is looked at."""
+    """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places
+    is looked at.
+    """
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
         fewer = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
         needed = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
-        return np.asarray(np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], needed, inf).min(axis=(1, 2)))
+        return np.asarray(
+            np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], needed, inf).min(
+                axis=(1, 2)
+            )
+        )
 
     return sizes
 
@@ -319,7 +390,15 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
         x, normals, _ = cells.at(element.points)
         turned = replace(each.formulas, frame=Q)
         bounded = each.given.key == THICKNESS
-        fit = fitted(values, cells, values(x, normals), element, element.degree, bounded=bounded, formulas=turned)
+        fit = fitted(
+            values,
+            cells,
+            values(x, normals),
+            element,
+            element.degree,
+            bounded=bounded,
+            formulas=turned,
+        )
         missed = fit.rest**2
         if fit.open:
             said.append(
@@ -330,7 +409,9 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
         lost = max(fit.missed, missed if each.given.deformed and missed > SQUARE else 0.0)
         if lost > TOTAL:
             off = f"{100 * lost:.2g} %"
-            said.append(f"{each.given.key}: varies so much within elements that its integral may be wrong by {off}")
+            said.append(
+                f"{each.given.key}: varies so much within elements that its integral may be wrong by {off}"
+            )
         elif wrong > STIFFNESS:
             said.append(
                 f"{each.given.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
@@ -347,11 +428,13 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
 
 
 def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
-    """By how much the stiffness t^3 or the compliance 1/t^3 of the cells differs, over that of all; collective.
+    """By how much the stiffness t^3 or the compliance 1/t^3 of the cells differs, over that of all;
+    collective.
 
-    Parts of a shell that carry side by side add their stiffness, those in a row their compliance. That of a cell is
-    what polynomial curvatures of its degree less two show under a constant moment. The squares of moments may be alike
-    everywhere or fall to zero along an axis, as those of a cantilever: the largest difference counts.
+    Parts of a shell that carry side by side add their stiffness, those in a row their compliance.
+    That of a cell is what polynomial curvatures of its degree less two show under a constant
+    moment. The squares of moments may be alike everywhere or fall to zero along an axis, as those
+    of a cantilever: the largest difference counts.
     """
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
     x, normals, area = cells.at(X)
@@ -366,8 +449,15 @@ def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, noda
     shown = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
     true = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
     off = np.abs(true - np.stack([(weight * p**3).sum(axis=(1, 2)), shown], axis=1))
-    middle, least, most = x.mean(axis=1), x.min(axis=(0, 1), initial=inf), x.max(axis=(0, 1), initial=-inf)
-    least, most = np.min(cells.comm.allgather(least), axis=0), np.max(cells.comm.allgather(most), axis=0)
+    middle, least, most = (
+        x.mean(axis=1),
+        x.min(axis=(0, 1), initial=inf),
+        x.max(axis=(0, 1), initial=-inf),
+    )
+    least, most = (
+        np.min(cells.comm.allgather(least), axis=0),
+        np.max(cells.comm.allgather(most), axis=0),
+    )
     along = (middle - (least + most) / 2) / np.maximum((most - least) / 2, SMALLEST_EXTENT)
     loaded = np.concatenate([np.ones((len(x), 1)), (1 + along) ** 2, (1 - along) ** 2], axis=1)
     shares = [cells.sum(each[..., None] * loaded[:, None]) for each in (off, true)]

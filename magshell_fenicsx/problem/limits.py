@@ -13,7 +13,10 @@ from magshell_fenicsx.shape.sections import MeshSurface
 PROCESS = 0.25e9  # bytes of a process before its model
 PER_UNKNOWN = {2: 1.0e3, 3: 1.1e3, 4: 1.3e3, 5: 1.65e3}  # degree -> bytes over N ln N, full shells
 SOLID = 0.7e3  # likewise of a body
-EXCLUDED, INDEFINITE = 0.6, 0.7  # added parts: for the modes that a half excludes, and past an instability
+EXCLUDED, INDEFINITE = (
+    0.6,
+    0.7,
+)  # added parts: for the modes that a half excludes, and past an instability
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,15 @@ class Memory:
     most: float
 
     @classmethod
-    def of(cls, context: Context, unknowns: float, *, half: bool = False, ranks: int = 1, here: int = 1) -> "Memory":
+    def of(
+        cls, context: Context, unknowns: float, *, half: bool = False, ranks: int = 1, here: int = 1
+    ) -> "Memory":
         """That of `here` of the `ranks` of a run, which are those on one machine."""
-        each = SOLID if context.solid else PER_UNKNOWN.get(degree_of(context), PER_UNKNOWN[max(PER_UNKNOWN)])
+        each = (
+            SOLID
+            if context.solid
+            else PER_UNKNOWN.get(degree_of(context), PER_UNKNOWN[max(PER_UNKNOWN)])
+        )
         shared = each * unknowns * log(max(unknowns, 2.0)) * here / ranks
         least = PROCESS * here + shared * (1 + EXCLUDED * half)
         return cls(unknowns, least, least + INDEFINITE * shared)
@@ -45,11 +54,14 @@ class Memory:
 
 
 def unknowns_of(context: Context, cells: float) -> float:
-    """Estimate the unknowns of a number of triangles before they are made: of degree k, one brings 3 k^2/2.
+    """Estimate the unknowns of a number of triangles before they are made: of degree k, one brings
+    3 k^2/2.
 
     The body over it brings three hexahedra of degree 2 in each layer.
     """
-    return cells * (36 * (2 * len(layers(context)) - 1) if context.solid else 1.5 * degree_of(context) ** 2)
+    return cells * (
+        36 * (2 * len(layers(context)) - 1) if context.solid else 1.5 * degree_of(context) ** 2
+    )
 
 
 def refuse_beyond_memory(problem: Problem, ranks: int = 1, here: int = 1) -> str | None:
@@ -81,7 +93,11 @@ def refuse_beyond_memory(problem: Problem, ranks: int = 1, here: int = 1) -> str
     how = f"lower mesh.refinement ({problem.mesh.refinement:g}) or mesh.degree ({degree})"
     if isinstance(shell, MeshSurface):
         how = f"take a coarser mesh file, or a lower mesh.degree ({degree})"
-    hint = "" if problem.half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
+    hint = (
+        ""
+        if problem.half
+        else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
+    )
     raise CaseError(
         f"mesh: about {needed.unknowns:.2g} unknowns at radius/thickness {shell.R_over_h:g} take "
         f"{needed.words(free)}: {how}{hint}; ranks on several machines share it; MAGSHELL_MEMORY=GB in the environment "

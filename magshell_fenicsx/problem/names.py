@@ -1,4 +1,6 @@
-"""The energies of a problem, each with its own name; its edges, points and patches, which the surface must have."""
+"""The energies of a problem, each with its own name; its edges, points and patches, which the
+surface must have.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 
@@ -17,7 +19,10 @@ from magshell_fenicsx.parts.registered import SEEN, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 from magshell_fenicsx.quantities.registry import TAKEN
 
-LEAST, MOST = 1e-12, 1e9  # of a part's amplitude, in E h/R^2: rounding, and what no mesh of a shell resolves
+LEAST, MOST = (
+    1e-12,
+    1e9,
+)  # of a part's amplitude, in E h/R^2: rounding, and what no mesh of a shell resolves
 
 
 def surface_terms(context: Context, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
@@ -32,21 +37,31 @@ def surface_terms(context: Context, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ..
     for key, part in parts_of(context).items():
         for term in part.terms(context.scales):
             if term.density and not LEAST <= abs(term.value) <= MOST:
-                raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
+                raise CaseError(
+                    f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}"
+                )
             terms.append(term)
     for step in {step.name: step for step in context.steps}.values():
         terms += step.load.terms(step, context)
     terms += own
-    names = [name for term in terms for name in ((term.name,) if term.density else ()) + tuple(term.observed)]
+    names = [
+        name
+        for term in terms
+        for name in ((term.name,) if term.density else ()) + tuple(term.observed)
+    ]
     names += {p.name for term in terms for p in term.free}
     for name in names:
         if name in TAKEN or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
     for term in terms if context.solid else []:
         if term.on is not None:
-            raise CaseError(f"model: solid: {term.name} is an energy of an edge, which only a shell has")
+            raise CaseError(
+                f"model: solid: {term.name} is an energy of an edge, which only a shell has"
+            )
         if curved := [f"r0.{name}" for name in term.placed_parts if name in SECOND]:
-            raise CaseError(f"model: solid: {term.name} depends on {', '.join(curved)}, which only a shell has")
+            raise CaseError(
+                f"model: solid: {term.name} depends on {', '.join(curved)}, which only a shell has"
+            )
     return tuple(terms)
 
 
@@ -69,7 +84,10 @@ def refuse_unfit(
 
 
 def refuse_unfit_ends(
-    ends: Collection[str], points: Collection[str], conditions: Mapping[str, Condition], loads: Loads
+    ends: Collection[str],
+    points: Collection[str],
+    conditions: Mapping[str, Condition],
+    loads: Loads,
 ) -> None:
     """The same of a meridian, which has ends and points.
 
@@ -82,19 +100,33 @@ def refuse_unfit_ends(
     _refuse_ambiguous(ends, points, conditions)
 
 
-def _refuse_ambiguous(edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]) -> None:
+def _refuse_ambiguous(
+    edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]
+) -> None:
     for name, condition in conditions.items():
         if isinstance(condition, Held) and name in edges and name in points:
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
 
 
-def open_edges(patch: PatchMesh, conditions: Mapping[str, Condition], on: Collection[str] = ()) -> tuple[str, ...]:
-    """The edges at which a live pressure has no potential; `on` are the patches that it acts on, all without."""
-    sides = {name: {(int(a), int(b)) for a, b in np.sort(edge, axis=1)} for name, edge in patch.edges.items()}
+def open_edges(
+    patch: PatchMesh, conditions: Mapping[str, Condition], on: Collection[str] = ()
+) -> tuple[str, ...]:
+    """The edges at which a live pressure has no potential; `on` are the patches that it acts on,
+    all without.
+    """
+    sides = {
+        name: {(int(a), int(b)) for a, b in np.sort(edge, axis=1)}
+        for name, edge in patch.edges.items()
+    }
     if on:
         inside = np.logical_or.reduce([patch.patches[name] for name in on])
         vertices = set(map(int, patch.corners[inside].ravel()))
-        sides = {name: {pair for pair in pairs if vertices.issuperset(pair)} for name, pairs in sides.items()}
+        sides = {
+            name: {pair for pair in pairs if vertices.issuperset(pair)}
+            for name, pairs in sides.items()
+        }
     return without_potential(
-        moving(sides, conditions), conditions, lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])])
+        moving(sides, conditions),
+        conditions,
+        lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])]),
     )

@@ -33,7 +33,12 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.names import refuse_unfit
 from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
-from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
+from magshell_fenicsx.problem.wanted import (
+    FrequenciesSection,
+    GradientsSection,
+    OutputSection,
+    StabilitySection,
+)
 from magshell_fenicsx.shape.turning import Span
 
 ROUNDING = 1e-9
@@ -42,7 +47,9 @@ PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a conta
 
 @dataclass(frozen=True)
 class Body:
-    """The material of a solid, and where its elements through the thickness begin and end, 0 inside to 1 outside."""
+    """The material of a solid, and where its elements through the thickness begin and end, 0 inside
+    to 1 outside.
+    """
 
     material: MooneyRivlin
     layers: list[float]
@@ -61,14 +68,17 @@ def body_of(context: Context) -> Body | None:
 def layers(context: Context) -> list[float]:
     """Where the elements through the thickness begin and end, from 0 inside to 1 outside.
 
-    Magnetised layers end where elements do, and so does the inner half then: nodes lie in the middle.
+    Magnetised layers end where elements do, and so does the inner half then: nodes lie in the
+    middle.
     """
     count, magnetic = _section(context).layers, context.of(MagneticSection)
     remanent = magnetic and magnetic.remanent
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
         return [n / count for n in range(count + 1)]
-    tops = [sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)]
+    tops = [
+        sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
+    ]
     ends = [0.0, *sorted({MIDDLE, *(round(top, 9) for top in tops)}), 1.0]
     begins = [0.0]
     for low, high in pairwise(ends):
@@ -83,7 +93,8 @@ def _section(context: Context) -> SolidSection:
 
 @dataclass(frozen=True)
 class Document:
-    """What a run writes of that from which its problem was made, and by which it knows the run again.
+    """What a run writes of that from which its problem was made, and by which it knows the run
+    again.
 
     Attributes
     ----------
@@ -243,8 +254,14 @@ class Problem:
 
     @property
     def outward(self) -> Embedding | None:
-        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell; None if they are not known."""
-        return self.meridian.normal if self.meridian else getattr(self.embedding, "normal", self.normal)
+        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell; None if
+        they are not known.
+        """
+        return (
+            self.meridian.normal
+            if self.meridian
+            else getattr(self.embedding, "normal", self.normal)
+        )
 
     @property
     def given(self) -> MeshFile | None:
@@ -263,9 +280,13 @@ class Problem:
 
     @property
     def moves_freely(self) -> bool:
-        """Whether the shell moves in time alone, so that it need not be held: its rigid motions cost inertia."""
+        """Whether the shell moves in time alone, so that it need not be held: its rigid motions
+        cost inertia.
+        """
         motions = [step.load.motion for step in self.programme]
-        needs_inertia_alone = all(motion is not None and motion.needs_inertia_alone for motion in motions)
+        needs_inertia_alone = all(
+            motion is not None and motion.needs_inertia_alone for motion in motions
+        )
         return bool(motions) and needs_inertia_alone and not (self.frequencies or self.stability)
 
     @property
@@ -316,23 +337,39 @@ class Problem:
     def _flat(self) -> tuple[float, float, float, str]:
         """The penalty and that of the degree by default; how messages tell places."""
         default = default_penalty(self.mesh.degree)
-        told = (1 / self._of_file.scale, "in the file's coordinates") if self._of_file else (1.0, "over R")
+        told = (
+            (1 / self._of_file.scale, "in the file's coordinates")
+            if self._of_file
+            else (1.0, "over R")
+        )
         return self.mesh.penalty or default, default, *told
 
     def _triangulated(self, shape: Shape) -> PatchMesh:
-        """The mesh of a shape by gmsh; that of a sector is symmetric, so that crests and troughs of waves are alike."""
+        """The mesh of a shape by gmsh; that of a sector is symmetric, so that crests and troughs of
+        waves are alike.
+        """
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
         middle = Mirror.upright(self.mirror.angle / 2)
         at = {name: np.append(x, 0.0) for name, x in self.points.items()}
-        points = {name: (x if middle.beyond(x) <= 0 else middle.image(x))[:2] for name, x in at.items()}
-        half = triangulate(replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding)
+        points = {
+            name: (x if middle.beyond(x) <= 0 else middle.image(x))[:2] for name, x in at.items()
+        }
+        half = triangulate(
+            replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding
+        )
         return replace(doubled(half, self.mirror.angle), points=dict(self.points))
 
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
-            held = [name for name, condition in self.conditions.items() if condition in ("clamped", "hinged")]
-            return replace(read_msh(self.shape, self.points, self.mirror, held), embedding=self.embedding)
+            held = [
+                name
+                for name, condition in self.conditions.items()
+                if condition in ("clamped", "hinged")
+            ]
+            return replace(
+                read_msh(self.shape, self.points, self.mirror, held), embedding=self.embedding
+            )
         if isinstance(self.shape, PatchMesh):
             return replace(self.shape, embedding=self.embedding)
         if isinstance(self.shape, Grid):
@@ -351,11 +388,18 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
     if span.vertices is not None:
         return span.vertices
     if span.pieces:
-        meets = {piece.name: any(pair.has(piece.name) for pair in problem.loads.pairs) for piece in span.pieces}
-        pressed = {piece.name: [(inf, piece.length)] if meets[piece.name] else [] for piece in span.pieces}
+        meets = {
+            piece.name: any(pair.has(piece.name) for pair in problem.loads.pairs)
+            for piece in span.pieces
+        }
+        pressed = {
+            piece.name: [(inf, piece.length)] if meets[piece.name] else [] for piece in span.pieces
+        }
         each = [piece.vertices([*problem.pressed, *pressed[piece.name]]) for piece in span.pieces]
         ends = [float(s[-1]) for s in each[:-1]]
-        return np.concatenate([s[s > end] for s, end in zip(each, [-inf, *ends], strict=True)])  # joined ones meet
+        return np.concatenate(
+            [s[s > end] for s, end in zip(each, [-inf, *ends], strict=True)]
+        )  # joined ones meet
     pole = span.names[0] is None
     h = problem.material.h / span.curvature
     reach = max((one[1] for one in problem.pressed), default=0.0)

@@ -1,4 +1,6 @@
-"""The elements: what a case says of them, and the sizes that dimple, loads and edges need, over the length sqrt(Rh)."""
+"""The elements: what a case says of them, and the sizes that dimple, loads and edges need, over the
+length sqrt(Rh).
+"""
 
 from collections.abc import Sequence
 from math import sqrt
@@ -49,11 +51,15 @@ class MeshSection(Section):
         for key in self.model_fields_set & {"degree", "penalty"}:
             if key != "degree" or self.degree != SOLID_DEGREE:
                 finer = "a file with smaller elements" if read else "mesh.refinement"
-                raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
+                raise ValueError(
+                    f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer"
+                )
 
 
 class SolidSection(Section):
-    """Hexahedra of degree 2 through the thickness, and the compressibility that stands for poisson_ratio: 0.5."""
+    """Hexahedra of degree 2 through the thickness, and the compressibility that stands for
+    poisson_ratio: 0.5.
+    """
 
     layers: int = Field(default=1, ge=1, le=10)
     """Elements through the thickness"""
@@ -97,7 +103,8 @@ def grading(
     *,
     local: bool = False,
 ) -> Grading:
-    """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; a size that is given is everywhere the same, as in a file.
+    """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; a size that is given is everywhere the same,
+    as in a file.
 
     Parameters
     ----------
@@ -130,7 +137,10 @@ def _largest(context: Context, outline: "Outline", fit: Fit) -> float:
         return min(2 * sqrt(fit.h), 0.35)
     if not outline.disc or context.shell.geometry == "disc":
         return min(0.25, 0.5 * (getattr(context.shell, "width", None) or 1.0))
-    return min((size for step in context.steps if (size := step.load.largest(fit)) is not None), default=0.35)
+    return min(
+        (size for step in context.steps if (size := step.load.largest(fit)) is not None),
+        default=0.35,
+    )
 
 
 def _growth(context: Context, fit: Fit) -> float:
@@ -145,7 +155,11 @@ def _rim(context: Context, outline: "Outline", fit: Fit) -> list[Feature]:
         size, held = 1.2 * sqrt(h) / fit.refinement, boundary.conditions() if boundary else {}
         ends = ((axis, end[axis]) for axis in range(2) for end in (grid.low, grid.high))
         sides = zip(ends, grid.sides, grid.glued[:1] * 2 + grid.glued[1:] * 2, strict=True)
-        fixed = (at for at, name, glued in sides if not glued and held.get(name, "free") not in ("free", "symmetry"))
+        fixed = (
+            at
+            for at, name, glued in sides
+            if not glued and held.get(name, "free") not in ("free", "symmetry")
+        )
         return [Line(axis, place, size, _growth(context, fit)) for axis, place in fixed]
     if not outline.disc or context.shell.geometry == "disc":
         return []

@@ -27,10 +27,11 @@ At = Annotated[
 
 
 class FrequenciesSection(Section):
-    """Natural frequencies of small vibrations about points of the path, under the loads of each point.
+    """Natural frequencies of small vibrations about points of the path, under the loads of each
+    point.
 
-    frequencies.csv lists ω² ρ R²/E, negative where the shell is unstable, and with `shell.density` hertz.
-    A shell that nothing loads needs no support: its rigid motions are listed with ω² = 0.
+    frequencies.csv lists ω² ρ R²/E, negative where the shell is unstable, and with `shell.density`
+    hertz. A shell that nothing loads needs no support: its rigid motions are listed with ω² = 0.
     """
 
     count: int = Field(default=6, ge=1, le=50)
@@ -45,9 +46,10 @@ FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
 class GradientsSection(Section):
     """Derivatives of results by numbers and by whole fields, of one adjoint solve for each result.
 
-    Fields, per area of the undeformed shell: the remanence (vectors), its magnitude (a factor), the thickness (over h),
-    the natural curvature (over 1/R, along t1 and t2 and its twist) and the deviation w0 of the shape (over R, along the
-    normal). They are written as fields/gradients_*.vtu and drawn: where would more help most?
+    Fields, per area of the undeformed shell: the remanence (vectors), its magnitude (a factor), the
+    thickness (over h), the natural curvature (over 1/R, along t1 and t2 and its twist) and the
+    deviation w0 of the shape (over R, along the normal). They are written as fields/gradients_*.vtu
+    and drawn: where would more help most?
     """
 
     of: Annotated[list[str], Field(min_length=1)] = Field(default=["knockdown"])

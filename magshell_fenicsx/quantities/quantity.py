@@ -1,4 +1,5 @@
-"""A quantity observed along a path, an amplitude that varies, their units, and the spelling of their symbols.
+"""A quantity observed along a path, an amplitude that varies, their units, and the spelling of
+their symbols.
 
 A unit is data: what one of a dimensionless number is, as a function of the shell's sizes.
 """
@@ -11,7 +12,18 @@ from functools import cached_property
 from math import nan, pi, sqrt
 from typing import Literal
 
-Kind = Literal["load", "displacement", "energy", "error", "time", "place", "reaction", "moment", "count", "text"]
+Kind = Literal[
+    "load",
+    "displacement",
+    "energy",
+    "error",
+    "time",
+    "place",
+    "reaction",
+    "moment",
+    "count",
+    "text",
+]
 SUPERSCRIPTS = str.maketrans("²³⁴", "234")
 
 
@@ -50,7 +62,9 @@ class Given:
 
     @property
     def in_si(self) -> float:
-        """1 in a case whose lengths and modulus have units, else nan: the size of numbers that are in SI already."""
+        """1 in a case whose lengths and modulus have units, else nan: the size of numbers that are
+        in SI already.
+        """
         return 1.0 + 0.0 * self.R * self.E
 
 
@@ -65,16 +79,18 @@ class Unit:
     si
         The unit in SI.
     ending, shown
-        The unit in which a case with units has a column of its own: the ending of its name, and the unit in words.
+        The unit in which a case with units has a column of its own: the ending of its name, and the
+        unit in words.
     size
         What one of the number is in that unit; nan if the case lacks what it needs.
     text
-        The unit of `size` in pint's words, into which a text with a unit is converted; empty if no text is. A column in
-        another unit than that of a target has a `Unit` of its own.
+        The unit of `size` in pint's words, into which a text with a unit is converted; empty if no
+        text is. A column in another unit than that of a target has a `Unit` of its own.
     needs
         What a case must have for such a text.
     words, symbol
-        Of the column in that unit, if they are not those of the quantity; a quantity without a symbol gets none.
+        Of the column in that unit, if they are not those of the quantity; a quantity without a
+        symbol gets none.
     """
 
     key: str
@@ -101,16 +117,40 @@ def _in_si(given: Given) -> float:
     return given.in_si
 
 
-PRESSURE = Unit("p_c", "Pa", "Pa", "Pa", lambda g: 2 * g.E / sqrt(3 * (1 - g.nu**2)) / g.R_over_h**2, text="pascal")
+PRESSURE = Unit(
+    "p_c",
+    "Pa",
+    "Pa",
+    "Pa",
+    lambda g: 2 * g.E / sqrt(3 * (1 - g.nu**2)) / g.R_over_h**2,
+    text="pascal",
+)
 THICKNESS = Unit("h", "m", "mm", "mm", lambda g: 1e3 * g.h, text="millimetre")
 VOLUME = Unit("R³", "m³", "mm3", "mm³", lambda g: 1e9 * g.R**3, text="millimetre**3")
 POINT_FORCE = Unit("2πD/R", "N", "N", "N", lambda g: g.force, text="newton")
 ENERGY = Unit("E h R²", "J", "mJ", "mJ", lambda g: 1e3 * g.E * g.h * g.R**2)
 STIFFNESS = Unit("E h/R²", "N/m³", "N_per_m3", "N/m³", lambda g: g.E * g.h / g.R**2)
 FIELD = Unit(
-    "λ_m", "mT", "mT", "mT", lambda g: g.applied, text="millitesla", formula="", words="applied field", symbol="B_a"
+    "λ_m",
+    "mT",
+    "mT",
+    "mT",
+    lambda g: g.applied,
+    text="millitesla",
+    formula="",
+    words="applied field",
+    symbol="B_a",
 )
-STRENGTH = Unit("λ_m", "", "percent", "%", lambda g: g.strength, formula="", words="strength of the sources", symbol="")
+STRENGTH = Unit(
+    "λ_m",
+    "",
+    "percent",
+    "%",
+    lambda g: g.strength,
+    formula="",
+    words="strength of the sources",
+    symbol="",
+)
 PLACE = Unit("place", "", "mm", "mm", lambda g: 1e3 * g.R / g.R, formula="")
 REACTION = Unit("reaction", "", "N", "N", _in_si, formula="")
 MOMENT = Unit("moment", "", "N_m", "N m", _in_si, formula="")
@@ -144,7 +184,9 @@ def plain_text(text: str) -> str:
     >>> plain_text("λ Δw² ρ")
     'lambda dw^2 rho'
     """
-    text = re.sub("[\u0391-\u03c9]", lambda greek: "d" if greek[0] == "Δ" else _letter(greek[0]), text)
+    text = re.sub(
+        "[\u0391-\u03c9]", lambda greek: "d" if greek[0] == "Δ" else _letter(greek[0]), text
+    )
     return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
 
@@ -178,17 +220,21 @@ class Quantity:
     meaning
         Definition in one sentence.
     symbol
-        For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there is no symbol.
+        For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there
+        is no symbol.
     units
-        What one of the number is, the first of them unless the case shows another; empty for a pure number.
+        What one of the number is, the first of them unless the case shows another; empty for a pure
+        number.
     note
         Distinguishes quantities with the same symbol; follows the words or the symbol.
     sign
         Sign of its value on an axis.
     stem
-        Its name without a unit, before the endings of columns in units; by default the name without "_over_h".
+        Its name without a unit, before the endings of columns in units; by default the name without
+        "_over_h".
     each
-        Whether there may be several, of which each has a column of its own: NAME_OF_COLUMN, an underscore, its name.
+        Whether there may be several, of which each has a column of its own: NAME_OF_COLUMN, an
+        underscore, its name.
     """
 
     name: str
@@ -275,15 +321,21 @@ class Quantity:
 
     def in_unit(self, unit: Unit) -> "Quantity":
         """The column in the unit that is shown for one of its units."""
-        stem, symbol = self.stem or self.name.replace("_over_h", ""), re.split("[ /]", self.symbol)[0]
+        stem, symbol = (
+            self.stem or self.name.replace("_over_h", ""),
+            re.split("[ /]", self.symbol)[0],
+        )
         words = self.words if unit.words is None else unit.words
         symbol = symbol if unit.symbol is None or not symbol else unit.symbol
         shown = Unit(unit.shown, unit.shown)
-        return replace(self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,))
+        return replace(
+            self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,)
+        )
 
     @cached_property
     def in_units(self) -> tuple["Quantity", ...]:
-        """The same in the units of a case, one of which is a column of its own where the case has units.
+        """The same in the units of a case, one of which is a column of its own where the case has
+        units.
 
         Examples
         --------
@@ -305,7 +357,8 @@ class Amplitude:
     column
         Column of its value.
     conjugate
-        Column of the displacement on the other axis of its curve; proportional to -Pi if its meaning says so.
+        Column of the displacement on the other axis of its curve; proportional to -Pi if its
+        meaning says so.
     place
         Location of that displacement.
     sideways

@@ -1,4 +1,6 @@
-"""Every amplitude and every column of path.csv, in the order of the file, and those columns in a case's units."""
+"""Every amplitude and every column of path.csv, in the order of the file, and those columns in a
+case's units.
+"""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -29,7 +31,11 @@ from magshell_fenicsx.quantities.quantity import (
     Unit,
 )
 
-OWN_MODES = ("", "symmetric", "asymmetric")  # in the column of modes: those of the model itself; it excludes all others
+OWN_MODES = (
+    "",
+    "symmetric",
+    "asymmetric",
+)  # in the column of modes: those of the model itself; it excludes all others
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -77,7 +83,11 @@ OF_EVERY_RUN = (
         "",
         "Inward displacement at the force (its mean over a patch), along the dead loads, or else of the pole.",
     ),
-    _w("w_from_field_over_h", "since the field", "w_over_h minus its value at the end of the field."),
+    _w(
+        "w_from_field_over_h",
+        "since the field",
+        "w_over_h minus its value at the end of the field.",
+    ),
     _w(
         "w_pole_over_h",
         "of the pole",
@@ -101,7 +111,10 @@ OF_EVERY_RUN = (
         "count",
     ),
     Quantity(
-        "negative_pivots_held", "unstable, w held", "The same number with the conjugate displacement fixed.", "count"
+        "negative_pivots_held",
+        "unstable, w held",
+        "The same number with the conjugate displacement fixed.",
+        "count",
     ),
     Quantity("iterations", "iterations", "Iterations of Newton's method.", "count"),
     Quantity("factorisations", "factorisations", "Factorisations of the tangent.", "count"),
@@ -110,15 +123,31 @@ OF_EVERY_RUN = (
     _energy("bending", "bending", "Bending energy, including the edges; not of a solid."),
     _energy("magnetic", "magnetic", "Magnetic energy."),
     _energy("U1", "first term", "First term of the approximate magnetic energies.", "U_1"),
-    _energy("Uq", "torques of rotations", "Torque term of the approximate magnetic energies, in rotations.", "U_q"),
+    _energy(
+        "Uq",
+        "torques of rotations",
+        "Torque term of the approximate magnetic energies, in rotations.",
+        "U_q",
+    ),
     _energy(
         "Utau",
         "torques of gradients",
         "Torque term of the approximate magnetic energies, in displacement gradients.",
         "U_τ",
     ),
-    Quantity("mode", "mode", "Mode of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
-    Quantity("field_angle", "field angle", "Angle by which the field has turned.", "load", units=(DEGREES,)),
+    Quantity(
+        "mode",
+        "mode",
+        "Mode of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...",
+        "text",
+    ),
+    Quantity(
+        "field_angle",
+        "field angle",
+        "Angle by which the field has turned.",
+        "load",
+        units=(DEGREES,),
+    ),
     Quantity(
         "branch",
         "branch",
@@ -134,7 +163,12 @@ OF_EVERY_RUN = (
         "",
         (THICKNESS,),
     ),
-    Quantity("load_error", "error of the load", "Estimate of the error of the amplitude at a located point.", "error"),
+    Quantity(
+        "load_error",
+        "error of the load",
+        "Estimate of the error of the amplitude at a located point.",
+        "error",
+    ),
     Quantity(
         "excluded_pivots",
         "unstable, excluded",
@@ -153,10 +187,14 @@ IN_TIME = (  # of runs with a step of kind: time
         (TIME,),
     ),
     _energy("kinetic", "kinetic", "Kinetic energy."),
-    _energy("stored", "stored", "Energy of the shell itself: all terms but the potentials of loads."),
+    _energy(
+        "stored", "stored", "Energy of the shell itself: all terms but the potentials of loads."
+    ),
     _energy("dissipated", "dissipated", "Energy lost by drag and viscosity; none in static steps."),
     _energy(
-        "work", "work", "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored."
+        "work",
+        "work",
+        "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored.",
     ),
     _energy(
         "imbalance",
@@ -210,22 +248,39 @@ def endings() -> dict[str, str]:
 
 
 def quantity(name: str) -> Quantity:
-    """The quantity of a column; a named point's displacement or a user-defined amplitude has its own name."""
+    """The quantity of a column; a named point's displacement or a user-defined amplitude has its
+    own name.
+    """
     if name in QUANTITIES:
         return QUANTITIES[name]
     if again := re.fullmatch(r"(force|load)_(\d+)", name):
         of = QUANTITIES[AMPLITUDES[again[1]].column]
-        return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
+        return replace(
+            of,
+            name=name,
+            words=f"{of.words} {again[2]}",
+            symbol=of.symbol and f"F_{again[2]} R/(2πD)",
+        )
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
-        return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
+        return _w(
+            name,
+            f"at {again[1].replace('_', ' ')}",
+            f"Displacement conjugate to {again[1]}, as w_over_h.",
+        )
     numbered = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
     first = QUANTITIES.get(numbered[1]) if numbered else None
     if numbered and first and first.kind == "load":
         return replace(first, name=name, words=f"{first.words} {numbered[2]}", symbol="")
-    if several := [q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)]:
+    if several := [
+        q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)
+    ]:
         longest = max(several, key=lambda q: len(q.name))
         return longest.of(name.removeprefix(f"{longest.name}_"))
-    kinds: dict[str, tuple[Kind, Unit]] = {"u": ("place", PLACE), "f": ("reaction", REACTION), "m": ("moment", MOMENT)}
+    kinds: dict[str, tuple[Kind, Unit]] = {
+        "u": ("place", PLACE),
+        "f": ("reaction", REACTION),
+        "m": ("moment", MOMENT),
+    }
     ending = re.search(r"_([ufm])[xyz]$", name)
     kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (WAY, TURN))
     return Quantity(name, name.replace("_", " "), "", kind, units=units)
@@ -234,7 +289,9 @@ def quantity(name: str) -> Quantity:
 def shown(name: str, columns: Collection[str]) -> Quantity:
     """The quantity of a column, in the case's units if one of the columns has it in these."""
     quantity_of_column = quantity(name)
-    return next((each for each in quantity_of_column.in_units if each.name in columns), quantity_of_column)
+    return next(
+        (each for each in quantity_of_column.in_units if each.name in columns), quantity_of_column
+    )
 
 
 def amplitude(name: str) -> Amplitude:
@@ -249,22 +306,28 @@ def amplitude(name: str) -> Amplitude:
     for each in AMPLITUDES.values():
         if each.each and name.startswith(f"{each.name}_"):
             which = name.removeprefix(each.name)
-            return replace(each, name=name, column=each.column + which, conjugate=each.conjugate + which)
+            return replace(
+                each, name=name, column=each.column + which, conjugate=each.conjugate + which
+            )
     return Amplitude(name, name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle, the time and the factor of a motion are on the x axis, and the displacement or the reaction on the y axis.
+    An angle, the time and the factor of a motion are on the x axis, and the displacement or the
+    reaction on the y axis.
 
     Parameters
     ----------
     row
-        The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
+        The columns that there are: where w_over_h belongs to another load, this one has a column of
+        its own.
     """
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
-    for reaction in (*(f"{each}_{name}" for each in reactions), *reactions) if name not in AMPLITUDES else ():
+    for reaction in (
+        (*(f"{each}_{name}" for each in reactions), *reactions) if name not in AMPLITUDES else ()
+    ):
         if reaction in row:
             return shown(name, row), shown(reaction, row)
     varied, own = amplitude(name), f"w_{name}_over_h"
@@ -327,7 +390,10 @@ class Sizes:
     def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
         """The values of a row in units."""
         units = ((name, unit) for name in row if (unit := self.unit(name)))
-        return {quantity(name).in_unit(unit).name: float(row[name]) * self.size(name) + 0.0 for name, unit in units}
+        return {
+            quantity(name).in_unit(unit).name: float(row[name]) * self.size(name) + 0.0
+            for name, unit in units
+        }
 
     def size(self, name: str) -> float:
         """What one of a column is in the unit in which it is shown; one without."""

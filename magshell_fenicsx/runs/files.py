@@ -24,7 +24,13 @@ from magshell_fenicsx.output.fields.surface import turned, whole
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import plain, read_run, verdict
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, sync_folder, write_whole
+from magshell_fenicsx.output.store.durable import (
+    Damaged,
+    read_object,
+    read_result,
+    sync_folder,
+    write_whole,
+)
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
@@ -58,8 +64,11 @@ class AlreadyComplete(Exception):
         return "the run is complete: there is nothing to resume"
 
 
-def open_folder(out: Path, document: Document, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
-    """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is changed.
+def open_folder(
+    out: Path, document: Document, comm: MPI.Comm, resume: bool, overwrite: bool = False
+) -> None:
+    """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is
+    changed.
 
     Parameters
     ----------
@@ -69,8 +78,8 @@ def open_folder(out: Path, document: Document, comm: MPI.Comm, resume: bool, ove
     Raises
     ------
     CaseError
-        If the folder cannot be written, has files that no run has written, a run of another case file, an interrupted
-        one or a damaged one; or no run of this case to resume.
+        If the folder cannot be written, has files that no run has written, a run of another case
+        file, an interrupted one or a damaged one; or no run of this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     """
@@ -96,8 +105,14 @@ def _refuse_other_case(out: Path, document: Document) -> None:
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
     name = begun.get(checkpoint.FILE)
-    if name and Path(name).stem != Path(document.name).stem and not checkpoint.is_of(begun, document):
-        raise CaseError(f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite")
+    if (
+        name
+        and Path(name).stem != Path(document.name).stem
+        and not checkpoint.is_of(begun, document)
+    ):
+        raise CaseError(
+            f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite"
+        )
 
 
 def belongs_to(out: Path, document: Document) -> dict[str, Any]:
@@ -113,16 +128,22 @@ def belongs_to(out: Path, document: Document) -> dict[str, Any]:
     if begun := checkpoint.begun_with(out / checkpoint.NAME):
         return begun
     summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
-    return {key: summary[key] for key in ("case", checkpoint.FILE, *document.outside) if key in summary}
+    return {
+        key: summary[key] for key in ("case", checkpoint.FILE, *document.outside) if key in summary
+    }
 
 
 def _refuse_interrupted(out: Path) -> None:
-    """A run that has ended, also where its solver could not go on, may be repeated; one that can go on is kept."""
+    """A run that has ended, also where its solver could not go on, may be repeated; one that can go
+    on is kept.
+    """
     if replaced(out):
         return
     file, table = out / checkpoint.NAME, out / "path.csv"
     points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0
-    if not file.exists() or (points < 2 and not (out / MESH).exists()):  # the undeformed shell alone is no loss
+    if not file.exists() or (
+        points < 2 and not (out / MESH).exists()
+    ):  # the undeformed shell alone is no loss
         return
     how = "killed, or its machine stopped"
     if (out / SUMMARY).exists():
@@ -148,15 +169,23 @@ def _refuse_no_resuming(out: Path, document: Document) -> None:
     if not file.exists() and (out / SUMMARY).exists():
         summary = read_summary(out)
         if summary["stopped"] is None:
-            kept = {key: summary[key] for key in ("case", "sources", *document.outside) if key in summary}
-            checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, document, out)
+            kept = {
+                key: summary[key]
+                for key in ("case", "sources", *document.outside)
+                if key in summary
+            }
+            checkpoint.refuse_other(
+                {"version": summary["versions"]["magshell_fenicsx"], **kept}, document, out
+            )
             try:
                 points = len(read_run(out)[1])
             except FileNotFoundError as e:
                 raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
             for number in range(points):
                 if not is_whole(out / "fields" / point_file(number)):
-                    raise Damaged(f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing")
+                    raise Damaged(
+                        f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing"
+                    )
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, document)
 
@@ -164,12 +193,14 @@ def _refuse_no_resuming(out: Path, document: Document) -> None:
 class RunFiles:
     """Writes the files of a run; every method is collective, and rank 0 writes.
 
-    A new run changes nothing in the folder before `begin`: one that is refused loses no earlier results.
+    A new run changes nothing in the folder before `begin`: one that is refused loses no earlier
+    results.
 
     Parameters
     ----------
     begun
-        The content of an empty checkpoint, as the case and its files were before the scene was built.
+        The content of an empty checkpoint, as the case and its files were before the scene was
+        built.
     resume
         Whether the run in the folder goes on.
     mesh
@@ -192,8 +223,16 @@ class RunFiles:
 
     journal: checkpoint.Checkpoint | None = None
 
-    def __init__(self, folder: Path, scene: Scene, begun: bytes, *, resume: bool, mesh: bytes | None = None) -> None:
-        self._folder, self._scene, self._comm, self._new, self._mesh = folder, scene, scene.comm, begun, mesh
+    def __init__(
+        self, folder: Path, scene: Scene, begun: bytes, *, resume: bool, mesh: bytes | None = None
+    ) -> None:
+        self._folder, self._scene, self._comm, self._new, self._mesh = (
+            folder,
+            scene,
+            scene.comm,
+            begun,
+            mesh,
+        )
         self._gatherer = gatherer(scene.model, scene.comm)
         self.kept, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
         if resume:
@@ -210,10 +249,14 @@ class RunFiles:
         """
         by_first(self._comm, self._make_room_again if again else self._make_room)
         self.kept, self._rows = by_first(self._comm, self._open)
-        self.journal = checkpoint.Checkpoint(self._folder / checkpoint.NAME, self._scene.model.V, self._comm)
+        self.journal = checkpoint.Checkpoint(
+            self._folder / checkpoint.NAME, self._scene.model.V, self._comm
+        )
 
     def _make_room(self) -> None:
-        """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is known as a run's."""
+        """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is
+        known as a run's.
+        """
         folder, file = self._folder, self._folder / checkpoint.NAME
         new, earlier = folder / NEW, written(folder) - {NEW}
         write_whole(new, self._new)  # a full disk stops here
@@ -224,16 +267,23 @@ class RunFiles:
         remove(folder, earlier & {SUMMARY})
 
     def _make_room_again(self) -> None:
-        remove(self._folder, {n for n in written(self._folder) if n not in OF_PATH and not n.startswith("fields/")})
+        remove(
+            self._folder,
+            {n for n in written(self._folder) if n not in OF_PATH and not n.startswith("fields/")},
+        )
         if self._mesh and not (self._folder / MESH).exists():
             write_whole(self._folder / MESH, self._mesh)
 
     def _open(self) -> tuple[int, list[dict[str, str]]]:
         begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
-        self._begun_with = {key: value for key, value in begun.items() if key not in ("case", "version")}
+        self._begun_with = {
+            key: value for key, value in begun.items() if key not in ("case", "version")
+        }
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         problem = self._scene.problem
-        halved = problem.mirror and not isinstance(problem.mirror, Sector)  # of which ParaView has one half
+        halved = problem.mirror and not isinstance(
+            problem.mirror, Sector
+        )  # of which ParaView has one half
         mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror and halved else None
         self._of_whole = mirror is None
         self._R = given(problem.context.shell).R
@@ -268,7 +318,11 @@ class RunFiles:
             assert surface is not None
             problem = scene.problem
             beside = problem.loads, state.mu, problem.material.h
-            every = whole(surface, mirror) if mirror and (isinstance(mirror, Sector) or self._of_whole) else surface
+            every = (
+                whole(surface, mirror)
+                if mirror and (isinstance(mirror, Sector) or self._of_whole)
+                else surface
+            )
             drawn = replace(every, outlines=outlines(*beside), solids=solids(*beside))
             self._table.write(row)
             beside_it = {grid.name: grid_content(grid, self._R) for grid in grids}
@@ -287,7 +341,10 @@ class RunFiles:
         by_first(self._comm, write)
 
     def close(self, complete: bool) -> None:
-        """Close the files; at the end of a complete run, delete the checkpoint. Write down which are the run's."""
+        """Close the files; at the end of a complete run, delete the checkpoint.
+
+        Write down which are the run's.
+        """
         assert self.journal
         by_first(self._comm, lambda: self._table.close())
         self.journal.close()
@@ -305,7 +362,8 @@ class RunFiles:
 def _same(row: Row, kept: dict[str, str]) -> None:
     """Check that a recomputed point equals the one in path.csv."""
     same = row["label"] == kept["label"] and all(
-        math.isclose(float(row[key]), float(kept[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
+        math.isclose(float(row[key]), float(kept[key]), rel_tol=1e-6, abs_tol=1e-9)
+        for key in COMPARED
     )
     if not same:
         raise CaseError(

@@ -24,7 +24,12 @@ from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.fields import density
 from magshell_fenicsx.simulate.gradients.gradient import Gradient, derivative
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
+from magshell_fenicsx.simulate.gradients.instabilities import (
+    FOLDS,
+    Lost,
+    instabilities,
+    refuse_moving,
+)
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene
@@ -69,19 +74,32 @@ def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
         if not slopes:
             continue
         fields = {by: each for by, each in slopes.items() if isinstance(each, FieldGradient)}
-        numbers = {by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)}
+        numbers = {
+            by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)
+        }
         scene = adjoint.scene  # that of the end, which may be of another model
-        told: dict[str, dict[str, Any]] = {by: {"alike": _alike(scene, by, each)} for by, each in fields.items()}
+        told: dict[str, dict[str, Any]] = {
+            by: {"alike": _alike(scene, by, each)} for by, each in fields.items()
+        }
         if fields:
             drawn = _surface(scene, adjoint, fields)
-            for by, most in scene.comm.bcast(drawn and {by: _most(drawn, by) for by in fields}).items():
+            for by, most in scene.comm.bcast(
+                drawn and {by: _most(drawn, by) for by in fields}
+            ).items():
                 told[by] |= most
             if folder:
                 by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
-        result.gradients[of] = {"value": adjoint.shown, "kind": kind, "numbers": numbers, "fields": told}
+        result.gradients[of] = {
+            "value": adjoint.shown,
+            "kind": kind,
+            "numbers": numbers,
+            "fields": told,
+        }
         for by, v in told.items():
             alike, place = _words(v["alike"], v["most_per_area"], 6), _words(v["at"], 1.0, 3)
-            say(f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})")
+            say(
+                f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})"
+            )
         for by, slope in numbers.items():
             say(f"d {of}/d {by}: {slope:.6g}")
 
@@ -104,7 +122,9 @@ def _words(values: Sequence[float], size: float, digits: int) -> str:
 
 def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
     assert drawn
-    write_whole(file, vtu_content(drawn, About(scene.problem.material.h, scene.problem.material.nu)))
+    write_whole(
+        file, vtu_content(drawn, About(scene.problem.material.h, scene.problem.material.nu))
+    )
 
 
 def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
@@ -120,7 +140,9 @@ def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
 
 
 def _alike(scene: Scene, by: str, gradient: FieldGradient) -> list[float]:
-    """By a field that changes alike everywhere, of vectors in the case's frame; of a meridian along e_rho, e_z."""
+    """By a field that changes alike everywhere, of vectors in the case's frame; of a meridian along
+    e_rho, e_z.
+    """
     total = gradient.within(np.ones(len(gradient.forces), dtype=bool))
     if by == "remanence":
         total = total[[0, 2]] if scene.problem.meridian else total @ rotation(scene.problem.azimuth)
@@ -136,7 +158,11 @@ def _most(drawn: Surface, by: str) -> dict[str, Any]:
 
 def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]) -> Surface | None:
     """The whole deformed shell with the densities as its fields, on rank 0; collective."""
-    gathering, model, drawn = gatherer(scene.model, scene.comm), scene.model, dict[str, Array | None]()
+    gathering, model, drawn = (
+        gatherer(scene.model, scene.comm),
+        scene.model,
+        dict[str, Array | None](),
+    )
     width = model.V.dofmap.bs
     for by, each in fields.items():
         values = density(scene, each)

@@ -1,4 +1,6 @@
-"""After a run: null vectors at the instabilities, the modes that the case requests, natural frequencies."""
+"""After a run: null vectors at the instabilities, the modes that the case requests, natural
+frequencies.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -111,7 +113,10 @@ class _Writer:
                 by_point[number] = lowest[: max(wanted.modes, unstable)]
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
-        by_first(self.result.scene.comm, partial(write_whole, self.folder / "stability.csv", mode_table(by_point)))
+        by_first(
+            self.result.scene.comm,
+            partial(write_whole, self.folder / "stability.csv", mode_table(by_point)),
+        )
         for number, modes in by_point.items():
             for n, mode in enumerate(modes[: wanted.modes], 1):
                 file = mode_file(self.folder, number, str(n), mode.label)
@@ -119,11 +124,17 @@ class _Writer:
                 state, scene = on.state(points[number]), self.result.scene_of(number)
                 write_mode_of(scene, gathering, file, state, mode.label, mode.vector, on)
             first = modes[0]
-            self.say(f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip())
+            self.say(
+                f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip()
+            )
 
-    def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
+    def _write(
+        self, number: int, name: str, state: State, label: str, vector: Vector
+    ) -> Surface | None:
         file = mode_file(self.folder, number, name, label)
-        return write_mode_of(self.result.scene_of(number), self._of(number)[1], file, state, label, vector)
+        return write_mode_of(
+            self.result.scene_of(number), self._of(number)[1], file, state, label, vector
+        )
 
 
 def _waves_said(point: int, waves: Waves) -> str:
@@ -135,9 +146,17 @@ def _waves_said(point: int, waves: Waves) -> str:
 
 
 def write_mode_of(
-    scene: Scene, gatherer: Gatherer, file: Path, state: State, label: str, vector: Vector, on: Seen | None = None
+    scene: Scene,
+    gatherer: Gatherer,
+    file: Path,
+    state: State,
+    label: str,
+    vector: Vector,
+    on: Seen | None = None,
 ) -> Surface | None:
-    """Write a mode at a state, both of the model where it is seen, and return it on rank 0; collective."""
+    """Write a mode at a state, both of the model where it is seen, and return it on rank 0;
+    collective.
+    """
     model = on.model if on else scene.model
     surface = mode_surface(model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
 
@@ -150,7 +169,9 @@ def write_mode_of(
 
 
 def wanted(section: FrequenciesSection | None, point: int) -> bool:
-    """Whether the state of a point must be kept for its frequencies; the start and the end are known anyway."""
+    """Whether the state of a point must be kept for its frequencies; the start and the end are
+    known anyway.
+    """
     at = section.at if section else ()
     return at == "all" or (isinstance(at, list) and point in at)
 
@@ -163,10 +184,11 @@ def own_wave(model: Model) -> str:
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
-    """How much omega^2 of each mode changes, relative, if the bodies that touch are four times as stiff; collective.
+    """How much omega^2 of each mode changes, relative, if the bodies that touch are four times as
+    stiff; collective.
 
-    It is compared with the nearest one of the same label: a mode that is not there any more changes too. nan, if the
-    shell finds no such equilibrium near.
+    It is compared with the nearest one of the same label: a mode that is not there any more changes
+    too. nan, if the shell finds no such equilibrium near.
     """
     bodies = pressing(scene, state)
     if not bodies:
@@ -177,14 +199,21 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     on = seen_on(scene.model)
     others = ShellModes(on.model).vibrations(on.state(harder), len(modes) + 2)
     return [
-        min((abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label), default=1.0)
+        min(
+            (abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label),
+            default=1.0,
+        )
         for mode in modes
     ]
 
 
 def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
     """The warning for a mode that depends on the penalty of a contact."""
-    by = "no equilibrium near to compare with" if isnan(change) else f"omega2 changes by {change:.2g} of it"
+    by = (
+        "no equilibrium near to compare with"
+        if isnan(change)
+        else f"omega2 changes by {change:.2g} of it"
+    )
     return (
         f"warning: frequency {n} of point {point} (omega2 {mode.eigenvalue:.6g}) depends on the stiffness of the "
         f"bodies: four times as stiff, {by}"
@@ -192,7 +221,8 @@ def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
 
 
 def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
-    """Keep the modes; with a folder write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last point.
+    """Keep the modes; with a folder write frequencies.csv, and fields/mode_*_f*.vtu of the first
+    and the last point.
 
     Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
 
@@ -205,7 +235,9 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
     if section is None:
         return
     if scene.model.without_potential and scene.problem.loads.pressure:
-        say("warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent")
+        say(
+            "warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent"
+        )
     states = dict(sorted(result.kept.items()))
     if section.at in ("ends", "end"):
         start = {0: scene.unloaded()} if section.at == "ends" else {}
@@ -223,7 +255,9 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         seen[number], own[number] = on, own_wave(on.model)
         state = rigid(scene, state)
         try:
-            result.frequencies[number] = modes = shell.vibrations(on.state(state), section.count, loose=scene.loose)
+            result.frequencies[number] = modes = shell.vibrations(
+                on.state(state), section.count, loose=scene.loose
+            )
             if scene.model.contacts:
                 result.contact_changes[number] = changes = contact_changes(scene, state, modes)
                 for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
@@ -233,13 +267,17 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
         rigid_modes = [mode for mode in modes if mode.eigenvalue == 0.0] if scene.loose else []
-        motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)  # a wave has a twin
+        motions = sum(
+            2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes
+        )  # a wave has a twin
         free = f"{motions} rigid motions, " if motions else ""
         first = modes[min(len(rigid_modes), len(modes) - 1)]
         f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own[number])
         in_hertz = "" if f is None else f", {f:.6g} Hz"
         of_mode = f", m = {wave}" if wave.isdigit() else wave and f", {wave}"
-        say(f"{free}lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}")
+        say(
+            f"{free}lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}"
+        )
     if folder is None:
         return
     content = frequency_table(result.frequencies, own, unit, result.contact_changes)

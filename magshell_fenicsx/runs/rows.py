@@ -24,7 +24,11 @@ class RowMaker:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
-        self._clock, self._begun, self._step = dict.fromkeys(CLOCK, 0.0), dict.fromkeys(CLOCK, 0.0), 0
+        self._clock, self._begun, self._step = (
+            dict.fromkeys(CLOCK, 0.0),
+            dict.fromkeys(CLOCK, 0.0),
+            0,
+        )
         self._listed = scene.problem.listed  # alone, a field as the load is no field before it
 
     def row(self, record: Record, wall_s: float) -> Row:
@@ -32,7 +36,9 @@ class RowMaker:
         scene = record.scene or self._scene
         point = record.point
         values = self._scene.journal.noted(lambda: Finding(scene.observe(point.state))).values
-        if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
+        if record.label in ("start", "field") or (
+            self._listed and record.amplitude in ("lambda_m", "angle")
+        ):
             self._field_end = values["w_over_h"]
         self._count += 1
         row: Row = {
@@ -69,11 +75,17 @@ class RowMaker:
         return {**self._clock, **own, "stored": stored}
 
 
-def imbalances(programme: Iterable[ProgrammeStep], rows: Sequence[Row], length: float) -> Iterator[str]:
+def imbalances(
+    programme: Iterable[ProgrammeStep], rows: Sequence[Row], length: float
+) -> Iterator[str]:
     """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
     for step in programme:
         over = step.load.motion.balance if step.load.motion else BALANCE
-        parts = [_imbalance(row, length) for row in rows if row["step"] == step.number and row.get("imbalance")]
+        parts = [
+            _imbalance(row, length)
+            for row in rows
+            if row["step"] == step.number and row.get("imbalance")
+        ]
         if parts and abs(worst := max(parts, key=abs)) > over:
             yield (
                 f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
@@ -87,7 +99,9 @@ def departures(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> I
     for step in programme:
         load = step.load
         how = load.motion or load.released_by
-        rows = [row for row in all_rows if row["step"] == step.number and row["amplitude"] == "time"]
+        rows = [
+            row for row in all_rows if row["step"] == step.number and row["amplitude"] == "time"
+        ]
         if how is None or not rows:
             continue
         error = max(float(row["error_over_h"]) for row in rows)
@@ -134,7 +148,9 @@ class Table(dict[str, NDArray[np.generic]]):
         try:
             import pandas
         except ModuleNotFoundError:
-            raise ModuleNotFoundError("to_pandas: needs pandas: python3 -m pip install pandas") from None
+            raise ModuleNotFoundError(
+                "to_pandas: needs pandas: python3 -m pip install pandas"
+            ) from None
         return pandas.DataFrame(dict(self))
 
 
@@ -144,7 +160,8 @@ def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> Table:
-    """The columns of path.csv except the time, each (records,); `columns(...).to_pandas()` is a frame of pandas.
+    """The columns of path.csv except the time, each (records,); `columns(...).to_pandas()` is a
+    frame of pandas.
 
     Collective.
     """

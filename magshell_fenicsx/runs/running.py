@@ -81,7 +81,9 @@ class Watch:
     def __init__(self, comm: MPI.Comm, start: float, limit: float | None, signals: bool) -> None:
         self._comm, self._start, self._limit = comm, start, limit
         # Python allows signal handlers only in the main thread
-        self._signals = SIGNALS if signals and threading.current_thread() is threading.main_thread() else ()
+        self._signals = (
+            SIGNALS if signals and threading.current_thread() is threading.main_thread() else ()
+        )
         self._reason: str | None = None
 
     def __enter__(self) -> Self:
@@ -96,7 +98,10 @@ class Watch:
         return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
@@ -143,7 +148,9 @@ class Stoppable:
         self._journal.begin(space)
 
     def check(self, known: bool) -> None:
-        self._watch.check(limited=not known)  # a way that is only computed again must end, or no resumed run gets on
+        self._watch.check(
+            limited=not known
+        )  # a way that is only computed again must end, or no resumed run gets on
 
 
 def run(
@@ -164,11 +171,17 @@ def run(
     if time_limit is not None and not time_limit >= 0:
         raise CaseError(f"--time-limit {time_limit}: must be a number of seconds, 0 or more")
     if folder and not problem.document.data:
-        raise CaseError("out: a run is known again by what it writes of its case: give the problem a 'document'")
+        raise CaseError(
+            "out: a run is known again by what it writes of its case: give the problem a 'document'"
+        )
     watch = Watch(comm, start, time_limit, signals=out is not None)
     listened = tell is not None
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
-    with reported(_of_kernels(say, tell, start, apart=plain(comm.size))) if listened else nullcontext():
+    with (
+        reported(_of_kernels(say, tell, start, apart=plain(comm.size)))
+        if listened
+        else nullcontext()
+    ):
         if pictures and folder and comm.rank == 0:
             from magshell_fenicsx.output.pictures.view import library
 
@@ -181,7 +194,9 @@ def run(
 
 
 def _of_kernels(say: Say, tell: Say, start: float, *, apart: bool) -> Say:
-    """Tells how far kernels are; if `apart`, the first time in a line that stays: a pipe gets a status late."""
+    """Tells how far kernels are; if `apart`, the first time in a line that stays: a pipe gets a
+    status late.
+    """
     stays = iter([say] if apart else [])
 
     def told(what: str) -> None:
@@ -211,7 +226,11 @@ def _run(
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
 
-    begun = by_first(comm, partial(checkpoint.begun, problem.document), "cannot be read") if folder else b""
+    begun = (
+        by_first(comm, partial(checkpoint.begun, problem.document), "cannot be read")
+        if folder
+        else b""
+    )
     try:
         problem = with_modes(problem, comm)
         chosen = _mesh_for_tolerance(problem, folder if resume else None, comm, say, doing)
@@ -226,13 +245,17 @@ def _run(
     if chosen and chosen.branch:
         scene.meshed = chosen.branch.choice.applied
     result = Result(scene, scene.unloaded(), adapted=chosen)
-    say(f"{', '.join(scene.problem.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
+    say(
+        f"{', '.join(scene.problem.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns"
+    )
     for warning in (*scene.warnings, *scene.unshown):
         say(f"warning: {warning}")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
     if comm.size == 1 and not has_cholmod():
-        say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
+        say(
+            "warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time"
+        )
     mesh = chosen.to_json() if chosen else None
     files = RunFiles(folder, scene, begun, resume=resume, mesh=mesh) if folder else None
     if files and files.kept:
@@ -247,12 +270,21 @@ def _run(
             if chosen and result.elsewhere:
                 result.branch_error = _branch_error(result)
                 known = result.branch_error is not None
-                result.remarks.append(OF_BOTH.format(result.branch_error) if known else OF_THE_FIRST)
+                result.remarks.append(
+                    OF_BOTH.format(result.branch_error) if known else OF_THE_FIRST
+                )
             for step in scene.problem.programme:
-                if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
-                    say(f"warning: the search at the end of step {step.number} has found no further solution")
+                if step.load.search and not any(
+                    int(result.rows[i]["step"]) == step.number for i in result.found
+                ):
+                    say(
+                        f"warning: the search at the end of step {step.number} has found no further solution"
+                    )
             steps = scene.problem.programme
-            for said in (*imbalances(steps, result.rows, scene.model.system.length), *departures(steps, result.rows)):
+            for said in (
+                *imbalances(steps, result.rows, scene.model.system.length),
+                *departures(steps, result.rows),
+            ):
                 say(f"warning: {said}")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)
@@ -275,14 +307,20 @@ def _run(
                             gradients_after(result, folder, say)
                         if pictures:
                             by_first(comm, partial(_draw, folder))
-                    files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
+                    files.summarise(
+                        summary(result, time.perf_counter() - start)
+                    )  # with the time of the pictures
                 by_first(comm, partial(write_report, folder, playable=pictures and not interrupted))
             except DiskError as e:
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
     if interrupted:
         resumable = files is not None and files.journal is not None
-        hint = f"; the results so far are in {folder}/, and --resume continues from there" if resumable else ""
+        hint = (
+            f"; the results so far are in {folder}/, and --resume continues from there"
+            if resumable
+            else ""
+        )
         result.stopped = f"{interrupted}{hint}"
     return result
 
@@ -297,7 +335,9 @@ def _draw(folder: Path) -> None:
 def _mesh_for_tolerance(
     problem: Problem, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say
 ) -> "Adapted | None":
-    """The mesh for the tolerance, that of an interrupted run if its folder has one; None for the default."""
+    """The mesh for the tolerance, that of an interrupted run if its folder has one; None for the
+    default.
+    """
     if problem.mesh.tolerance is None:
         return None
     from magshell_fenicsx.simulate.adapt.branch import branched
@@ -305,7 +345,11 @@ def _mesh_for_tolerance(
     from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
     file = folder / MESH if folder else None
-    if file and (saved := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
+    if file and (
+        saved := by_first(
+            comm, lambda: read_result(file) if file.exists() else b"", "cannot be read"
+        )
+    ):
         try:
             return Adapted.from_json(problem, saved)
         except (ValueError, KeyError, TypeError, IndexError) as e:
@@ -327,7 +371,11 @@ def _mesh_for_tolerance(
 def _branch_error(result: Result) -> float | None:
     """The estimated error at the end of the branch, of a mesh that was chosen for it; collective."""
     assert result.adapted
-    if result.adapted.branch is None or result.latest is None or result.latest.scene is result.scene:
+    if (
+        result.adapted.branch is None
+        or result.latest is None
+        or result.latest.scene is result.scene
+    ):
         return None
     from magshell_fenicsx.simulate.adapt.branch import branch_error
 
@@ -367,7 +415,12 @@ def _barrier(result: Result) -> float | None:
 
 
 def _follow(
-    result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float, watch: Watch
+    result: Result,
+    files: RunFiles | None,
+    say: Say,
+    progress: RunProgress,
+    start: float,
+    watch: Watch,
 ) -> None:
     """Compute the history of a scene and write it point by point."""
     scene, made = result.scene, RowMaker(result.scene)
@@ -383,7 +436,11 @@ def _follow(
         if record.label == SOLUTION:
             result.found[len(result.rows) - 1] = record.point.state
         else:
-            result.latest, result.last, result.end = record, record.point.state, len(result.rows) - 1
+            result.latest, result.last, result.end = (
+                record,
+                record.point.state,
+                len(result.rows) - 1,
+            )
         if wanted(scene.problem.frequencies, len(result.rows) - 1):
             result.kept[len(result.rows) - 1] = record.point.state
         if record.scene and record.scene is not scene:
@@ -400,18 +457,40 @@ def _follow(
 
 
 def _line(row: Row) -> str:
-    """A point in 79 columns: what varied, the displacement, and of the other loads those that there are."""
+    """A point in 79 columns: what varied, the displacement, and of the other loads those that there
+    are.
+    """
     pressed = amplitude(str(row["amplitude"])).conjugate  # of several bodies each has its own force
-    load = "load_factor" if "load_factor" in row else pressed if pressed.startswith("force_") else "force"
+    load = (
+        "load_factor"
+        if "load_factor" in row
+        else pressed
+        if pressed.startswith("force_")
+        else "force"
+    )
     formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
     varied = amplitude(str(row["amplitude"])).column if row["amplitude"] else ""
     beside = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
-    unstable = [f"unstable {row['negative_pivots']}{beside}"] if row["negative_pivots"] or beside else []
+    unstable = (
+        [f"unstable {row['negative_pivots']}{beside}"] if row["negative_pivots"] or beside else []
+    )
     loads = [name for name in formats if name != varied and row[name]]
     first = [_value(varied, row, formats.get(varied, "9.5f"))] if varied else []
-    at_pole = [_value("w_pole_over_h", row, "8.4f", "pole")] if row["w_pole_over_h"] != row["w_over_h"] else []
-    parts = [*first, _value("w_over_h", row, "8.4f"), *unstable, *(_value(n, row, formats[n]) for n in loads), *at_pole]
-    return fitting([f"{row['point']:4d} {row['label']:>11}", *parts, f"it {row['iterations']}"], COLUMNS)
+    at_pole = (
+        [_value("w_pole_over_h", row, "8.4f", "pole")]
+        if row["w_pole_over_h"] != row["w_over_h"]
+        else []
+    )
+    parts = [
+        *first,
+        _value("w_over_h", row, "8.4f"),
+        *unstable,
+        *(_value(n, row, formats[n]) for n in loads),
+        *at_pole,
+    ]
+    return fitting(
+        [f"{row['point']:4d} {row['label']:>11}", *parts, f"it {row['iterations']}"], COLUMNS
+    )
 
 
 def _value(name: str, row: Row, form: str, words: str = "") -> str:

@@ -117,7 +117,11 @@ def clock(seconds: float) -> str:
     ('0:07', '1:01:11')
     """
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+    return (
+        f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+        if minutes >= 60
+        else f"{minutes}:{rest:02d}"
+    )
 
 
 def waiting(what: str, seconds: float) -> str:
@@ -138,7 +142,9 @@ class RunProgress:
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
         self._scene, self._report, self._start = scene, report, start
-        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.problem.programme]
+        self._aims = [
+            replace(aim(scene, step), sizes=scene.sizes) for step in scene.problem.programme
+        ]
         self._row: Row = {}
         self._first: Row = {}
         self._step = 1
@@ -172,7 +178,11 @@ class RunProgress:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
         of = f" in step {self._step} of {len(self._aims)}" if self._scene.problem.listed else ""
         ahead = "the snap" if self._snaps else self._aim.text(self._row) if self._aim else ""
-        self._report("  ".join(part for part in (f"{self._count}{of}", ahead, times, f"du/h {step:.2g}") if part))
+        self._report(
+            "  ".join(
+                part for part in (f"{self._count}{of}", ahead, times, f"du/h {step:.2g}") if part
+            )
+        )
 
     def doing(self, what: str) -> None:
         self._report(waiting(f"{self._count}  {what}", time.perf_counter() - self._start))

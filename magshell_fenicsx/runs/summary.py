@@ -48,19 +48,34 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
             continue
-        t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
+        t, w, lost = (
+            np.array([float(row[key]) for row in moving])
+            for key in ("time", "w_over_h", "dissipated")
+        )
         way = (w - w[0]) / (w[-1] - w[0])
         # the last two rows are of one time
-        begun, half, done = (_first_at(part, t[:-1], way[:-1]) - t[0] for part in (JUMP_BEGINS, 0.5, JUMP_ENDS))
+        begun, half, done = (
+            _first_at(part, t[:-1], way[:-1]) - t[0] for part in (JUMP_BEGINS, 0.5, JUMP_ENDS)
+        )
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
         times = {"time": half, "departure": begun, "jump": done - begun}
-        at_rest.append({**ends, **times, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
+        at_rest.append(
+            {
+                **ends,
+                **times,
+                "overshoot": float(way.max() - 1),
+                "dissipated": float(lost[-1] - lost[0]),
+            }
+        )
     return at_rest
 
 
 def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
     """Return the times of a snap of a case with units."""
-    return {f"snap_{key}_ms": 1e3 * snap[key] * sizes.size("time") for key in ("time", "departure", "jump")}
+    return {
+        f"snap_{key}_ms": 1e3 * snap[key] * sizes.size("time")
+        for key in ("time", "departure", "jump")
+    }
 
 
 def _first_at(part: float, times: Array, way: Array) -> float:
@@ -88,26 +103,30 @@ class Result:
     stopped
         Why the run ended before its target; None if it reached it.
     remarks
-        What the result must not be read without: why the path stopped beyond its first instability with
-        `until: limit`, or that a snap starts from a shell that has buckled before.
+        What the result must not be read without: why the path stopped beyond its first instability
+        with `until: limit`, or that a snap starts from a shell that has buckled before.
     replayed
         Number of solves taken from a checkpoint.
     sensitivities
-        Sensitivities of the amplitude at the final fold, if the case requests them; see `simulate.sensitivity`.
+        Sensitivities of the amplitude at the final fold, if the case requests them; see
+        `simulate.sensitivity`.
     adapted
         The mesh and its error estimate, if the case has a tolerance.
     branch_error
-        The estimated relative error at the end of a branch in a larger model, if that has its own mesh.
+        The estimated relative error at the end of a branch in a larger model, if that has its own
+        mesh.
     walked
         The records that `value` is taken from.
     end
         Number of the row of `last`.
     kept
-        States at the points whose frequencies are requested, by row number; not of the start and the end.
+        States at the points whose frequencies are requested, by row number; not of the start and
+        the end.
     frequencies
         The natural modes, by row number; their `eigenvalue` is omega^2 rho R^2/E.
     contact_changes
-        Beside bodies how much their omega^2 depend on the bodies' stiffness; see `frequencies.contact_changes`.
+        Beside bodies how much their omega^2 depend on the bodies' stiffness; see
+        `frequencies.contact_changes`.
     found
         The states of the solutions that searches have found, by row number.
     barrier
@@ -115,12 +134,13 @@ class Result:
     gradients
         By result, as in summary.json.
     largest
-        By row number of an instability the undeformed place where its mode moves most along the normal, in the shell's
-        length; on rank 0, and not of a meridian, whose modes have rings.
+        By row number of an instability the undeformed place where its mode moves most along the
+        normal, in the shell's length; on rank 0, and not of a meridian, whose modes have rings.
     latest
         The record of `last`; None before the first.
     elsewhere
-        The scenes of the rows that have another than `scene`, as of a branch that its model excludes.
+        The scenes of the rows that have another than `scene`, as of a branch that its model
+        excludes.
     """
 
     scene: Scene
@@ -157,7 +177,9 @@ class Result:
 
     @property
     def record(self) -> Record:
-        """The last point of the path, as `follow` gives it: for `picture`, `surface`, `gradient`, and for its `u`."""
+        """The last point of the path, as `follow` gives it: for `picture`, `surface`, `gradient`,
+        and for its `u`.
+        """
         assert self.latest, "a run has a first point"
         return self.latest
 
@@ -192,19 +214,37 @@ class Result:
             return {}
         place, shell = self.largest[number], self.scene.problem.context.shell
         shown = place_in_units(place, shell.geometry, in_metres=shell.with_units)
-        return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit}}
+        return {
+            "mode_at": place,
+            **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit},
+        }
 
     @property
     def knockdown(self) -> float | None:
-        """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
-        at_volume = {step.number for step in self.scene.problem.programme if step.name in step.load.hold}
-        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
-        return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
+        """k_d: p/p_c at the first instability under pressure; None if there is none, or at held
+        volume.
+        """
+        at_volume = {
+            step.number for step in self.scene.problem.programme if step.name in step.load.hold
+        }
+        points = (
+            row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure"
+        )
+        return next(
+            (
+                float(p["p_over_pc"])
+                for p in points
+                if not p["branch"] and p.get("step") not in at_volume
+            ),
+            None,
+        )
 
     @property
     def critical_field(self) -> float | None:
         """λ_m at the first instability under the field; None if there is none."""
-        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "lambda_m")
+        points = (
+            row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "lambda_m"
+        )
         return next((float(row["lambda_m"]) for row in points if not row["branch"]), None)
 
     @property
@@ -264,16 +304,30 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             {
                 "point": number,
                 "omega2": [mode.eigenvalue for mode in modes],
-                **({"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]} if time_unit else {}),
-                **({"contact_change": result.contact_changes[number]} if number in result.contact_changes else {}),
+                **(
+                    {"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]}
+                    if time_unit
+                    else {}
+                ),
+                **(
+                    {"contact_change": result.contact_changes[number]}
+                    if number in result.contact_changes
+                    else {}
+                ),
             }
             for number, modes in result.frequencies.items()
         ],
         "solutions": solutions(result),
-        "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
+        "most_excluded_pivots": max(
+            (int(row["excluded_pivots"]) for row in result.rows), default=0
+        ),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
-        **({"tolerance": result.adapted.account(result.value, result.branch_error)} if result.adapted else {}),
+        **(
+            {"tolerance": result.adapted.account(result.value, result.branch_error)}
+            if result.adapted
+            else {}
+        ),
         "timing": {
             "jit_s": model.kernels.seconds,
             "setup_s": scene.setup_s,
@@ -293,14 +347,27 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
 
 
 def solutions(result: Result) -> list[dict[str, Any]]:
-    """What searches have found; the residual is over the sum of the sizes of all terms' forces. Collective."""
+    """What searches have found; the residual is over the sum of the sizes of all terms' forces.
+
+    Collective.
+    """
     entries = []
     for number, state in result.found.items():
         row, system = result.rows[number], result.scene_of(number).model.system
         residual = system.residual(state.u, state.mu)
-        forces = (factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name) for t in system.terms)
+        forces = (
+            factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name)
+            for t in system.terms
+        )
         sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
-        keys = ("p_over_pc", "w_over_h", "w_pole_over_h", "volume_change", "energy", "negative_pivots")
+        keys = (
+            "p_over_pc",
+            "w_over_h",
+            "w_pole_over_h",
+            "volume_change",
+            "energy",
+            "negative_pivots",
+        )
         entries.append(
             {
                 "point": number,
@@ -346,4 +413,8 @@ def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
         lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
     else:
         lengths, in_si = {"radius": shell.reference, "thickness": shell.thickness}, shell.with_units
-    return {**lengths, "youngs_modulus": shell.youngs_modulus, "units": "SI" if in_si else "the case's own"}
+    return {
+        **lengths,
+        "youngs_modulus": shell.youngs_modulus,
+        "units": "SI" if in_si else "the case's own",
+    }

@@ -1,4 +1,5 @@
-"""What the kinds of a part need of the shell that they are on: its outline, its scales, places of it; lines of bodies.
+"""What the kinds of a part need of the shell that they are on: its outline, its scales, places of
+it; lines of bodies.
 
 The lines outline simple bodies around their own axes.
 """
@@ -25,13 +26,17 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Distance = Callable[[Array], Array]  # places (n, 3) over R -> distances (n,) over R, from one place
-Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
+Coordinates = Annotated[
+    list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)
+]
 ON_AXIS = 1e-9  # over R
 SEEN = 0.5  # of R: half of what is drawn of a body without end
 
 
 class At(Direction):
-    """A direction from the centre of a sphere, `polar: 0` of a pole or a centre; or a place of the perfect surface."""
+    """A direction from the centre of a sphere, `polar: 0` of a pole or a centre; or a place of the
+    perfect surface.
+    """
 
     point: Coordinates | None = None
     """Place on the perfect surface, on any shape [the shell's length; over R if that has no unit]"""
@@ -51,7 +56,8 @@ class At(Direction):
 
 @dataclass(frozen=True)
 class Ground:
-    """The shell that imperfections, bodies and sources are on; places are over R, in the frame of the case.
+    """The shell that imperfections, bodies and sources are on; places are over R, in the frame of
+    the case.
 
     Attributes
     ----------
@@ -114,7 +120,9 @@ class Ground:
 
     def half_thickness(self, x: Array) -> Array:
         """Half the thickness over R at places (n, 3)."""
-        return np.broadcast_to(self.h / 2 * (self._thickness(*x.T) if self._thickness else 1.0), len(x))
+        return np.broadcast_to(
+            self.h / 2 * (self._thickness(*x.T) if self._thickness else 1.0), len(x)
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,9 @@ class Angle:
 
     def __call__(self, places: Array) -> Array:
         (a, b, c), (x, y, z) = self.axis, places.T
-        across = np.sqrt((b * z - c * y) ** 2 + (c * x - a * z) ** 2 + (a * y - b * x) ** 2)  # np.cross takes thrice
+        across = np.sqrt(
+            (b * z - c * y) ** 2 + (c * x - a * z) ** 2 + (a * y - b * x) ** 2
+        )  # np.cross takes thrice
         return np.asarray(np.arctan2(across, places @ self.axis))
 
 
@@ -140,8 +150,8 @@ class Straight:
 
 
 def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
-    """A place (3,) over R of the perfect surface, and the distance from there: an angle, or the length of the
-    meridian from a pole, or straight.
+    """A place (3,) over R of the perfect surface, and the distance from there: an angle, or the
+    length of the meridian from a pole, or straight.
 
     Raises
     ------
@@ -155,10 +165,15 @@ def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
             refuse_beside(f"{key}.at.point", place, perfect, ground.R, with_units=ground.with_units)
     elif ground.spherical:
         place = at.vector()
-        if not 0 <= at.polar <= 180 or np.linalg.norm(perfect.perfect(perfect.inverse(place)[None])[0] - place) > 1e-6:
+        if (
+            not 0 <= at.polar <= 180
+            or np.linalg.norm(perfect.perfect(perfect.inverse(place)[None])[0] - place) > 1e-6
+        ):
             raise CaseError(f"{key}.at{_off_shell(at, ground)}")
     elif at.polar or perfect.highest is None or not (perfect.disc or ground.geometry == "strip"):
-        raise CaseError(f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}")
+        raise CaseError(
+            f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}"
+        )
     else:
         place = perfect.perfect(perfect.highest[None])[0]
     if ground.spherical:
@@ -202,13 +217,18 @@ def refuse_beside(key: str, x: Array, outline: "Outline", R: float, *, with_unit
 def circle(radius: float, z: float = 0.0, *, axes: tuple[int, int, int] = (0, 1, 2)) -> Array:
     """Places (n, 3) along a circle around the last of some axes."""
     t = np.linspace(0.0, 2 * np.pi, 49)
-    return np.column_stack([radius * np.cos(t), radius * np.sin(t), np.full_like(t, z)])[:, np.argsort(axes)]
+    return np.column_stack([radius * np.cos(t), radius * np.sin(t), np.full_like(t, z)])[
+        :, np.argsort(axes)
+    ]
 
 
 def upright(radius: float, height: float) -> list[Array]:
     """The outline of a cylinder: both circles, and four lines between them."""
     ends = np.array([-height / 2, height / 2])
-    sides = [np.array([[x, y, z] for z in ends]) for x, y in radius * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])]
+    sides = [
+        np.array([[x, y, z] for z in ends])
+        for x, y in radius * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    ]
     return [*(circle(radius, z) for z in ends), *sides]
 
 

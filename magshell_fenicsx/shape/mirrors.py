@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Flip = Callable[[Array, Array], tuple[Array, Array]]
 ALIKE = 1e-3  # of two halves with different triangles: difference of their areas and centres
-# where the chart's corner low + (s, t) extent goes, and the sides in the places of left, right, bottom and top
+# where the chart's corner low + (s, t) extent goes, and the sides in the places of left, right,
+# bottom and top
 FLIPS: tuple[tuple[Flip, tuple[int, ...]], ...] = (
     (lambda s, t: (1 - s, t), (1, 0, 2, 3)),
     (lambda s, t: (s, 1 - t), (0, 1, 3, 2)),
@@ -27,7 +28,9 @@ MIDDLES = ((0.0, 0.5), (1.0, 0.5), (0.5, 0.0), (0.5, 1.0))
 def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     """Planes that map a grid onto itself; the half that is kept has the larger chart coordinates."""
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
-    sample = np.stack(np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 1, 8) ** 1.5), axis=-1).reshape(-1, 2)
+    sample = np.stack(
+        np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 1, 8) ** 1.5), axis=-1
+    ).reshape(-1, 2)
     square = abs(extent[0] - extent[1]) < ROUNDING * extent[0]
 
     def places(chart: Array) -> Array:
@@ -41,20 +44,28 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         if (axis == 0 and grid.glued[0]) or not normal.any():
             continue
         mirror = Mirror.of(normal)
-        mirror = Mirror(mirror.normal, _rounded(float(((originals + images) / 2 @ mirror.normal).mean())))
-        if np.abs(mirror.image(originals) - images).max() > ROUNDING * max(1.0, np.abs(originals).max()):
+        mirror = Mirror(
+            mirror.normal, _rounded(float(((originals + images) / 2 @ mirror.normal).mean()))
+        )
+        if np.abs(mirror.image(originals) - images).max() > ROUNDING * max(
+            1.0, np.abs(originals).max()
+        ):
             continue
         beyond = mirror.beyond(places(np.array(MIDDLES)))
         if beyond[1] + beyond[3] < -ROUNDING:
             mirror, beyond = mirror.reversed, -beyond
         lost = {
-            grid.sides[i]: grid.sides[j] for i, j in enumerate(sides) if i != j and beyond[i] < 0 and _edge(grid, i)
+            grid.sides[i]: grid.sides[j]
+            for i, j in enumerate(sides)
+            if i != j and beyond[i] < 0 and _edge(grid, i)
         }
         mirrors.append(Mirror(mirror.normal, mirror.offset, lost))
     return mirrors
 
 
-def lines_on(mirror: Mirror, grid: Grid, embedding: Embedding) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def lines_on(
+    mirror: Mirror, grid: Grid, embedding: Embedding
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Coordinates of the grid lines, of either axis, that lie in a mirror plane within the chart."""
     t, lines = np.linspace(0, 1, 9), []
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
@@ -77,8 +88,8 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
     vectors
         Which the plane should hold, where the shape itself leaves a choice.
     loosely
-        Take planes too that only the shape has, as far as areas and centres tell, where edges of the mesh lie
-        in them.
+        Take planes too that only the shape has, as far as areas and centres tell, where edges of
+        the mesh lie in them.
     """
     if CUT in patch.edges:
         return []
@@ -88,7 +99,9 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
     tree = scipy.spatial.cKDTree(patch.nodes)
     for normal in _normals(patch, vectors):
         mirror = Mirror.of(normal)
-        exact = _with_edges(Mirror(mirror.normal, _rounded(float(mirror.normal @ centre))), patch, tree)
+        exact = _with_edges(
+            Mirror(mirror.normal, _rounded(float(mirror.normal @ centre))), patch, tree
+        )
         if exact:
             mirrors.append(exact)
         elif loosely:
@@ -108,11 +121,17 @@ def _rounded(offset: float) -> float:
 
 
 def _normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[Array]:
-    """Each once: normal to what the parts need, the axes of inertia, those of space, and halfway between."""
+    """Each once: normal to what the parts need, the axes of inertia, those of space, and halfway
+    between.
+    """
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
     principal = np.linalg.eigh(np.cov(corners.T))[1].T
     axes = np.eye(3)
-    diagonals = [a + s * b for a, b in ((axes[0], axes[1]), (axes[1], axes[2]), (axes[0], axes[2])) for s in (1, -1)]
+    diagonals = [
+        a + s * b
+        for a, b in ((axes[0], axes[1]), (axes[1], axes[2]), (axes[0], axes[2]))
+        for s in (1, -1)
+    ]
     crossed = [np.cross(v, w) for v in vectors for w in (*axes[::-1], *vectors)]
     seen: list[Array] = []
     for normal in (*crossed, axes[1], axes[0], axes[2], *principal, *diagonals):
@@ -136,7 +155,9 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
         return None
     lost = {}
     for name, lines in patch.edges.items():
-        other = next((o for o, pairs in patch.edges.items() if _same_rows(image[lines], pairs)), None)
+        other = next(
+            (o for o, pairs in patch.edges.items() if _same_rows(image[lines], pairs)), None
+        )
         if other is None:
             return None
         if other != name and mirror.beyond(nodes[lines]).mean() < 0:
@@ -171,7 +192,8 @@ def _halves_alike(mirror: Mirror, patch: PatchMesh) -> bool:
         return False
     extent, whole = np.ptp(patch.nodes, axis=0).max(), one[1] + other[1]
     return bool(
-        abs(one[1] - other[1]) < ALIKE * whole and np.abs(mirror.image(one[0]) - other[0]).max() < ALIKE * extent
+        abs(one[1] - other[1]) < ALIKE * whole
+        and np.abs(mirror.image(one[0]) - other[0]).max() < ALIKE * extent
     )
 
 

@@ -1,4 +1,6 @@
-"""The chart of each geometry, over the reference length R: what is meshed, and how it is put into space."""
+"""The chart of each geometry, over the reference length R: what is meshed, and how it is put into
+space.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,14 +37,15 @@ class Outline:
     Attributes
     ----------
     chart
-        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of grids).
+        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of
+        grids).
     normal
         Chart -> outward unit normals.
     inverse
         Chart (2,) of a place (3,); of a mesh file the place itself.
     highest
-        Chart of the point whose displacement is reported where the case names none: a pole, a tip; None: the
-        reader of the mesh file takes the highest.
+        Chart of the point whose displacement is reported where the case names none: a pole, a tip;
+        None: the reader of the mesh file takes the highest.
     edge
         Distance of the outer edge from the chart's origin; infinite where the chart is no disc.
     sphere
@@ -50,10 +53,11 @@ class Outline:
     round
         Whether it is closed around e3.
     mirrors
-        Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a plane should
-        hold, and whether its edges suffice (see `mesh_mirrors`).
+        Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a
+        plane should hold, and whether its edges suffice (see `mesh_mirrors`).
     from_pole
-        Places -> length of the meridian from the pole; None but for a pole of a surface of revolution.
+        Places -> length of the meridian from the pole; None but for a pole of a surface of
+        revolution.
     span
         The meridian; None if it is closed, or the surface is none of revolution.
     also
@@ -77,7 +81,9 @@ class Outline:
     askew: str | None = None
 
     def on_half(self, chart: Array) -> Array:
-        """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
+        """A place of the chart on its half, from which rounding may have moved it; grids and meshes
+        are cut.
+        """
         if self.grid or isinstance(self.chart(None, ANY), MeshFile):
             return chart
         return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
@@ -92,7 +98,9 @@ class Outline:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
         if self.span and self.span.pieces:
             along = self.span.sample()
-            return np.vstack([*(along @ rotation(angle) for angle in np.linspace(0, 2 * pi, AROUND)), self.also])
+            return np.vstack(
+                [*(along @ rotation(angle) for angle in np.linspace(0, 2 * pi, AROUND)), self.also]
+            )
         chart, nodes = self.charts(), self.nodes
         if chart is None:
             assert nodes is not None
@@ -110,7 +118,9 @@ class Outline:
         return read_msh(shape, {}).nodes if isinstance(shape, MeshFile) else None
 
     def normal_near(self, chart: Array) -> Array:
-        """The outward unit normal (3,) at a chart (2,), or of the nearest node of a mesh file to a place (3,)."""
+        """The outward unit normal (3,) at a chart (2,), or of the nearest node of a mesh file to a
+        place (3,).
+        """
         shape = self.chart(None, ANY)
         if not isinstance(shape, MeshFile):
             return np.asarray(self.normal(chart[None])[0])
@@ -118,7 +128,9 @@ class Outline:
             assert shape.given.normal
             return shape.given.normal(chart)
         nodes = read_msh(replace(shape, normals=True), {}).nodes
-        return np.asarray(normals(nodes[[np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()]])[0])
+        return np.asarray(
+            normals(nodes[[np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()]])[0]
+        )
 
     def charts(self) -> Array | None:
         """Their charts (n, 2); None for a mesh file."""
@@ -133,7 +145,9 @@ class Outline:
             x, y = np.meshgrid(t, (t - 0.5) * shape.width)
         else:
             assert isinstance(shape, Grid)
-            x, y = np.meshgrid(*(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True)))
+            x, y = np.meshgrid(
+                *(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True))
+            )
         return np.column_stack([x.ravel(), y.ravel()])
 
     def within(self, chart: Array) -> Array:
@@ -151,8 +165,12 @@ class Outline:
         """Chart -> the surface without its imperfections."""
         return self.embedding.perfect if isinstance(self.embedding, Deviated) else self.embedding
 
-    def deviated(self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float) -> "Outline":
-        """The outline with imperfections; the curvature jumps on circles around the pole, `largest` cells show them."""
+    def deviated(
+        self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float
+    ) -> "Outline":
+        """The outline with imperfections; the curvature jumps on circles around the pole, `largest`
+        cells show them.
+        """
         span = self.span and replace(
             self.span,
             embedding=Deviated(self.span.embedding, self.span.normal, deviations),
@@ -162,7 +180,9 @@ class Outline:
         return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
 
     def placed(self, shape: Chart) -> Embedding:
-        """The map to space of what is meshed: halves of several shells have charts in frames of their own."""
+        """The map to space of what is meshed: halves of several shells have charts in frames of
+        their own.
+        """
         if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly):
             return shape.given.patch.embedding
         return self.embedding
@@ -187,7 +207,10 @@ def ground_of(shell: Surface | ShellSection) -> Ground:
         shell.with_units,
         shell.edge_polar,
         factor if isinstance(factor, str) else None,
-        (shell.model_dump_json(exclude={"imperfections"}), shell.digest if isinstance(shell, MeshSurface) else None),
+        (
+            shell.model_dump_json(exclude={"imperfections"}),
+            shell.digest if isinstance(shell, MeshSurface) else None,
+        ),
         hole_polar=getattr(shell, "hole", None) or 0.0,
         azimuths=(azimuth[0], azimuth[1]) if (azimuth := getattr(shell, "azimuth", None)) else None,
     )
@@ -205,7 +228,9 @@ def outline(shell: Surface | ShellSection) -> Outline:
                 return given.patch.embedding(nodes)
 
             return Outline(
-                lambda mirror, size: replace(file, given=given.half(mirror)) if mirror and given.half else file,
+                lambda mirror, size: (
+                    replace(file, given=given.half(mirror)) if mirror and given.half else file
+                ),
                 embedded,
                 normals,
                 lambda x: x,
@@ -222,7 +247,9 @@ def outline(shell: Surface | ShellSection) -> Outline:
             except MeshError:  # for whoever builds it to report
                 return []
 
-        return Outline(lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes)
+        return Outline(
+            lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes
+        )
     if isinstance(shell, ShellSection) and shell.width is not None:
         width = shell.width
         tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
@@ -231,7 +258,12 @@ def outline(shell: Surface | ShellSection) -> Outline:
             return np.clip(_plane(x), corner, -corner + tip)
 
         return Outline(
-            lambda m, size: StripShape(width, m is not None), flat, upwards, within, tip, mirrors=lambda *_: [Y0]
+            lambda m, size: StripShape(width, m is not None),
+            flat,
+            upwards,
+            within,
+            tip,
+            mirrors=lambda *_: [Y0],
         )
     if isinstance(shell, ShellSection) and shell.geometry == "disc":
         return _disc(1.0, "rim", flat, upwards, _plane)
@@ -246,7 +278,9 @@ def outline(shell: Surface | ShellSection) -> Outline:
     profile, names = shell.turned
     if names[1] is None:
         capped, bent = Capped(profile), _curvature(profile)
-        drawn = _disc(profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent)
+        drawn = _disc(
+            profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent
+        )
         return replace(drawn, from_pole=capped.from_pole)
     return _ring(shell, profile, (names[0], names[1]))
 
@@ -274,10 +308,14 @@ def _disc(
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
 
     span = Span(edge, (), (None, name), embedding, normal, place, curvature)
-    return Outline(chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span)
+    return Outline(
+        chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span
+    )
 
 
-def _ring(shell: RoundSection | RevolutionSurface, profile: Profile, names: tuple[str, str]) -> Outline:
+def _ring(
+    shell: RoundSection | RevolutionSurface, profile: Profile, names: tuple[str, str]
+) -> Outline:
     first, last = shell.turn
     along = np.linspace(0, profile.length, 101, dtype=np.float64)
     rho = float(profile(along)[:, 0].max())
@@ -301,9 +339,13 @@ def _ring(shell: RoundSection | RevolutionSurface, profile: Profile, names: tupl
 
     span = None
     if glued == (True, False):
-        span = Span(profile.length, (), (names[1], names[0]), section, normal, place, _curvature(profile))
+        span = Span(
+            profile.length, (), (names[1], names[0]), section, normal, place, _curvature(profile)
+        )
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
-    return _grid(grid, embedding, embedding.normal, inverse, np.array(low if any(glued) else high), span)
+    return _grid(
+        grid, embedding, embedding.normal, inverse, np.array(low if any(glued) else high), span
+    )
 
 
 def _curvature(profile: Profile) -> float:
@@ -323,18 +365,24 @@ def _grid(
 ) -> Outline:
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
         if isinstance(mirror, Sector):
-            return replace(_between(grid, mirror), size=size.across if size.features else size.largest)
+            return replace(
+                _between(grid, mirror), size=size.across if size.features else size.largest
+            )
         through = lines_on(mirror, grid, embedding) if mirror else grid.through
         return replace(grid, size=size.across if size.features else size.largest, through=through)
 
     def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
         return _either_half(grid_mirrors(grid, embedding))
 
-    return Outline(chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
+    return Outline(
+        chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span
+    )
 
 
 def _between(grid: Grid, sector: Sector) -> Grid:
-    """The part of a grid that is closed around e3 from azimuth 0 to 180/m degrees, at least four quadrilaterals."""
+    """The part of a grid that is closed around e3 from azimuth 0 to 180/m degrees, at least four
+    quadrilaterals.
+    """
     end = (grid.high[0] - grid.low[0]) / sector.copies
     parts = tuple(end * part for part in (0.25, 0.5, 0.75))
     sides = (CUT, SECOND_CUT, *grid.sides[2:])

@@ -1,7 +1,9 @@
-"""What all mid-surfaces have, and those of revolution about e3: caps, cylinders, rings, tori, profiles.
+"""What all mid-surfaces have, and those of revolution about e3: caps, cylinders, rings, tori,
+profiles.
 
-Lengths are plain numbers of one unit that the user chooses, or all have units and are then in metres;
-the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
+Lengths are plain numbers of one unit that the user chooses, or all have units and are then in
+metres; the same holds for Young's modulus, so that loads and results are in the user's units or in
+SI.
 """
 
 from math import pi, radians
@@ -28,9 +30,20 @@ Measure = Annotated[float, or_number("metre", Positive), Field(gt=0)]
 Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Heights = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=2, max_length=2)]
-Azimuth = Annotated[Range | None, Field(description="First and last, of a part; closed without [degree]")]
+Azimuth = Annotated[
+    Range | None, Field(description="First and last, of a part; closed without [degree]")
+]
 FULL_TURN = [0.0, 360.0]
-MEASURES = ("thickness", "youngs_modulus", "density", "radius", "length", "width", "inner_radius", "tube_radius")
+MEASURES = (
+    "thickness",
+    "youngs_modulus",
+    "density",
+    "radius",
+    "length",
+    "width",
+    "inner_radius",
+    "tube_radius",
+)
 
 
 class Material(Section):
@@ -45,7 +58,8 @@ class Material(Section):
     density: Annotated[float, or_number("kilogram/metre**3", Positive), Field(gt=0)] | None = None
     """Density ρ; with it frequencies are in hertz [mass/length³]"""
     thickness_factor: Annotated[
-        Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | GivenField | None, OrOfProgram(GivenField)
+        Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | GivenField | None,
+        OrOfProgram(GivenField),
     ] = None
     """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
 
@@ -62,9 +76,15 @@ class SurfaceSection(ShellKeys, Material):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
-        written = {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
-        measured = {key: value for key, value in written.items() if isinstance(value, str | int | float)}
+    def _all_with_units_or_none(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        written = (
+            {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
+        )
+        measured = {
+            key: value for key, value in written.items() if isinstance(value, str | int | float)
+        }
         kinds = {isinstance(value, str) for value in measured.values()}
         all_or_none = "give every length and youngs_modulus a unit, or none of them"
         if len(kinds) > 1:
@@ -88,11 +108,15 @@ class SurfaceSection(ShellKeys, Material):
     @model_validator(mode="after")
     def _thin(self) -> Self:
         if not 3 <= self.R_over_h <= 1e6:
-            raise ValueError(f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6")
+            raise ValueError(
+                f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6"
+            )
         if self.density is not None and self.youngs_modulus is None:
             raise ValueError("density turns frequencies into hertz: that needs youngs_modulus")
         if isinstance(self.thickness_factor, GivenField) and self.thickness_factor.size != 1:
-            raise ValueError(f"thickness_factor: a function of {self.thickness_factor.size} numbers; it has one")
+            raise ValueError(
+                f"thickness_factor: a function of {self.thickness_factor.size} numbers; it has one"
+            )
         if isinstance(self.thickness_factor, dict) and not self.has_patches:
             raise ValueError("thickness_factor: patches have names only with geometry: mesh")
         return self
@@ -125,7 +149,9 @@ class SurfaceSection(ShellKeys, Material):
 def _refuse_overturned(azimuth: list[float] | None) -> None:
     first, last = azimuth or FULL_TURN
     if not 1e-3 <= last - first <= 360:
-        raise ValueError(f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360")
+        raise ValueError(
+            f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360"
+        )
 
 
 class RoundSection(SurfaceSection):
@@ -162,7 +188,9 @@ class RoundSection(SurfaceSection):
 
 
 class CapSurface(RoundSection):
-    """Sphere from `polar` (degrees from e3) up to the pole or a `hole`; edges rim, hole and, of a part, left, right."""
+    """Sphere from `polar` (degrees from e3) up to the pole or a `hole`; edges rim, hole and, of a
+    part, left, right.
+    """
 
     geometry: Literal["cap"]
     polar: float = Field(default=90.0, ge=1, le=179)
@@ -193,7 +221,9 @@ class CapSurface(RoundSection):
 
 
 class CylinderSurface(RoundSection):
-    """Around e3 from z = 0 to `length`, or a panel of it; edges bottom, top and, of a panel, left, right."""
+    """Around e3 from z = 0 to `length`, or a panel of it; edges bottom, top and, of a panel, left,
+    right.
+    """
 
     geometry: Literal["cylinder"]
     length: Measure
@@ -207,7 +237,10 @@ class CylinderSurface(RoundSection):
 
 
 class AnnulusSurface(RoundSection):
-    """Flat ring; with azimuth: [0, 360] it is slit. Edges inner, outer and, where it is not closed, left, right."""
+    """Flat ring; with azimuth: [0, 360] it is slit.
+
+    Edges inner, outer and, where it is not closed, left, right.
+    """
 
     geometry: Literal["annulus"]
     inner_radius: Measure
@@ -216,7 +249,9 @@ class AnnulusSurface(RoundSection):
     @model_validator(mode="after")
     def _inner_within(self) -> Self:
         if self.inner_radius >= self.radius:
-            raise ValueError(f"inner_radius: {self.inner_radius:g}: must be smaller than radius, {self.radius:g}")
+            raise ValueError(
+                f"inner_radius: {self.inner_radius:g}: must be smaller than radius, {self.radius:g}"
+            )
         return self
 
     @property
@@ -227,7 +262,8 @@ class AnnulusSurface(RoundSection):
 
 
 class TorusSurface(RoundSection):
-    """A tube around the circle of `radius`; `tube` (degrees, from outside towards e3) is the part of its section.
+    """A tube around the circle of `radius`; `tube` (degrees, from outside towards e3) is the part
+    of its section.
 
     Edges left, right and, with tube, bottom, top.
     """
@@ -242,10 +278,16 @@ class TorusSurface(RoundSection):
     def _hole_in_it(self) -> Self:
         first, last = self.tube or FULL_TURN
         if not 1e-3 <= last - first <= 360:
-            raise ValueError(f"tube: from {first:g} to {last:g} degrees; it must grow, by at most 360")
-        inside = self.radius + self.tube_radius * np.cos(np.radians(np.linspace(first, last, 721))).min()
+            raise ValueError(
+                f"tube: from {first:g} to {last:g} degrees; it must grow, by at most 360"
+            )
+        inside = (
+            self.radius + self.tube_radius * np.cos(np.radians(np.linspace(first, last, 721))).min()
+        )
         if inside <= 0:
-            raise ValueError(f"tube_radius: {self.tube_radius:g}: the tube reaches the axis; radius is {self.radius:g}")
+            raise ValueError(
+                f"tube_radius: {self.tube_radius:g}: the tube reaches the axis; radius is {self.radius:g}"
+            )
         return self
 
     @property
@@ -253,7 +295,10 @@ class TorusSurface(RoundSection):
         from magshell_fenicsx.mesh.revolved import Arc
 
         first, last = self.tube or FULL_TURN
-        return Arc(self.tube_radius / self.radius, radians(first), radians(last), 1.0), ("bottom", "top")
+        return Arc(self.tube_radius / self.radius, radians(first), radians(last), 1.0), (
+            "bottom",
+            "top",
+        )
 
     @property
     def closed(self) -> bool:
@@ -272,11 +317,15 @@ class ProfileSection(Section):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
-        if (self.points is None) == (self.radius is None) or (self.radius is None) != (self.heights is None):
+        if (self.points is None) == (self.radius is None) or (self.radius is None) != (
+            self.heights is None
+        ):
             raise ValueError("give points, or radius (a formula of z) and heights")
         r = self.curve[:, 0]
         if not np.isfinite(self.curve).all() or r.max() <= 0 or (r[:-1] <= 0).any() or r[-1] < 0:
-            raise ValueError("r must be positive along the profile; only its end may lie on the axis, as a pole")
+            raise ValueError(
+                "r must be positive along the profile; only its end may lie on the axis, as a pole"
+            )
         if (np.linalg.norm(np.diff(self.curve, axis=0), axis=1) == 0).any():
             raise ValueError("two points that follow each other are the same")
         return self
@@ -294,7 +343,8 @@ class ProfileSection(Section):
 
 
 class RevolutionSurface(SurfaceSection):
-    """A profile turned about e3; the normal points to the right of its direction (outside, if it goes up).
+    """A profile turned about e3; the normal points to the right of its direction (outside, if it
+    goes up).
 
     Edges bottom (its beginning), top (its end, if that is not the pole), left, right.
     """

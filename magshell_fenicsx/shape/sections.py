@@ -2,7 +2,13 @@
 
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationInfo,
+    model_validator,
+)
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import (
@@ -54,14 +60,19 @@ class MeshSurface(FileKeys, SurfaceSection):
     """Its path from the folder of the case; triangles of order 1 to 3"""
     radius: Measure
     """Reference length R, which formulas and dimensionless results are over [length]"""
-    unit: Annotated[float, BeforeValidator(in_units("metre", bare=True), json_schema_input_type=str)] | None = None
+    unit: (
+        Annotated[float, BeforeValidator(in_units("metre", bare=True), json_schema_input_type=str)]
+        | None
+    ) = None
     """Unit of the file's coordinates, such as mm; goes with lengths that have units"""
 
     @model_validator(mode="before")
     @classmethod
     def _unit_of_the_file(cls, data: Any) -> Any:
         if isinstance(data, dict) and isinstance(data.get("thickness"), str) != ("unit" in data):
-            raise ValueError("unit (of the file's coordinates, such as mm) goes with lengths that have units")
+            raise ValueError(
+                "unit (of the file's coordinates, such as mm) goes with lengths that have units"
+            )
         return data
 
     @property
@@ -76,7 +87,15 @@ class MeshSurface(FileKeys, SurfaceSection):
 
 
 FLAT = ("disc", "strip", "plate", "annulus")  # geometries
-Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface
+Surface = (
+    CapSurface
+    | CylinderSurface
+    | PlateSurface
+    | AnnulusSurface
+    | TorusSurface
+    | RevolutionSurface
+    | MeshSurface
+)
 
 
 def _over_the_length(value: Any, info: ValidationInfo) -> Any:
@@ -85,7 +104,9 @@ def _over_the_length(value: Any, info: ValidationInfo) -> Any:
         return value
     radius = info.data.get("radius")
     if radius is None:
-        raise ValueError("a width with a unit needs radius and thickness with units; a number is over the length")
+        raise ValueError(
+            "a width with a unit needs radius and thickness with units; a number is over the length"
+        )
     return in_units("metre")(value) / radius
 
 
@@ -125,7 +146,8 @@ class OneShape(Section):
 
 
 class ShellSection(ShellKeys, OneShape):
-    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its
+    length.
 
     Without units lengths are over R, forces over E R².
 
@@ -141,8 +163,15 @@ class ShellSection(ShellKeys, OneShape):
         plain = [size for size in sizes if isinstance(size, int | float) and size > 0]
         if len(plain) == 2:
             ratio = f"{plain[0] / plain[1]:.12g}"
-            raise ValueError(f"radius and thickness: give each a unit, or radius_to_thickness: {ratio} in their place")
-        cls.note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
+            raise ValueError(
+                f"radius and thickness: give each a unit, or radius_to_thickness: {ratio} in their place"
+            )
+        cls.note_sizes(
+            data,
+            handler,
+            info,
+            with_units=isinstance(data, dict) and data.get("thickness") is not None,
+        )
         return handler(data)
 
     @model_validator(mode="after")
@@ -154,11 +183,15 @@ class ShellSection(ShellKeys, OneShape):
         elif None in lengths:
             raise ValueError("give radius_to_thickness, or both radius and thickness")
         elif not 10 <= self.R_over_h <= 1e5:
-            raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
+            raise ValueError(
+                f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5"
+            )
         if (self.width is None) == (self.geometry == "strip"):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
         if self.density is not None and (self.youngs_modulus is None or self.radius is None):
-            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus, radius and thickness")
+            raise ValueError(
+                "density turns frequencies into hertz: that needs youngs_modulus, radius and thickness"
+            )
         if self.defect and self.geometry != "hemisphere":
             raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
         if self.width is not None and self.width * self.R_over_h < 1:

@@ -1,4 +1,6 @@
-"""The faces of simple bodies, for pictures: triangles around their own axes, with the poles of magnets."""
+"""The faces of simple bodies, for pictures: triangles around their own axes, with the poles of
+magnets.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +27,8 @@ class Solid:
     name
         Of the body or the source.
     poles
-        (n,) of a magnet: positive on the north pole's half, negative on the other; zero of what is no magnet.
+        (n,) of a magnet: positive on the north pole's half, negative on the other; zero of what is
+        no magnet.
     """
 
     points: Array
@@ -46,22 +49,34 @@ class Solid:
     @property
     def creases(self) -> list[Array]:
         """Lines (2, 3) where faces end."""
-        sides = np.sort(np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
+        sides = np.sort(
+            np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1
+        )
         edges, count = np.unique(sides, axis=0, return_counts=True)
-        return [self.points[pair] for pair in edges[count == 1] if np.ptp(self.points[pair], axis=0).max() > 0]
+        return [
+            self.points[pair]
+            for pair in edges[count == 1]
+            if np.ptp(self.points[pair], axis=0).max() > 0
+        ]
 
 
 def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:
-    """A solid of revolution about z: of each profile, points (rho, z), a smooth face; faces meet in edges."""
+    """A solid of revolution about z: of each profile, points (rho, z), a smooth face; faces meet in
+    edges.
+    """
     t = 2 * np.pi * np.arange(AROUND) / AROUND
     points, triangles = [], []
     start, next_one = 0, (np.arange(AROUND) + 1) % AROUND
-    on_axis = SAME * max(rho for profile in profiles for rho, _ in profile)  # a cosine of 90 degrees is not quite zero
+    on_axis = SAME * max(
+        rho for profile in profiles for rho, _ in profile
+    )  # a cosine of 90 degrees is not quite zero
     for profile in profiles:
         rings = list[NDArray[np.int64]]()
         for rho, z in profile:
             points.append(np.column_stack([rho * np.cos(t), rho * np.sin(t), np.full(AROUND, z)]))
-            rings.append(start + np.arange(AROUND) * (rho > on_axis))  # on the axis there is one point
+            rings.append(
+                start + np.arange(AROUND) * (rho > on_axis)
+            )  # on the axis there is one point
             start += AROUND
         for low, high in pairwise(rings):
             triangles.append(np.column_stack([low, low[next_one], high[next_one]]))
@@ -77,7 +92,11 @@ def disc(radius: float) -> Solid:
 def cylinder(radius: float, height: float, hole: float = 0.0) -> Solid:
     """A cylinder or a ring."""
     low, high = -height / 2, height / 2
-    faces = [[(hole, low), (radius, low)], [(radius, low), (radius, high)], [(radius, high), (hole, high)]]
+    faces = [
+        [(hole, low), (radius, low)],
+        [(radius, low), (radius, high)],
+        [(radius, high), (hole, high)],
+    ]
     return revolved(*faces, *([[(hole, high), (hole, low)]] if hole else []))
 
 
@@ -90,7 +109,9 @@ def globe(radius: float) -> Solid:
 def block(half: Array) -> Solid:
     """A cuboid of half the sizes (3,)."""
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    faces = [np.insert(square, axis, side, axis=1) * half for axis in range(3) for side in (-1.0, 1.0)]
+    faces = [
+        np.insert(square, axis, side, axis=1) * half for axis in range(3) for side in (-1.0, 1.0)
+    ]
     triangles = [4 * k + np.array([[0, 1, 2], [0, 2, 3]]) for k in range(6)]
     return Solid(np.concatenate(faces), np.concatenate(triangles))
 

@@ -87,8 +87,14 @@ def mirror(parts: Sequence[Leaves], outline: "Outline", *, loosely: bool = False
         upright = [Mirror.upright(azimuth + turn) for turn in turns]
 
     if outline.round:
-        between = [Mirror.upright(a + turn) for part in parts for a in part.azimuths for turn in (0.0, pi)]
-        upright += [plane for plane in between if all(abs(plane.normal @ unit(v)) <= PARALLEL for v in vectors)]
+        between = [
+            Mirror.upright(a + turn) for part in parts for a in part.azimuths for turn in (0.0, pi)
+        ]
+        upright += [
+            plane
+            for plane in between
+            if all(abs(plane.normal @ unit(v)) <= PARALLEL for v in vectors)
+        ]
 
     def first(planes: Sequence[Mirror]) -> Mirror | None:
         return next((plane for plane in planes if all(part.mirrors(plane) for part in parts)), None)
@@ -96,10 +102,16 @@ def mirror(parts: Sequence[Leaves], outline: "Outline", *, loosely: bool = False
     if any(part.mirrors is nothing for part in parts):
         return None
     chosen = first(upright) or first(outline.mirrors([unit(v) for v in vectors], False))
-    return first(outline.mirrors([unit(v) for v in vectors], True)) if loosely and not chosen else chosen
+    return (
+        first(outline.mirrors([unit(v) for v in vectors], True))
+        if loosely and not chosen
+        else chosen
+    )
 
 
-def sector(parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vectors = ()) -> Sector | None:
+def sector(
+    parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vectors = ()
+) -> Sector | None:
     """The sector of 180/m degrees between two planes that all parts leave; None if there is none.
 
     Parameters
@@ -112,18 +124,26 @@ def sector(parts: Sequence[Leaves], outline: "Outline", waves: int, places: Vect
     if azimuth is None:
         return None
     if outline.round:
-        beside = [a for part in parts for a in part.azimuths] + [atan2(x[1], x[0]) for x in places if tilted(x)]
+        beside = [a for part in parts for a in part.azimuths] + [
+            atan2(x[1], x[0]) for x in places if tilted(x)
+        ]
         begins = [a + turn for a in (azimuth, *beside) for turn in (0.0, -pi / waves, pi)]
     else:
-        begins = [plane.azimuth for plane in _upright(outline, [unit(v) for v in (*vectors, *places)])]
+        begins = [
+            plane.azimuth for plane in _upright(outline, [unit(v) for v in (*vectors, *places)])
+        ]
     sectors = (Sector.at(begin, waves) for begin in begins)
-    fitting = (s for s in sectors if all(part.mirrors(side) for part in parts for side in s.sides.values()))
+    fitting = (
+        s for s in sectors if all(part.mirrors(side) for part in parts for side in s.sides.values())
+    )
     return next((s for s in fitting if outline.round or _ends(outline, s)), None)
 
 
 def _upright(outline: "Outline", vectors: Vectors) -> list[Mirror]:
     """The planes through e3 of an outline that is not round, which map each edge onto itself."""
-    return [plane for plane in outline.mirrors(vectors, False) if plane.through_e3 and not plane.lost]
+    return [
+        plane for plane in outline.mirrors(vectors, False) if plane.through_e3 and not plane.lost
+    ]
 
 
 def _ends(outline: "Outline", sector: Sector) -> bool:
@@ -142,7 +162,9 @@ def unmirrored(parts: Sequence[Leaves], outline: "Outline") -> str | None:
     """The name of an energy that alone keeps a case from being a half; None if there is none."""
     others = [part for part in parts if not part.energy]
     plane = mirror(others, outline, loosely=True)
-    return next((part.energy for part in parts if plane and part.energy and not part.mirrors(plane)), None)
+    return next(
+        (part.energy for part in parts if plane and part.energy and not part.mirrors(plane)), None
+    )
 
 
 def tilted(v: Array) -> bool:
@@ -151,7 +173,9 @@ def tilted(v: Array) -> bool:
 
 
 def unit(v: Array) -> Array:
-    """A vector (3,) over its length; zero stays zero, and what is as short as 1e-200 has a direction."""
+    """A vector (3,) over its length; zero stays zero, and what is as short as 1e-200 has a
+    direction.
+    """
     largest = np.abs(v).max()
     if not largest:
         return v
@@ -186,21 +210,27 @@ def of_patches(key: str, names: Iterable[str], shell: "ShellSection | Surface") 
 
 
 def of_points(points: Iterable[Sequence[float]], R: float, outline: "Outline") -> Leaves:
-    """Named points lie on the half that is modelled, and so does the one that is reported without any."""
+    """Named points lie on the half that is modelled, and so does the one that is reported without
+    any.
+    """
     named = [np.array(x) / R for x in points]
     places = named
     if not named and outline.highest is not None:
         places = [outline.embedding(outline.highest[None])[0]]
 
     def within(mirror: Mirror) -> bool:
-        chosen = outline.round and mirror.through_e3 and not named  # then the chart begins at the plane
+        chosen = (
+            outline.round and mirror.through_e3 and not named
+        )  # then the chart begins at the plane
         return chosen or all(float(mirror.beyond(x)) > -ROUNDING for x in places)
 
     return Leaves(mirrors=within)
 
 
 def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) -> bool:
-    """Whether a formula is the same at places (n, 3) over R and at their images; `length` is R in its unit."""
+    """Whether a formula is the same at places (n, 3) over R and at their images; `length` is R in
+    its unit.
+    """
     of = formula(text)
     return alike(of(*(length * x).T), of(*(length * mirror.image(x)).T))
 

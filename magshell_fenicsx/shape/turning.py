@@ -32,7 +32,8 @@ class Piece:
     place
         Place (3,) in space -> parameter of the nearest place of it, and azimuth (rad).
     vertices
-        Those of its mesh, with cells of that size up to that distance from its pole, where something presses on it.
+        Those of its mesh, with cells of that size up to that distance from its pole, where
+        something presses on it.
     """
 
     name: str
@@ -48,7 +49,8 @@ class Piece:
 
 @dataclass(frozen=True)
 class Span:
-    """A meridian, walked from the pole or one edge to the other; or those of several shells with one axis.
+    """A meridian, walked from the pole or one edge to the other; or those of several shells with
+    one axis.
 
     Attributes
     ----------
@@ -59,11 +61,13 @@ class Span:
     names
         Of its ends; None for a pole, and where shells are joined.
     embedding, normal
-        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the
+        perfect surface there.
     place
         Chart (2,) of the surface -> parameter of this one and azimuth (rad).
     curvature
-        The largest of the meridian over 1/R, at least 1; of several that which has the most waves around e3.
+        The largest of the meridian over 1/R, at least 1; of several that which has the most waves
+        around e3.
     largest
         Size of cells that shows the imperfections.
     vertices
@@ -91,11 +95,15 @@ class Span:
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""
-        return self._at([np.linspace(first, last, 401, dtype=np.float64) for first, last in self._parts])
+        return self._at(
+            [np.linspace(first, last, 401, dtype=np.float64) for first, last in self._parts]
+        )
 
     def between(self) -> NDArray[np.float64]:
         """The same without its ends: a formula may divide by zero on the axis."""
-        return self._at([np.linspace(first, last, 401, dtype=np.float64)[1:-1] for first, last in self._parts])
+        return self._at(
+            [np.linspace(first, last, 401, dtype=np.float64)[1:-1] for first, last in self._parts]
+        )
 
     def place_of(self, name: str, x: Array) -> tuple[float, float]:
         """Parameter and azimuth (rad) of a named place, which is that of the shell in its name."""
@@ -110,7 +118,9 @@ class Span:
     def ends(self) -> dict[str, NDArray[np.float64]]:
         """Name of each edge -> its place (rho, z)."""
         places = self._at([np.array(ends) for ends in self._parts])[:, [0, 2]]
-        return {name: np.asarray(place) for name, place in zip(self.names, places, strict=True) if name}
+        return {
+            name: np.asarray(place) for name, place in zip(self.names, places, strict=True) if name
+        }
 
     @property
     def _parts(self) -> list[tuple[float, float]]:
@@ -130,7 +140,9 @@ def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
     )
 
 
-def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, in_space: bool = False) -> bool:
+def vector_turns(
+    components: Sequence[str], span: Span, length: float = 1.0, *, in_space: bool = False
+) -> bool:
     """Whether the vector with these components turns with the meridian and has none across it.
 
     On the surface, and with `in_space` beside it, where it may move to.
@@ -145,7 +157,9 @@ def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, 
         places = beside(places) * [1.0, 0.0, 1.0]
     turned, Q = _at_azimuth_zero(span.also)
     around = np.einsum("nij,nj->ni", Q, vectors(length * span.also))
-    return _turns(lambda x: vectors(length * x), places) and _same([vectors(length * turned), around])
+    return _turns(lambda x: vectors(length * x), places) and _same(
+        [vectors(length * turned), around]
+    )
 
 
 def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
@@ -157,11 +171,19 @@ def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
 
 
 def field_turns(field: Callable[[Array], Array], span: Span, *, smooth: bool = True) -> bool:
-    """Whether a field, smooth as that of sources, turns with the meridian and has no component across it, there."""
-    return _turns(field, span.between()[::20], ANGLES[:12]) if smooth else _turns(field, span.between())
+    """Whether a field, smooth as that of sources, turns with the meridian and has no component
+    across it, there.
+    """
+    return (
+        _turns(field, span.between()[::20], ANGLES[:12])
+        if smooth
+        else _turns(field, span.between())
+    )
 
 
-def _turns(field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES) -> bool:
+def _turns(
+    field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES
+) -> bool:
     turned = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
     return _same([*turned, turned[0] * [1.0, 0.0, 1.0]])
 
@@ -179,4 +201,6 @@ def beside(x: Array) -> Array:
 
 def _same(values: Sequence[Array]) -> bool:
     first = values[0]
-    return not first.size or all(bool((np.abs(v - first) <= SAME * np.abs(first).max()).all()) for v in values)
+    return not first.size or all(
+        bool((np.abs(v - first) <= SAME * np.abs(first).max()).all()) for v in values
+    )

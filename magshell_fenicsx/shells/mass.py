@@ -1,7 +1,8 @@
 """Inertia: the consistent mass of a model, and what the motion of supports gives to what they hold.
 
-Over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all others.
-With the displacement u + E(mu(t)), E at nodes that move, the mass is that of all nodes: M (u'' + E'') and M (u' + E').
+Over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all others. With
+the displacement u + E(mu(t)), E at nodes that move, the mass is that of all nodes: M (u'' + E'')
+and M (u' + E').
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -32,7 +33,9 @@ Model: TypeAlias = "ShellModel | MeridianModel | SolidModel"
 
 
 def mass(model: Model) -> PETSc.Mat:
-    """The consistent mass of what is modelled, without rotary inertia; zero rows and columns at supports."""
+    """The consistent mass of what is modelled, without rotary inertia; zero rows and columns at
+    supports.
+    """
     M, projection = mass_matrix(_product(model), model.system.clamped), model.system.projection
     return projection.mass(M) if projection else M
 
@@ -49,7 +52,9 @@ def _product(model: Model) -> fem.Form:
 
 
 def weight(model: Model) -> Expr | None:
-    """What multiplies the mass of a shell per area: thickness and density; a solid has the thickness in its shape."""
+    """What multiplies the mass of a shell per area: thickness and density; a solid has the
+    thickness in its shape.
+    """
     factors = [] if model.thickness is None else [model.thickness[0]]
     if model.made_of is not None:
         factors.append(model.made_of[2])
@@ -65,7 +70,9 @@ def of_displacements(model: Model, factor: Expr | float) -> ufl.Form:
 def of_waves(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
-    cosine, sine = zip(*(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
+    cosine, sine = zip(
+        *(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
+    )
     return _integral(model, factor * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
 
@@ -100,7 +107,9 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
     So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
     """
     M = fem_petsc.create_matrix(product)
-    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the tangent has no entries of held ones
+    M.setOption(
+        PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True
+    )  # the tangent has no entries of held ones
     compat.add_matrix(M, product, held)
     M.assemble()
     return M
@@ -135,7 +144,13 @@ class Ground:
         carried: Vector | None = None,
     ) -> None:
         assert system.moving
-        self._system, self._moving, self._mass, self._at, self._carried = system, system.moving, mass, at, carried
+        self._system, self._moving, self._mass, self._at, self._carried = (
+            system,
+            system.moving,
+            mass,
+            at,
+            carried,
+        )
         self.names = system.moving.names
         self._x, self._y = mass.createVecs()
 

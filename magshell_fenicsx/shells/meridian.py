@@ -32,7 +32,14 @@ from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells, side_of
-from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
+from magshell_fenicsx.parts.supports.moved import (
+    PRESSURE,
+    Support,
+    enclosed,
+    motions_of,
+    moving,
+    rotation_of,
+)
 from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
@@ -45,7 +52,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
-SMALL_RISE = 1e-9  # largest axial component of a motion of length one that is a translation across the axis
+SMALL_RISE = (
+    1e-9  # largest axial component of a motion of length one that is a translation across the axis
+)
 
 
 @dataclass(frozen=True)
@@ -102,9 +111,9 @@ class MeridianModel(Thin):
     conditions
         Of the named ends, and of a named point on the axis; ends that are not named are free.
     loads
-        A force at the pole; dead forces along e3 at the pole, on ends and areas, dead pressures and moments on
-        ends; an applied field along e3, its gradient diag(a, a, b), a remanence that is the same along every
-        meridian and has no component across it.
+        A force at the pole; dead forces along e3 at the pole, on ends and areas, dead pressures and
+        moments on ends; an applied field along e3, its gradient diag(a, a, b), a remanence that is
+        the same along every meridian and has no component across it.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
@@ -155,13 +164,17 @@ class MeridianModel(Thin):
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         of_place = partial(field_of_place, self.r0)
-        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
+        loads = self.loads = replace(
+            loads, own=tuple(term.with_functions(of_place) for term in loads.own)
+        )
         patches, count = meridian.patches, len(meridian.order)
         for name in ("magnetic", "remanence"):
             if given := getattr(loads, name):
                 loads = self.loads = replace(loads, **{name: given.on(patches, count)})
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
+        shapes = {
+            name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()
+        }
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
         self.made_of: fem.Function | None = None
@@ -177,7 +190,13 @@ class MeridianModel(Thin):
         folded = meridian.largest_fold(self.r0) > FOLD
         creases = Creases.of(loads.joints, meridian) if loads.joints else None
         self.factory = factory = EnergyFactory(
-            carrier, self.u, *of_shell, folded, pressed=pressed, creases=creases, made_of=self.made_of
+            carrier,
+            self.u,
+            *of_shell,
+            folded,
+            pressed=pressed,
+            creases=creases,
+            made_of=self.made_of,
         )
         around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
@@ -187,7 +206,10 @@ class MeridianModel(Thin):
             edge, turn = "", None
             if conditions[name] == "clamped":
                 several = list(conditions.values()).count("clamped") > 1
-                edge, turn = f"{name} clamped edges" if several else "clamped edges", rotation_of(loads, name, V)
+                edge, turn = (
+                    f"{name} clamped edges" if several else "clamped edges",
+                    rotation_of(loads, name, V),
+                )
                 self.energies.append(factory.clamped_edges(edge, facets, turn))
             self.supports[name] = Support.of(held_on(V, 0, facets, components), edge, turn)
         if len(self.held.mirror):
@@ -204,7 +226,9 @@ class MeridianModel(Thin):
         self.load_size, self.load_sizes = {}, {}
         for name, dead in loads.dead.items():
             if forces(dead):
-                energy, self.load_size[name], self.load_sizes[name] = dead_loads(name, dead, around, self.kernels)
+                energy, self.load_size[name], self.load_sizes[name] = dead_loads(
+                    name, dead, around, self.kernels
+                )
                 self.energies.append(energy)
             self.energies += factory.dead_energies(name, dead, meridian.ends)
         if assembled:
@@ -217,7 +241,9 @@ class MeridianModel(Thin):
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
-        parameters: dict[str, Parameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
+        parameters: dict[str, Parameter] = {
+            **make_parameters(factory.free, terms, self.u, self.kernels)
+        }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         if self.growing:
@@ -256,9 +282,13 @@ class MeridianModel(Thin):
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
 
     def numbers(self) -> dict[str, list[Array]] | None:
-        """All values that its terms take from the problem, by term, as views; None if a term takes others too."""
+        """All values that its terms take from the problem, by term, as views; None if a term takes
+        others too.
+        """
         touched = self.contacts or self.loads.pairs
-        follows = self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
+        follows = (
+            self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
+        )
         if follows or any(e.density is None or e.counted for e in self.energies):
             return None
         free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
@@ -266,15 +296,21 @@ class MeridianModel(Thin):
         for e in self.energies:
             assert e.density
             parameters = [p for p in e.density.parameters if id(p) not in free]
-            values[e.name] = [p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters]
+            values[e.name] = [
+                p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters
+            ]
         return values
 
     def with_numbers(self, of: "MeridianModel", numbers: Settable, value: float) -> "MeridianModel":
-        """The same model with the numbers of another one, which all evaluations put in place by that value."""
+        """The same model with the numbers of another one, which all evaluations put in place by
+        that value.
+        """
         other = copy(self)
         other.system = self.system.with_number("numbers of the case", numbers, value)
         other.meridian, other.material = of.meridian, of.material
-        other.excluded_modes = ExcludedWaves(self.waves.of(other.system, most_waves(of.meridian, of.material.h)))
+        other.excluded_modes = ExcludedWaves(
+            self.waves.of(other.system, most_waves(of.meridian, of.material.h))
+        )
         return other
 
     @cached_property
@@ -302,7 +338,8 @@ class MeridianModel(Thin):
         return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
 
     def rigid_motions(self, amplitudes: Amplitudes) -> RigidMotions:
-        """Return the rigid motions of the undeformed shell that neither supports nor springs resist.
+        """Return the rigid motions of the undeformed shell that neither supports nor springs
+        resist.
 
         Where supports leave waves free, it compiles their kernels.
         """
@@ -315,7 +352,9 @@ class MeridianModel(Thin):
 
         tangent = partial(self.system.tangent, state.u, state.mu)
         along = unresisted(motions.along, self.system.held, tangent, comm)
-        return RigidMotions(along, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1))
+        return RigidMotions(
+            along, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1)
+        )
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """Return a rigid motion that is left free, as a message; empty if there is none."""
@@ -340,10 +379,13 @@ class MeridianModel(Thin):
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
             Lid.over_ring(
-                self.meridian.section(np.array([s]))[0, 0], motions, last=(side > 0) != self.meridian.begins(name)
+                self.meridian.section(np.array([s]))[0, 0],
+                motions,
+                last=(side > 0) != self.meridian.begins(name),
             )
             for name, s in ends.items()
-            if (side := side_of(name, self.loads.pressed)) and (motions := motions_of(self.loads, name))
+            if (side := side_of(name, self.loads.pressed))
+            and (motions := motions_of(self.loads, name))
         ]
         return Pressed(PRESSURE, self.material.classical_pressure / self.material.h, lids)
 

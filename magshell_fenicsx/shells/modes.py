@@ -1,9 +1,9 @@
 """The lowest modes of a shell, those that its reduced model excludes included.
 
-Each solves K phi = lambda M phi with M the inner product of displacements over the undeformed mid-surface:
-lambda is the stiffness per area with which the shell resists phi. Lengths in R and energies in E h R^2 make
-its unit E h/R^2. A shallow wave of the best length on a sphere under pressure has lambda = 1 - (p/p_c)^2 in
-this unit, but for its tangential part.
+Each solves K phi = lambda M phi with M the inner product of displacements over the undeformed
+mid-surface: lambda is the stiffness per area with which the shell resists phi. Lengths in R and
+energies in E h R^2 make its unit E h/R^2. A shallow wave of the best length on a sphere under
+pressure has lambda = 1 - (p/p_c)^2 in this unit, but for its tangential part.
 
 With the mass of the shell as M, lambda is omega^2 rho R^2/E of small vibrations.
 """
@@ -28,12 +28,16 @@ from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
-EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
+EXCLUDED = (
+    "antisymmetric",
+    "m = ",
+)  # what labels of modes begin with that a reduced model does not see
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The model in whose space all modes of a shell are, with those that it excludes: of a sector its half.
+    """The model in whose space all modes of a shell are, with those that it excludes: of a sector
+    its half.
 
     Attributes
     ----------
@@ -50,7 +54,9 @@ class Seen:
 
 
 def seen_on(model: Model) -> Seen:
-    """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked; collective."""
+    """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked;
+    collective.
+    """
     modes = None if isinstance(model, MeridianModel) else model.excluded_modes
     return Seen(modes.half, modes.unfolded) if isinstance(modes, UnfoldedModes) else Seen(model)
 
@@ -76,7 +82,9 @@ class ShellMode:
 
 @dataclass(frozen=True)
 class _Family:
-    """Modes that share a tangent, what is held, and an inner product (name and form); `contains` selects them."""
+    """Modes that share a tangent, what is held, and an inner product (name and form); `contains`
+    selects them.
+    """
 
     label: str
     tangent: Callable[[State], Tangent]
@@ -84,13 +92,20 @@ class _Family:
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
     contains: Callable[[Vector], bool] = lambda vector: True
-    rigid: int = 0  # dimension of the kernel: rigid motions of the undeformed shell that nothing holds
-    motions: Sequence[Vector] = ()  # those of them that the family contains, where they are not all of the kernel
+    rigid: int = (
+        0  # dimension of the kernel: rigid motions of the undeformed shell that nothing holds
+    )
+    motions: Sequence[
+        Vector
+    ] = ()  # those of them that the family contains, where they are not all of the kernel
 
 
 @dataclass
 class ShellModes:
-    """Modes of a model at any of its states. Overwrites the model's tangent, on which a path relies."""
+    """Modes of a model at any of its states.
+
+    Overwrites the model's tangent, on which a path relies.
+    """
 
     model: Model
     _products: dict[str, fem.Form] = field(default_factory=dict)
@@ -100,9 +115,9 @@ class ShellModes:
 
         Of a tangent that is not symmetric, those of its symmetric part.
 
-        Waves count once, though each has a twin turned by a quarter of its length. If the state is the undeformed one
-        of a `loose` shell, its rigid motions are among them, with an eigenvalue of exactly zero. Compiles a mass
-        matrix when it is first called, and the waves' kernels.
+        Waves count once, though each has a twin turned by a quarter of its length. If the state is
+        the undeformed one of a `loose` shell, its rigid motions are among them, with an eigenvalue
+        of exactly zero. Compiles a mass matrix when it is first called, and the waves' kernels.
 
         Raises
         ------
@@ -112,17 +127,20 @@ class ShellModes:
         return self._lowest(_families(self.model, rest=state if loose else None), state, count)
 
     def vibrations(self, state: State, count: int, *, loose: bool = False) -> list[ShellMode]:
-        """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are omega^2 rho R^2/E.
+        """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are
+        omega^2 rho R^2/E.
 
-        The mass is consistent, without rotary inertia, and that of the drawn shell. On the meridian vibrations around
-        the axis are among them. Otherwise as `lowest`.
+        The mass is consistent, without rotary inertia, and that of the drawn shell. On the meridian
+        vibrations around the axis are among them. Otherwise as `lowest`.
 
         Raises
         ------
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
-        lowest = self._lowest(_families(self.model, vibrating=True, rest=state if loose else None), state, count)
+        lowest = self._lowest(
+            _families(self.model, vibrating=True, rest=state if loose else None), state, count
+        )
         return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
 
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
@@ -133,12 +151,19 @@ class ShellModes:
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
             if family.contains is _turns:  # of a kernel with the motion along the axis
                 modes = modes[family.rigid :]
-            of_families += [ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions]
-            of_families += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
+            of_families += [
+                ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions
+            ]
+            of_families += [
+                ShellMode(family.label, m.eigenvalue, m.vector)
+                for m in modes
+                if family.contains(m.vector)
+            ]
         return sorted(of_families, key=lambda mode: mode.eigenvalue)
 
     def null_vector(self, state: State, label: str) -> Vector:
-        """The vector of the mode whose stiffness is nearest to zero: at a located instability the null vector.
+        """The vector of the mode whose stiffness is nearest to zero: at a located instability the
+        null vector.
 
         Parameters
         ----------
@@ -161,11 +186,14 @@ class ShellModes:
         return self._products[name]
 
 
-def _families(model: Model, *, vibrating: bool = False, rest: State | None = None) -> Iterator[_Family]:
-    """The modes that the model sees, then those that it excludes, whose kernels are compiled by then.
+def _families(
+    model: Model, *, vibrating: bool = False, rest: State | None = None
+) -> Iterator[_Family]:
+    """The modes that the model sees, then those that it excludes, whose kernels are compiled by
+    then.
 
-    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian. `rest` is the
-    undeformed state of a shell that is not held, whose rigid motions are counted.
+    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
+    `rest` is the undeformed state of a shell that is not held, whose rigid motions are counted.
     """
     of_mass = weight(model) if vibrating else None
     factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
@@ -173,7 +201,12 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
 
     def of(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
         return _Family(
-            label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection, rigid=rigid
+            label,
+            lambda state: system.tangent(state.u, state.mu),
+            system.clamped,
+            mass,
+            system.projection,
+            rigid=rigid,
         )
 
     if isinstance(model, MeridianModel):
@@ -195,7 +228,9 @@ def _families(model: Model, *, vibrating: bool = False, rest: State | None = Non
             )
         for m in range(1, waves.largest + 1):
             rigid = across if m == 1 else 0
-            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=rigid)
+            yield _Family(
+                f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=rigid
+            )
         return
 
     def free_of(system: FiniteElementSystem) -> int:

@@ -45,13 +45,15 @@ class Observed:
     system
         What the solvers see.
     multiplicity
-        Of how many such parts the shell is made: 2 for a half, 2 m for a sector of 180/m degrees, else 1.
+        Of how many such parts the shell is made: 2 for a half, 2 m for a sector of 180/m degrees,
+        else 1.
     u, r0
         Displacement and placement.
     normals
         n0 (3,) at the named points.
     loads, load_size, load_sizes
-        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, and its forms, see `DeadLoads`.
+        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, and its
+        forms, see `DeadLoads`.
     supports
         Name of an edge, point or patch -> what it holds.
     without_potential
@@ -59,7 +61,8 @@ class Observed:
     fields
         The applied field, where it is known by its values.
     observed
-        Column -> the form that a term observes, see `OwnTerm.observed`; and what a field induces. Of the modelled part.
+        Column -> the form that a term observes, see `OwnTerm.observed`; and what a field induces.
+        Of the modelled part.
     contacts
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
     touchings
@@ -71,7 +74,8 @@ class Observed:
     axes
         The components in space of displacement and placement.
     thickness
-        What multiplies that of a shell, (1,); None for 1, and for a solid, which has it in its shape.
+        What multiplies that of a shell, (1,); None for 1, and for a solid, which has it in its
+        shape.
     midsurface
         The mesh of a mid-surface; None for a meridian or a solid.
     """
@@ -120,14 +124,18 @@ class Observed:
         points: Mapping[str, Array],
         beside: Callable[[str], NDArray[np.bool_] | None] | None = None,
     ) -> None:
-        """Take the volume change's form (of the modelled part), and the named vertices' places (3,).
+        """Take the volume change's form (of the modelled part), and the named vertices' places
+        (3,).
 
         `beside` tells the cells of this rank that may have a vertex; None for all.
         """
         self._volume = volume
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
-        self._probes = {name: point_entries(V, x, np.ones(3), beside and beside(name))[0] for name, x in points.items()}
+        self._probes = {
+            name: point_entries(V, x, np.ones(3), beside and beside(name))[0]
+            for name, x in points.items()
+        }
 
     def load_with(self, name: str, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads of an amplitude, except the moments."""
@@ -135,7 +143,13 @@ class Observed:
         one, u = fem.Constant(self.V.mesh, 1.0), self.u
         forms = [
             FormTerm(
-                name, -ufl.dot(along, u) * on, u, self.kernels, name, linear=True, over=one * on if total else None
+                name,
+                -ufl.dot(along, u) * on,
+                u,
+                self.kernels,
+                name,
+                linear=True,
+                over=one * on if total else None,
             )
             for along, on, total in dead.spread
         ]
@@ -143,7 +157,10 @@ class Observed:
 
     def size_terms(self, name: str) -> list[FormTerm]:
         """What the size of the loads of an amplitude is, as terms that depend on the placement."""
-        return [FormTerm(f"{name} size", form, self.u, self.kernels) for form in self.load_sizes.get(name, ())]
+        return [
+            FormTerm(f"{name} size", form, self.u, self.kernels)
+            for form in self.load_sizes.get(name, ())
+        ]
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """A rigid motion that is left free, as a message; empty if there is none. Collective."""
@@ -157,7 +174,9 @@ class Observed:
         """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
         moving = self.system.moving
         lids = moving.pressed.swept(mu) if mu and moving and moving.pressed else 0.0
-        return self.multiplicity * (self.system.at(State(u, dict(mu or {}))).integral(self._volume) + lids)
+        return self.multiplicity * (
+            self.system.at(State(u, dict(mu or {}))).integral(self._volume) + lids
+        )
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""
@@ -169,7 +188,9 @@ class Observed:
         return np.asarray(self.system.comm.allreduce(share))
 
     def probe(self, point: str) -> Array:
-        """Rows (3, size) that take the displacement at a named vertex from a vector, each rank its part."""
+        """Rows (3, size) that take the displacement at a named vertex from a vector, each rank its
+        part.
+        """
         rows = np.zeros((3, self.system.size))
         dofs = np.asarray(self._probes[point]).reshape(-1, 3)
         rows[np.arange(3), dofs] = 1.0
@@ -180,7 +201,9 @@ class Observed:
         pressing, forms = self.contacts[approach]
         at = self.system.at(state)
         pressure, moment = (at.integral(forms[name]) for name in ("pressure", "radius"))
-        return at.of(lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0))
+        return at.of(
+            lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0)
+        )
 
     def cell_pressures(self, state: State) -> Array | None:
         """The pressure of all contacts in each local cell, see `Pressing`; None without contacts."""
@@ -190,7 +213,9 @@ class Observed:
 
         def present() -> Array:
             each = [pressing.cell_pressures() for pressing in pressings]
-            return np.asarray(sum((*each, *(touching.of_cells()[0] for touching in self.touchings))))
+            return np.asarray(
+                sum((*each, *(touching.of_cells()[0] for touching in self.touchings)))
+            )
 
         return self.system.at(state).of(present)
 
@@ -206,14 +231,19 @@ class Observed:
         return self.system.at(state).of(present)
 
     def cell_gaps(self, state: State) -> Array | None:
-        """The least gap over R in each local cell between parts of the shell, see `Touching`; None without pairs."""
+        """The least gap over R in each local cell between parts of the shell, see `Touching`; None
+        without pairs.
+        """
         if not self.touchings:
             return None
-        gaps = self.system.at(state).of(lambda: [touching.of_cells()[1] for touching in self.touchings])
+        gaps = self.system.at(state).of(
+            lambda: [touching.of_cells()[1] for touching in self.touchings]
+        )
         return np.asarray(np.min(gaps, axis=0))
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
-        """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.
+        """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along
+        themselves.
 
         Moments alone have none: that of the pole.
         """
@@ -244,9 +274,14 @@ class Thin(Observed):
 
     def own_and_contacts(self, edges: Mapping[str, Facets]) -> list[Energy]:
         """The energies of one's own terms and of bodies; sets what is observed of them."""
-        factory, own = self.factory, [(term, edges[term.on] if term.on else None) for term in self.loads.own]
+        factory, own = (
+            self.factory,
+            [(term, edges[term.on] if term.on else None) for term in self.loads.own],
+        )
         energies = [factory.own(term, facets) for term, facets in own if term.density]
-        self.observed = self.kernels.compile_all(factory.observed(term, facets) for term, facets in own)
+        self.observed = self.kernels.compile_all(
+            factory.observed(term, facets) for term, facets in own
+        )
         if self.loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}

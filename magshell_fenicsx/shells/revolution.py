@@ -16,13 +16,14 @@ ENDS = np.array([[0.0], [1.0]])  # of the reference cell
 
 
 class Revolution:
-    """The vertices of a meridian turned into `sectors` equal angles; at a pole all of them are one node.
+    """The vertices of a meridian turned into `sectors` equal angles; at a pole all of them are one
+    node.
 
     Parameters
     ----------
     kinks
-        Numbers of the cells along the meridian that share no circle of nodes with the one before, so that fields may
-        jump there.
+        Numbers of the cells along the meridian that share no circle of nodes with the one before,
+        so that fields may jump there.
 
     Attributes
     ----------
@@ -43,16 +44,24 @@ class Revolution:
         begin = np.arange(len(vertices)) + np.cumsum([0, *apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
-        self._at_ends[0, self.ends], self._at_ends[1, self.ends] = np.arange(len(vertices))[:, None], np.arange(2)
+        self._at_ends[0, self.ends], self._at_ends[1, self.ends] = (
+            np.arange(len(vertices))[:, None],
+            np.arange(2),
+        )
         poles = model.meridian.poles
         s = model.meridian.cells[tuple(self._at_ends)]
         self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
         theta = np.arange(sectors) * 2 * np.pi / sectors
         cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
-        basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # e_rho, e_theta, e_z
+        basis = np.array(
+            [[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]]
+        )  # e_rho, e_theta, e_z
         self._basis = np.moveaxis(basis, -1, 0)
         normals = nodal_normals(model.r0)
-        self.r0, self.n0 = self._turned(model.r0.x.array.reshape(-1, 2)), self._turned(normals[:, [0, 2]])
+        self.r0, self.n0 = (
+            self._turned(model.r0.x.array.reshape(-1, 2)),
+            self._turned(normals[:, [0, 2]]),
+        )
         self.cells = self._triangles(sectors)
 
     def displacement(self, u: Vector) -> Array:
@@ -60,7 +69,8 @@ class Revolution:
         return self._turned(u.reshape(-1, 2))
 
     def jets(self, f: fem.Function) -> Array:
-        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2, 3).
+        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2,
+        3).
 
         At the pole, where the surface has no second direction, a little off it.
         """
@@ -73,7 +83,9 @@ class Revolution:
         return _revolved(self._at(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
-        """The values of a field (1,) at the ends of all cells, or other reference points (q, 1): (cells, q)."""
+        """The values of a field (1,) at the ends of all cells, or other reference points (q, 1):
+        (cells, q).
+        """
         return self._at(f, points)[0, :, :, 0]
 
     def vertices(self, V: fem.FunctionSpace) -> NDArray[np.int64]:
@@ -88,11 +100,15 @@ class Revolution:
         return np.asarray(circles[kept])
 
     def _at(self, f: fem.Function, points: Array) -> Array:
-        """(3, cells, q, components) values, first and second derivatives at reference points (q, 1)."""
+        """(3, cells, q, components) values, first and second derivatives at reference points (q,
+        1).
+        """
         V = f.function_space
         cells, bs = V.dofmap.list, V.dofmap.bs
         table = V.element.basix_element.tabulate(2, points)[:, :, :, 0]
-        return np.asarray(np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[self.order]]))
+        return np.asarray(
+            np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[self.order]])
+        )
 
     def around(self, ends: Array, weight: Array) -> Array:
         """Values at the nodes, of those at the ends of all cells.
@@ -100,7 +116,8 @@ class Revolution:
         Parameters
         ----------
         ends
-            Scalars (cells, 2), vectors (cells, 2, 3) or tensors (cells, 2, 3, 3) along (e_rho, e_theta, e_z).
+            Scalars (cells, 2), vectors (cells, 2, 3) or tensors (cells, 2, 3, 3) along (e_rho,
+            e_theta, e_z).
         weight
             (cells, 2) of a cell's value in the mean over the two that meet.
         """
@@ -114,7 +131,9 @@ class Revolution:
         return self.at_nodes(circles)
 
     def _means(self, ends: Array, weight: Array) -> Array:
-        """The weighted mean of the cells that meet at each circle, of values (cells, 2, ...) at their ends."""
+        """The weighted mean of the cells that meet at each circle, of values (cells, 2, ...) at
+        their ends.
+        """
         weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
 
         def sums(values: Array) -> Array:
@@ -128,21 +147,29 @@ class Revolution:
         """(rho, z) components at the meridian's nodes -> vectors at the poles and on the circles."""
         along = nodal[self.vertices(self._model.V)]
         along = np.where(self._poles[:, None], along * [0.0, 1.0], along)[:, None]
-        return self.at_nodes(along[:, :, :1] * self._basis[:, 0] + along[:, :, 1:] * self._basis[:, 2])
+        return self.at_nodes(
+            along[:, :, :1] * self._basis[:, 0] + along[:, :, 1:] * self._basis[:, 2]
+        )
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
         """Two for each cell and sector; one beside a pole."""
         first = np.cumsum([0, *np.where(self._poles, 1, sectors)])
         sector = np.arange(sectors)
         ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
-        (a, c), (b, d) = (np.moveaxis(each[self.ends], 1, 0) for each in (ring, np.roll(ring, -1, axis=1)))
+        (a, c), (b, d) = (
+            np.moveaxis(each[self.ends], 1, 0) for each in (ring, np.roll(ring, -1, axis=1))
+        )
         begins, ends = (~self._poles[each] for each in self.ends.T)
         bands = [(ends, (a, c, d)), (begins, (a, d, b))]
-        return np.concatenate([np.stack(corners, axis=-1)[which].reshape(-1, 3) for which, corners in bands])
+        return np.concatenate(
+            [np.stack(corners, axis=-1)[which].reshape(-1, 3) for which, corners in bands]
+        )
 
 
 def _revolved(values: Array) -> Array:
-    """Jets (6, cells, q, 3) along (e_rho, e_theta, e_z) from derivatives (3, cells, q, 2) along the meridian."""
+    """Jets (6, cells, q, 3) along (e_rho, e_theta, e_z) from derivatives (3, cells, q, 2) along the
+    meridian.
+    """
     (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values, -1, 1)
     o = np.zeros_like(U)
     jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]

@@ -28,7 +28,13 @@ from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.gradients import PointTerm
-from magshell_fenicsx.models.shell.parameters import Condition, Force, Held, Material, default_penalty
+from magshell_fenicsx.models.shell.parameters import (
+    Condition,
+    Force,
+    Held,
+    Material,
+    default_penalty,
+)
 from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place, places
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
@@ -79,8 +85,8 @@ class ShellModel(Thin):
     degree
         Of displacement and placement, 2 to 5.
     conditions
-        Edge name -> condition; edges that are not named are free. A vertex can be held too, and a patch clamped or
-        held: then all of it.
+        Edge name -> condition; edges that are not named are free. A vertex can be held too, and a
+        patch clamped or held: then all of it.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
@@ -91,7 +97,8 @@ class ShellModel(Thin):
     Raises
     ------
     MeshError
-        On every rank, if the surface has no such edge, point or patch, or an edge lies in no plane of symmetry.
+        On every rank, if the surface has no such edge, point or patch, or an edge lies in no plane
+        of symmetry.
 
     Attributes
     ----------
@@ -106,7 +113,8 @@ class ShellModel(Thin):
     mirror
         Of a half model or a sector.
     turns
-        Whether what it is made of, and all that loads it, is axisymmetric; whoever makes the model may set it.
+        Whether what it is made of, and all that loads it, is axisymmetric; whoever makes the model
+        may set it.
     """
 
     thin: Literal[True] = True
@@ -134,7 +142,11 @@ class ShellModel(Thin):
                 loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
         self.midsurface, self.material, self.degree = midsurface, material, degree
         self.load_size, self.load_sizes = {}, {}
-        sides = {name: plane for name, plane in mirror.sides.items() if conditions.get(name) == "symmetry"}
+        sides = {
+            name: plane
+            for name, plane in mirror.sides.items()
+            if conditions.get(name) == "symmetry"
+        }
         self.multiplicity = mirror.copies if sides else 1
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
@@ -149,16 +161,23 @@ class ShellModel(Thin):
                 loads = replace(loads, **{name: replace(field, remanent=vectors)})
         of_place = partial(field_of_place, self.r0)
         loads = self.loads = replace(
-            loads, own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own)
+            loads,
+            own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own),
         )
         if thickness and thickness.given:
             thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        for name in [name for name, c in conditions.items() if c == "plane" and not midsurface.read]:
+        for name in [
+            name for name, c in conditions.items() if c == "plane" and not midsurface.read
+        ]:
             put_in_plane(self.r0, midsurface.edges[name])
-        shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
+        shapes = {
+            name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()
+        }
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
-        self.thickness = factor = thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
+        self.thickness = factor = (
+            thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
+        )
         self.made_of = None
         if material.shells:
             self.made_of = material_field(material.shells, midsurface.mesh, midsurface.patches)
@@ -166,7 +185,9 @@ class ShellModel(Thin):
         if loads.natural:
             cells = midsurface.mesh.topology.index_map(2)
             count = cells.size_local + cells.num_ghosts
-            grown = loads.natural.on(midsurface.patches, count, lambda given: carried(given, midsurface, in_cells))
+            grown = loads.natural.on(
+                midsurface.patches, count, lambda given: carried(given, midsurface, in_cells)
+            )
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
         folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD
@@ -178,16 +199,26 @@ class ShellModel(Thin):
             carrier, self.u, *of_shell, pressed=pressed, creases=creases, made_of=self.made_of
         )
         interior = factory.term(factory.interior_edges())
-        terms: list[Term] = [factory.term(factory.membrane()), factory.term(factory.bending()), interior]
+        terms: list[Term] = [
+            factory.term(factory.membrane()),
+            factory.term(factory.bending()),
+            interior,
+        ]
         held: list[Constraint] = []
         mirrored: list[Constraint] = []
         planes: list[Mirror] = []
 
         def facets(condition: Condition) -> NDArray[np.int32]:
             held_unknowns = [
-                midsurface.edges[name] for name, c in conditions.items() if c == condition and name in midsurface.edges
+                midsurface.edges[name]
+                for name, c in conditions.items()
+                if c == condition and name in midsurface.edges
             ]
-            return np.unique(np.concatenate(held_unknowns)).astype(np.int32) if held_unknowns else np.empty(0, np.int32)
+            return (
+                np.unique(np.concatenate(held_unknowns)).astype(np.int32)
+                if held_unknowns
+                else np.empty(0, np.int32)
+            )
 
         for name, side in sides.items():
             planes.append(side)
@@ -196,7 +227,9 @@ class ShellModel(Thin):
             self._mirror_term = factory.term(factory.mirror_edges(where, side.normal, edge))
             terms.append(self._mirror_term)
             mirrored.append(held_along(V, 1, where, side.normal))
-        clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
+        clamped = [
+            name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges
+        ]
         self.supports: dict[str, Support] = {}
         on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
@@ -205,12 +238,18 @@ class ShellModel(Thin):
                 continue
             if condition == "plane":
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
-                plies = (each for of, each in material.every_laminate.items() if not of or name.startswith(f"{of}_"))
+                plies = (
+                    each
+                    for of, each in material.every_laminate.items()
+                    if not of or name.startswith(f"{of}_")
+                )
                 if not all(laminate.mirrored(plane) for laminate in plies):
                     raise MeshError(
                         f"boundary: {name}: its plane does not mirror the plies, which are neither along nor across it"
                     )
-                mirrored_edges = factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges")
+                mirrored_edges = factory.mirror_edges(
+                    midsurface.edges[name], plane.normal, f"{name} mirror edges"
+                )
                 terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
                 on_edge = held_on(V, 1, midsurface.edges[name], components)
@@ -222,7 +261,9 @@ class ShellModel(Thin):
                     f"{name} clamped edges" if len(clamped) > 1 else "clamped edges",
                     rotation_of(loads, name, V),
                 )
-                terms.append(factory.term(factory.clamped_edges(edge, midsurface.edges[name], turn)))
+                terms.append(
+                    factory.term(factory.clamped_edges(edge, midsurface.edges[name], turn))
+                )
             if name in midsurface.edges:
                 conditions_of_part = held_on(V, 1, midsurface.edges[name], components)
             elif name in midsurface.patches:
@@ -230,7 +271,9 @@ class ShellModel(Thin):
                     V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components
                 )
             else:
-                conditions_of_part = held_at_vertex(V, midsurface.points[name], components, midsurface.beside(name))
+                conditions_of_part = held_at_vertex(
+                    V, midsurface.points[name], components, midsurface.beside(name)
+                )
             held += conditions_of_part
             kind: SupportKind = "point" if name in midsurface.points else "part"
             self.supports[name] = Support.of(conditions_of_part, edge, turn, kind=kind)
@@ -241,25 +284,35 @@ class ShellModel(Thin):
         free_edges, self.without_potential = openings(self.r0, open_at, conditions)
         closed = enclosed(loads, free_edges, self.without_potential)
         swept = loads.pressure or closed
-        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3) if closing is None else closing)
+        volume = (
+            factory.swept_volume()
+            if swept
+            else factory.volume_change(np.zeros(3) if closing is None else closing)
+        )
         if loads.magnetic:
             terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
         if loads.interaction:
-            from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm  # few shells have one
+            from magshell_fenicsx.parts.magnetism.interacting import (
+                InteractionTerm,
+            )  # few shells have one
 
             terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {
-            name: vertex_normal(self.r0, x, midsurface.beside(name)) for name, x in midsurface.points.items()
+            name: vertex_normal(self.r0, x, midsurface.beside(name))
+            for name, x in midsurface.points.items()
         }
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
         for name, dead in loads.dead.items():
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
-            terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
+            terms += [
+                factory.term(energy)
+                for energy in factory.dead_energies(name, dead, midsurface.edges)
+            ]
         meeting: Sequence[Touching] = ()
         if loads.pairs:
             from magshell_fenicsx.parts.touching.building import touchings
@@ -267,7 +320,9 @@ class ShellModel(Thin):
             of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
             thick = carrier.contact_rule, factor, factory.law_of_cells.thins
             surfaces = self.r0, self.u, midsurface.patches
-            meeting = touchings(loads.pairs, *surfaces, material.h, *thick, *of_images, shape, self.planes)
+            meeting = touchings(
+                loads.pairs, *surfaces, material.h, *thick, *of_images, shape, self.planes
+            )
             terms += meeting
         self.touchings = meeting
         if loads.joints or midsurface.feet:
@@ -288,7 +343,10 @@ class ShellModel(Thin):
         self.moving = moving(self.r0, self.supports, loads, at_edges)
         near = None
         if self.moving:
-            near = self.moving.cells, make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
+            near = (
+                self.moving.cells,
+                make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells),
+            )
         fast = FastTangent(self.u, self._sites, held + mirrored, near)
         dense = [term for term in terms if isinstance(term, ShellTerm)]
 
@@ -298,7 +356,9 @@ class ShellModel(Thin):
         gradients = serve(dense)
         gradients.begin(energies=True)
         for term in dense:
-            if not (self.growing and term.amplitude == "pressure"):  # whose form measures from the drawn placement
+            if not (
+                self.growing and term.amplitude == "pressure"
+            ):  # whose form measures from the drawn placement
                 term.points = gradients
         parameters: dict[str, Parameter] = {
             **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
@@ -313,23 +373,39 @@ class ShellModel(Thin):
         for each in meeting:
             stiffnesses |= each.history
         self.system = FiniteElementSystem(
-            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses
+            self.u,
+            terms,
+            held + mirrored,
+            interior,
+            material.h,
+            fast,
+            gradients,
+            parameters,
+            self.moving,
+            stiffnesses,
         )
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
-        self.observe(self.kernels.compile("volume energy", volume), midsurface.points, midsurface.beside)
+        self.observe(
+            self.kernels.compile("volume energy", volume), midsurface.points, midsurface.beside
+        )
         if loads.interaction:
             interacting.refuse_near()  # now that all is there which it reads
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | UnfoldedModes | None:
-        """The modes that a half model or a sector does not see; None for a whole one. Compiles kernels."""
+        """The modes that a half model or a sector does not see; None for a whole one.
+
+        Compiles kernels.
+        """
         if self.multiplicity == 1:
             return None
         if isinstance(self.mirror, Sector):
             return UnfoldedModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
-        held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
+        held = self._held + [
+            held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane
+        ]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
@@ -366,7 +442,9 @@ class ShellModel(Thin):
         return self.midsurface.growth(self.V, deviations)
 
     def at_nodes(self, of: Embedding) -> NDArray[np.float64]:
-        """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes, ...)."""
+        """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes,
+        ...).
+        """
         return self.midsurface.at(self.V.element.basix_element.points, of)
 
     def chart(self) -> NDArray[np.float64]:
@@ -380,14 +458,18 @@ class ShellModel(Thin):
     def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
         nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
         coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
-        np.minimum.at(coordinates, nodes, cells)  # the first of the two positions of a node on a seam
+        np.minimum.at(
+            coordinates, nodes, cells
+        )  # the first of the two positions of a node on a seam
         return coordinates[: index_map.size_local]
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
         beside = self.midsurface.beside(force.point)
         if force.patch:
-            entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels, beside)
+            entries = patch_entries(
+                self.r0, x, force.patch, inward, self.degree, self.kernels, beside
+            )
         else:
             entries = point_entries(self.V, x, inward, beside)
         return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)

@@ -1,7 +1,8 @@
-"""The body of a shell as a three-dimensional solid: a system of terms, with the interface of `ShellModel`.
+"""The body of a shell as a three-dimensional solid: a system of terms, with the interface of
+`ShellModel`.
 
-Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements are those of nodes in the middle
-of the thickness; the pressure, the volume and the loaded patch are of the outer face.
+Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements are those of nodes
+in the middle of the thickness; the pressure, the volume and the loaded patch are of the outer face.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -59,7 +60,8 @@ class SolidModel(Observed):
     Parameters
     ----------
     conditions
-        As of `ShellModel`: a whole face is clamped or in a mirror plane, else its middle line is held.
+        As of `ShellModel`: a whole face is clamped or in a mirror plane, else its middle line is
+        held.
     loads
         A force has a patch, on the outer face; the magnetic energy is the full one.
     mirror
@@ -68,7 +70,8 @@ class SolidModel(Observed):
     Raises
     ------
     MeshError
-        On every rank, if an edge lies in no plane of symmetry, or if a patch is not there or unknown to the mesh.
+        On every rank, if an edge lies in no plane of symmetry, or if a patch is not there or
+        unknown to the mesh.
 
     Attributes
     ----------
@@ -95,7 +98,9 @@ class SolidModel(Observed):
         loads: Loads,
         mirror: Mirror = Y0,
     ) -> None:
-        magnetic, remanence = (field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence))
+        magnetic, remanence = (
+            field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence)
+        )
         loads = replace(loads, magnetic=magnetic, remanence=remanence)
         self.body, self.material, self.law = body, material, law
         self.normals = body.normals
@@ -106,16 +111,33 @@ class SolidModel(Observed):
         self.r0.interpolate(lambda x: x)
 
         def of_place(parameter: ByPlace) -> fem.Function:
-            return field_in_body(Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1)
+            return field_in_body(
+                Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1
+            )
 
-        loads = self.loads = replace(loads, own=tuple(term.with_functions(of_place) for term in loads.own))
-        hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
+        loads = self.loads = replace(
+            loads, own=tuple(term.with_functions(of_place) for term in loads.own)
+        )
+        hinged = tuple(
+            n
+            for n, c in conditions.items()
+            if n in body.faces and c not in ("free", "clamped", *MIRRORS)
+        )
         free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
         if loads.natural:
             shape = body_shape(loads.natural, body, V, free)
             growing["grown"] = lambda density: grown_in_body(density, shape)
         self.factory = factory = TermFactory(
-            body, self.u, law, material.h, self.kernels, hinged, free=free, fields=[], saturated=[], **growing
+            body,
+            self.u,
+            law,
+            material.h,
+            self.kernels,
+            hinged,
+            free=free,
+            fields=[],
+            saturated=[],
+            **growing,
         )
         self._pattern, *areal = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
@@ -167,10 +189,14 @@ class SolidModel(Observed):
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
-        """The modes that a half model does not see: moved freely across the mirror plane and not in it."""
+        """The modes that a half model does not see: moved freely across the mirror plane and not in
+        it.
+        """
         if self.multiplicity == 1:
             return None
-        return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
+        return AntisymmetricModes(
+            self._system(self._held + self._held_on_mirror(self.mirror.in_plane))
+        )
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """The integral over the undeformed volume of what is modelled."""
@@ -181,12 +207,16 @@ class SolidModel(Observed):
         return cells_of_body(self.V)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
-        """The nodes of every cell, whatever is asked for, and the normals of the surface at their height."""
+        """The nodes of every cell, whatever is asked for, and the normals of the surface at their
+        height.
+        """
         return places_in_body(self.V)
 
     def chart(self) -> Array:
         """Coordinates (n, 3) of this rank's nodes: the chart's and the height in the thickness."""
-        coordinates = self.body.at_nodes(self.V, np.column_stack([self.body.chart, self.body.heights]))
+        coordinates = self.body.at_nodes(
+            self.V, np.column_stack([self.body.chart, self.body.heights])
+        )
         return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
     def _rim(self, facets: NDArray[np.int32], height: float) -> Curve:
@@ -202,18 +232,32 @@ class SolidModel(Observed):
         return np.asarray(np.concatenate([np.empty(0, dtype=np.int32), *self._faces]))
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
-        return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]
+        return [
+            held_along(self.V, 2, facets, along) for facets in self._faces for along in directions
+        ]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
         near, factory, moving = None, self.factory, self._moving
         if moving:
-            near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
+            near = (
+                moving.cells,
+                make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells),
+            )
         fast = FastTangent(self.u, self._sites, held, near)
-        parameters: dict[str, Parameter] = {**make_parameters(factory.free, self._terms, self.u, self.kernels)}
+        parameters: dict[str, Parameter] = {
+            **make_parameters(factory.free, self._terms, self.u, self.kernels)
+        }
         parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
         self.fields = factory.fields
         return FiniteElementSystem(
-            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters, moving=moving
+            self.u,
+            self._terms,
+            held,
+            self._pattern,
+            self.material.h,
+            fast,
+            parameters=parameters,
+            moving=moving,
         )
 
 
@@ -226,11 +270,17 @@ def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
         If the body has no such patch.
     """
     own = field.on(body.patches, len(body.between))
-    return replace(own, remanent=_layered(field.layers, body)) if field.layers and not field.patches else own
+    return (
+        replace(own, remanent=_layered(field.layers, body))
+        if field.layers and not field.patches
+        else own
+    )
 
 
 def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:
-    """Layers from the inner face outwards: fractions of the thickness, which end where cells do, and vectors."""
+    """Layers from the inner face outwards: fractions of the thickness, which end where cells do,
+    and vectors.
+    """
     ends = np.cumsum([fraction for fraction, _ in layers])
     middle = body.between.mean(axis=1)
     return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])

@@ -1,7 +1,7 @@
 """Where the solid's terms live: the Hessians of their densities at points, contracted in batches.
 
-As on the shell (see `models.shell.sites`), with the jets in reference coordinates: the tables of the shape
-functions are the same for all cells.
+As on the shell (see `models.shell.sites`), with the jets in reference coordinates: the tables of
+the shape functions are the same for all cells.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,8 +26,9 @@ from magshell_fenicsx.shells.solid_terms import SolidTerm
 
 Array = NDArray[np.float64]
 PARTS = 4  # value and three reference derivatives
-# where the numbers that a density wants at a point begin: in the body those of X, of the inverse of dX/dxi, and its
-# determinant; at ends the area in its place, then n and t; on the outer face there is X's jet alone
+# where the numbers that a density wants at a point begin: in the body those of X, of the inverse of
+# dX/dxi, and its determinant; at ends the area in its place, then n and t; on the outer face there
+# is X's jet alone
 INVERSE, MEASURE, NORMAL, TANGENT = 3, 12, 13, 16
 SIZES = {"body": 13, "outer": 12, "end": 19}
 
@@ -65,7 +66,9 @@ class Site:
         self._batches = [Batch((part,), rule, np.empty((len(part), 0))) for part in parts]
         self._points = Points(max([1, *(batch.size for batch in self._batches)]))
         where = terms[0].density.where
-        self._geometry = [_geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches]
+        self._geometry = [
+            _geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches
+        ]
         self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * PARTS)
         self._hessians = {}
         self._pairs: dict[str, Pairs] = {}
@@ -75,12 +78,20 @@ class Site:
             z = self._points.field(3 * PARTS) if term.density.work else self._u
             W = self._density(term, z)
             self._pairs[term.name] = pairs
-            self._hessians[term.name] = point_hessian(term.name, W, z, PARTS, pairs, log, at_zero=z is not self._u)
+            self._hessians[term.name] = point_hessian(
+                term.name, W, z, PARTS, pairs, log, at_zero=z is not self._u
+            )
         wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.same})
         self._coupled = Pairs(tuple(wanted))
         self._contraction = Contraction(rule, self._coupled)
 
-    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+    def add(
+        self,
+        u: Array,
+        factors: Mapping[str, float],
+        same: Array,
+        couple: Callable[[int, Array], None],
+    ) -> None:
         """Add the terms' element matrices to `same`; see `models.shell.sites.Site.add`."""
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
@@ -93,7 +104,11 @@ class Site:
             for name in names:
                 for target, values in self._varying[name]:
                     fill(target, values.latest[number])
-                blocks.add(self._points.evaluate(self._hessians[name], batch.size), factors[name], self._pairs[name])
+                blocks.add(
+                    self._points.evaluate(self._hessians[name], batch.size),
+                    factors[name],
+                    self._pairs[name],
+                )
             same[batch.cells[0]] += self._contraction.same(blocks, 0)
 
     def _jets(self, batch: Batch, field: Array) -> Array:
@@ -101,11 +116,15 @@ class Site:
         return batch.rule.tables[0].jets(field.reshape(-1, 3)[self._dofs[batch.cells[0]]])
 
     def _density(self, term: SolidTerm, v: fem.Function) -> Any:
-        """A function of u, or of u and v with the Hessian in v that its virtual work has in symmetric part."""
+        """A function of u, or of u and v with the Hessian in v that its virtual work has in
+        symmetric part.
+        """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
         of = density.work or density.of
-        self._varying[term.name] = [(target, on_batches(field, self._batches)) for target, field in varying]
+        self._varying[term.name] = [
+            (target, on_batches(field, self._batches)) for target, field in varying
+        ]
 
         def vector(f: fem.Function, start: int) -> Any:
             return ufl.as_vector([f[start + c] for c in range(3)])
@@ -115,8 +134,12 @@ class Site:
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
         if density.where == "outer":
-            return second(of(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters))
-        by_reference = ufl.as_matrix([[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)])
+            return second(
+                of(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
+            )
+        by_reference = ufl.as_matrix(
+            [[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)]
+        )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
         frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.where == "end" else []
         W = of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters)
@@ -124,9 +147,15 @@ class Site:
 
 
 def make_sites(
-    body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLog, chosen: NDArray[np.bool_] | None = None
+    body: Body,
+    X: fem.Function,
+    terms: Sequence[Term],
+    log: KernelLog,
+    chosen: NDArray[np.bool_] | None = None,
 ) -> list[Site]:
-    """The sites of the terms that have a tangent, one for each quadrature, on all or some local cells. Collective."""
+    """The sites of the terms that have a tangent, one for each quadrature, on all or some local
+    cells. Collective.
+    """
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     sites = []
@@ -134,7 +163,9 @@ def make_sites(
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
         counted = cells if chosen is None else cells[chosen[cells]]
-        of_degree = [t for t in nonlinear if t.density.where == "body" and t.density.degree == degree]
+        of_degree = [
+            t for t in nonlinear if t.density.where == "body" and t.density.degree == degree
+        ]
         sites.append(Site(X, counted, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
         if term.density.where == "body":
@@ -150,12 +181,16 @@ def make_sites(
 
 
 def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> Rule:
-    table = Table(np.ascontiguousarray(V.element.basix_element.tabulate(1, points)[..., 0].transpose(1, 0, 2)))
+    table = Table(
+        np.ascontiguousarray(V.element.basix_element.tabulate(1, points)[..., 0].transpose(1, 0, 2))
+    )
     return Rule((points,), (table,), weights)
 
 
 def _on_facet(points: Array, facet: int) -> Array:
-    corners = basix.geometry(basix.CellType.hexahedron)[basix.topology(basix.CellType.hexahedron)[2][facet]]
+    corners = basix.geometry(basix.CellType.hexahedron)[
+        basix.topology(basix.CellType.hexahedron)[2][facet]
+    ]
     return np.asarray(corners[0] + points @ (corners[1:3] - corners[0]))
 
 
@@ -164,7 +199,9 @@ def _cells_at(body: Body, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32],
     topology = body.mesh.topology
     links = topology.connectivity(2, 3)
     cells = links.array[links.offsets[facets]]
-    numbers = np.argmax(topology.connectivity(3, 2).array.reshape(-1, 6)[cells] == facets[:, None], axis=1)
+    numbers = np.argmax(
+        topology.connectivity(3, 2).array.reshape(-1, 6)[cells] == facets[:, None], axis=1
+    )
     owned = cells < topology.index_map(3).size_local
     return np.asarray(cells[owned], dtype=np.int32), numbers[owned]
 
@@ -181,4 +218,6 @@ def _geometry(jets: Array, where: str, facet: int | None) -> Array:
     outward = basix.cell.facet_outward_normals(basix.CellType.hexahedron)[facet] @ inverse
     n, t = flat[:, 3], np.cross(flat[:, 3], outward)
     unit = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
-    return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), size * np.linalg.norm(outward, axis=1), *unit])
+    return np.column_stack(
+        [flat[:, 0], inverse.reshape(-1, 9), size * np.linalg.norm(outward, axis=1), *unit]
+    )

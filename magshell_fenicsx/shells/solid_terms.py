@@ -28,7 +28,11 @@ from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
 
 REDUCED = 3  # quadrature degree: two points in each direction
-VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
+VALUE, GRADIENT, ON_FACE = (
+    (0,),
+    (1, 2, 3),
+    (0, 1, 2),
+)  # parts of a displacement's jet: value, reference derivatives
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 ROUNDING = 1e-9
@@ -41,9 +45,9 @@ class Density:
     Attributes
     ----------
     of
-        In the body of (X, u, H, *parameters) per volume, see `densities`; on its outer face of
-        (X, X1, X2, u, u1, u2, *parameters) per area of the reference cell; on ends, the faces above edges, of
-        (X, u, H, n, t, *parameters) per area.
+        In the body of (X, u, H, *parameters) per volume, see `densities`; on its outer face of (X,
+        X1, X2, u, u1, u2, *parameters) per area of the reference cell; on ends, the faces above
+        edges, of (X, u, H, n, t, *parameters) per area.
     parameters
         Numbers, or fields of vectors.
     parts
@@ -71,7 +75,9 @@ class Density:
     def rule(self) -> tuple[Array, Array]:
         """Points on the reference facet, and their weights."""
         points, weights = basix.make_quadrature(basix.CellType.quadrilateral, self.degree)
-        return ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
+        return (
+            ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
+        )
 
 
 class SolidTerm(DensityTerm[Density]):
@@ -95,26 +101,39 @@ class TermFactory:
     grown: Callable[[Density], Density] = lambda density: density  # takes the body's natural shape
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
-    saturated: list[PointField] = field(default_factory=list)  # of a soft material, when it was made
+    saturated: list[PointField] = field(
+        default_factory=list
+    )  # of a soft material, when it was made
 
     def distortions(self) -> list[SolidTerm]:
         """What does not depend on a change of volume; of a neo-Hookean body one term."""
         shear, share = self.material.shear, self.material.share
-        of = {"distortion": (densities.distortion, 1 - share), "areal distortion": (densities.areal_distortion, share)}
+        of = {
+            "distortion": (densities.distortion, 1 - share),
+            "areal distortion": (densities.areal_distortion, share),
+        }
         return [
-            self._bulk(name, self.grown(Density(density, self._constants(part * shear, self.h))), group="distortion")
+            self._bulk(
+                name,
+                self.grown(Density(density, self._constants(part * shear, self.h))),
+                group="distortion",
+            )
             for name, (density, part) in of.items()
             if part or name == "distortion"
         ]
 
     def compression(self) -> SolidTerm:
-        """With two quadrature points in each direction: more constraints on J than that would lock the element.
+        """With two quadrature points in each direction: more constraints on J than that would lock
+        the element.
 
-        The same as a discontinuous trilinear pressure, eliminated (Malkus and Hughes, Comput. Methods Appl.
-        Mech. Eng. 15, 1978), so the tangent is that of displacements alone and its inertia tells stability.
+        The same as a discontinuous trilinear pressure, eliminated (Malkus and Hughes, Comput.
+        Methods Appl. Mech. Eng. 15, 1978), so the tangent is that of displacements alone and its
+        inertia tells stability.
         """
         parameters = self._constants(self.material.bulk, self.h)
-        return self._bulk("compression", self.grown(Density(densities.compression, parameters, degree=REDUCED)))
+        return self._bulk(
+            "compression", self.grown(Density(densities.compression, parameters, degree=REDUCED))
+        )
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m; and what is soft."""
@@ -126,7 +145,10 @@ class TermFactory:
             self.fields.append(applied)
         if of.soft is None:
             return self.remanent(of, applied)
-        return [*([] if of.soft.alone else self.remanent(of, applied)), self.soft(of, of.soft, applied)]
+        return [
+            *([] if of.soft.alone else self.remanent(of, applied)),
+            self.soft(of, of.soft, applied),
+        ]
 
     def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
@@ -136,7 +158,9 @@ class TermFactory:
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """The integrals of the polarisation over the undeformed volume of what is modelled, and that volume."""
+        """The integrals of the polarisation over the undeformed volume of what is modelled, and
+        that volume.
+        """
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
@@ -146,8 +170,12 @@ class TermFactory:
             densities[axis] = Density(sheet.induced_in_body, (law, *self._constants(e), n0, *given))
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
-    def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> "list[fem.Constant | fem.Function]":
-        """The susceptibility, or what is known of what saturates; normals of layers, amplitudes, parts of the field."""
+    def _of_sheet(
+        self, sheet: Sheet, soft: Soft, applied: AppliedField | None
+    ) -> "list[fem.Constant | fem.Function]":
+        """The susceptibility, or what is known of what saturates; normals of layers, amplitudes,
+        parts of the field.
+        """
         chi, V = soft.susceptibility, self.u.function_space
         law = (
             field_in_body(chi, V, name="susceptibility", key="magnetic.susceptibility", size=1)
@@ -155,7 +183,9 @@ class TermFactory:
             else self._constants(chi)[0]
         )
         n0 = field_in_body(radial, V, name="n0")
-        amplitudes = [self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes]
+        amplitudes = [
+            self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes
+        ]
         polynomials = [applied.polynomial] if applied else []
         if soft.saturation is not None:
             if not self.saturated:  # energy and observed forms share it
@@ -179,10 +209,15 @@ class TermFactory:
         before = at_quadrature(n0, known.points)
 
         def placed() -> list[Array]:
-            x0, u = (np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list]) for f in followed)
+            x0, u = (
+                np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list])
+                for f in followed
+            )
             G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (x0, u))
             F = np.eye(3) + H @ np.linalg.inv(G)
-            n = np.linalg.solve(np.swapaxes(F, -1, -2), before[..., None])[..., 0]  # cof F n0, but for its length
+            n = np.linalg.solve(np.swapaxes(F, -1, -2), before[..., None])[
+                ..., 0
+            ]  # cof F n0, but for its length
             return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), before]
 
         return sheet.saturated(chi, amplitudes, applied, known, followed, placed)
@@ -190,26 +225,46 @@ class TermFactory:
     def remanent(self, of: Magnetisation, field: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
         pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
-        Br = field_in_body(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        Br = (
+            field_in_body(pattern, self.u.function_space)
+            if callable(pattern)
+            else self._constants(pattern)[0]
+        )
         if field:
-            density = Density(law.magnetic_in_space, (Br, field.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
+            density = Density(
+                law.magnetic_in_space,
+                (Br, field.polynomial, *self._constants(self.h)),
+                VALUE + GRADIENT,
+            )
             return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", of.applied)]
-        directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
+        directions += [
+            (name, name.replace("lambda_", " "), Ba)
+            for name, Ba in zip(ACROSS, of.across, strict=False)
+        ]
         terms = []
         for amplitude, suffix, Ba in directions:
             density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
             of_field = self._bulk(
-                "magnetic" + suffix, density, amplitude, linear=law is densities, group="magnetic", column="magnetic"
+                "magnetic" + suffix,
+                density,
+                amplitude,
+                linear=law is densities,
+                group="magnetic",
+                column="magnetic",
             )
             terms.append(of_field)
         if of.gradient is not None:
-            density = Density(law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT)
+            density = Density(
+                law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT
+            )
             terms.append(self._bulk("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
 
     def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends."""
+        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of
+        hinged ends.
+        """
         v = None if potential else ufl.TestFunction(self.u.function_space)
         return [
             SolidTerm(
@@ -221,24 +276,38 @@ class TermFactory:
                 "pressure",
                 work=None if v is None else self._on_faces([density], v),
             )
-            for name, density in self._enclosing(classical / self.h, None, potential=potential).items()
+            for name, density in self._enclosing(
+                classical / self.h, None, potential=potential
+            ).items()
         ]
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
-        """The energy of a part or one's own on the outer face or of the body, with its own amplitude or another."""
+        """The energy of a part or one's own on the outer face or of the body, with its own
+        amplitude or another.
+        """
         assert term.density
         if term.of_volume:
-            return self._bulk(term.name, self._inside(term, term.density), amplitude or term.name, linear=term.linear)
+            return self._bulk(
+                term.name,
+                self._inside(term, term.density),
+                amplitude or term.name,
+                linear=term.linear,
+            )
         density = self._surface(term, term.density)
         energy = self._on_faces([density])
-        return SolidTerm(term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear)
+        return SolidTerm(
+            term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear
+        )
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face, or of the body."""
         if term.of_volume:
             inside = {column: self._inside(term, of) for column, of in term.observed.items()}
             return {column: self._over_body(density) for column, density in inside.items()}
-        return {column: self._on_faces([self._surface(term, of)]) for column, of in term.observed.items()}
+        return {
+            column: self._on_faces([self._surface(term, of)])
+            for column, of in term.observed.items()
+        }
 
     def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
         """A density of the volume, which depends on places alone."""
@@ -251,7 +320,9 @@ class TermFactory:
         return Density(at, (*constants, *self._constants(self.h)), VALUE)
 
     def _over_body(self, density: Density) -> ufl.Form:
-        dx = ufl.Measure("dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree})
+        dx = ufl.Measure(
+            "dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree}
+        )
         X, H = ufl.SpatialCoordinate(self.body.mesh), ufl.grad(self.u)
         return density.of(X, self.u, H, *density.parameters) * dx
 
@@ -259,14 +330,20 @@ class TermFactory:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
         flat = [ufl.zero(3)] * len(SECOND)
 
-        def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
-            return per_area(term.at_point(of))(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
+        def on_face(
+            X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr
+        ) -> Expr:
+            return per_area(term.at_point(of))(
+                Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters
+            )
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
-        """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points move straight."""
+        """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points
+        move straight.
+        """
         return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
@@ -278,27 +355,55 @@ class TermFactory:
         parameters = (weight, *self._constants(intensity), past)
         density = Density(densities.turning, parameters, where="end", facets=self.body.faces[edge])
         term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
-        length = self.log.compile("end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1))
-        term.count_from(past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length)))
+        length = self.log.compile(
+            "end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1)
+        )
+        term.count_from(
+            past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
+        )
         return term
 
-    def _enclosing(self, unit: float, origin: Array | None, *, potential: bool = True) -> dict[str, Density]:
-        """p times the change of the volume under the outer face, down to the middle line where an end is hinged."""
+    def _enclosing(
+        self, unit: float, origin: Array | None, *, potential: bool = True
+    ) -> dict[str, Density]:
+        """p times the change of the volume under the outer face, down to the middle line where an
+        end is hinged.
+        """
         moved, faces = origin is None, self.body.faces
-        parameters = self._constants(unit, *([origin] if origin is not None and origin.any() else []))
-        of, on_end = (densities.swept, densities.swept_end) if moved else (densities.pressure, densities.sealing)
-        work, end_work = (None, None) if potential else (densities.following, densities.following_end)
-        of_faces = {"pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)}
+        parameters = self._constants(
+            unit, *([origin] if origin is not None and origin.any() else [])
+        )
+        of, on_end = (
+            (densities.swept, densities.swept_end)
+            if moved
+            else (densities.pressure, densities.sealing)
+        )
+        work, end_work = (
+            (None, None) if potential else (densities.following, densities.following_end)
+        )
+        of_faces = {
+            "pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)
+        }
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
             links = self.body.mesh.topology.connectivity(2, 3)
             low, high = self.body.between[links.array[links.offsets[facets]]].T
-            parts = {"whole": low > MIDDLE - ROUNDING, "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING)}
+            parts = {
+                "whole": low > MIDDLE - ROUNDING,
+                "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING),
+            }
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
                     facets_of_part, upper = facets[inside], name == "upper"
                     of_faces[f"pressure {name}"] = Density(
-                        on_end, parameters, VALUE + GRADIENT, WHOLE, "end", facets_of_part, upper, end_work
+                        on_end,
+                        parameters,
+                        VALUE + GRADIENT,
+                        WHOLE,
+                        "end",
+                        facets_of_part,
+                        upper,
+                        end_work,
                     )
         return of_faces
 

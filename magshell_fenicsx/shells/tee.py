@@ -1,9 +1,10 @@
 """T-junctions: an edge of one shell that stands on another one, and moves and turns with it.
 
-Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied to the places of
-the other mid-surface at which they are undeformed. So the edge follows the other shell, whose own displacements stay
-free: cells need not meet. Both ties are springs, `TIGHT` times as stiff as an element beside them. With n of the edge's
-cell and m of the other shell, t along the edge, s = t . (n x m) and c = n . m:
+Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied
+to the places of the other mid-surface at which they are undeformed. So the edge follows the other
+shell, whose own displacements stay free: cells need not meet. Both ties are springs, `TIGHT` times
+as stiff as an element beside them. With n of the edge's cell and m of the other shell, t along the
+edge, s = t . (n x m) and c = n . m:
 
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
 """
@@ -24,7 +25,13 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
 from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values, whole_hessian
+from magshell_fenicsx.assembly.point_kernels import (
+    PointKernel,
+    Points,
+    point_gradient,
+    point_values,
+    whole_hessian,
+)
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
@@ -41,16 +48,21 @@ Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 TIGHT = 1e4  # stiffness of a tie over that of an element
 NEAR = 2e-9  # of a parameter: rounding
-APART = 0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
+APART = (
+    0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
+)
 SIDES = np.array([[1, 2], [0, 2], [0, 1]])
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 AROUND = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
 PARTS = 12  # of both tangents of both shells at a point
-AROUND_E3 = np.array([[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]])  # (U, W) -> vector and its derivative
+AROUND_E3 = np.array(
+    [[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]]
+)  # (U, W) -> vector and its derivative
 
 
 class Tie:
-    """Points of an edge tied to places of another shell: an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+    """Points of an edge tied to places of another shell: an `assembly.terms.Term` and
+    `assembly.coupled.Coupled`.
 
     Parameters
     ----------
@@ -84,7 +96,12 @@ class Tie:
         index = V.dofmap.index_map
         self._own = self._size * index.local_range[0], self._size * index.size_local
         self.name = self.group = f"joint of {' and '.join(joint.edges)}"
-        self._unknowns, self._gaps, self._tangents, self._tie = unknowns, gap, tangents, stiffness[:, 0]
+        self._unknowns, self._gaps, self._tangents, self._tie = (
+            unknowns,
+            gap,
+            tangents,
+            stiffness[:, 0],
+        )
         self._turns = bool(joint.rigid or joint.stiffness)
         self._points = Points(max(len(unknowns), 1))
         self._present, self._moved = self._points.field(PARTS), self._points.field(PARTS)
@@ -122,7 +139,9 @@ class Tie:
     def add_residual(self, b: Array, factor: float) -> None:
         u = whole(self._u)
         residual = np.zeros(u.size)
-        forces = np.einsum("nc,nck->nk", self._tie[:, None] * self._times(self._gaps, u), self._gaps)
+        forces = np.einsum(
+            "nc,nck->nk", self._tie[:, None] * self._times(self._gaps, u), self._gaps
+        )
         if self._turns:
             forces += np.einsum("nc,nck->nk", self._at("gradient", u), self._tangents)
         np.add.at(residual, self._unknowns, factor * forces)
@@ -144,12 +163,16 @@ class Tie:
         return 0.0
 
     def _second(self, gap: Array, tangents: Array) -> Array:
-        """(n, k, k) the second variation at the present u, along what these make of any k unknowns; collective."""
+        """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
+        collective.
+        """
         H, u = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True), whole(self._u)
         if self._turns and len(H):
             of_parts = np.zeros((len(H), PARTS, PARTS))
             upper = np.triu_indices(PARTS)
-            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at("hessian", u)
+            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at(
+                "hessian", u
+            )
             H += np.einsum("nik,nij,njl->nkl", tangents, of_parts, tangents, optimize=True)
         return np.asarray(H)
 
@@ -158,9 +181,13 @@ class Tie:
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
     def _at(self, kernel: str, u: Array) -> Array:
-        """(n, ..) what a kernel gives at the points, with this displacement (nodes, components) of all nodes."""
+        """(n, ..) what a kernel gives at the points, with this displacement (nodes, components) of
+        all nodes.
+        """
         count = len(self._unknowns)
-        self._present.x.array[: count * PARTS] = (self._placed + self._times(self._tangents, u)).ravel()
+        self._present.x.array[: count * PARTS] = (
+            self._placed + self._times(self._tangents, u)
+        ).ravel()
         return np.array(self._points.evaluate(self._kernels[kernel], count))
 
 
@@ -203,7 +230,9 @@ class Tee(Tie):
         half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
         on_other = surfaces.shapes(at.Y)
         D = np.zeros((len(at.x), 4, both.shape[1]))
-        D[:, :2, :half], D[:, 2:, half:] = (N[1:].transpose(1, 0, 2) for N in (at.on_edge, on_other))
+        D[:, :2, :half], D[:, 2:, half:] = (
+            N[1:].transpose(1, 0, 2) for N in (at.on_edge, on_other)
+        )
         beta = np.concatenate([at.on_edge[0], -on_other[0]], axis=1)
         super().__init__(
             joint,
@@ -213,7 +242,13 @@ class Tee(Tie):
             np.einsum("nk,cd->nckd", beta, axes).reshape(len(at.x), 3, count),
             np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), PARTS, count),
             at.along,
-            _stiff(joint, material, np.maximum(of_cells[at.cell], of_cells[at.other_cell]), at.length, at.weight),
+            _stiff(
+                joint,
+                material,
+                np.maximum(of_cells[at.cell], of_cells[at.other_cell]),
+                at.length,
+                at.weight,
+            ),
             log,
         )
 
@@ -327,25 +362,39 @@ class Surfaces:
         return Foot(cell, on_edge, x, along, weight, length, other, Y, apart, clearance)
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
-        """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance, inf without a cell."""
+        """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance,
+        inf without a cell.
+        """
         from scipy.spatial import cKDTree  # takes long to import
 
-        nearest, Y, apart = np.zeros(len(x), dtype=np.int64), np.zeros((len(x), 2)), np.full(len(x), np.inf)
+        nearest, Y, apart = (
+            np.zeros(len(x), dtype=np.int64),
+            np.zeros((len(x), 2)),
+            np.full(len(x), np.inf),
+        )
         nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = AROUND * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-        near = cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
+        near = (
+            cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
+        )
         point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in near])
         which = np.concatenate([np.asarray(numbers, dtype=np.int64) for numbers in (*near, [])])
         if not len(point):
             return nearest, Y, apart
-        surface = Cells(self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64))
+        surface = Cells(
+            self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64)
+        )
         each = which, np.arange(len(which)), np.ones(len(which), dtype=np.int64), point
         pair, at = places_near(surface, self.r0, x, each, np.inf)
         point, which, foot, distance = at.point, which[pair], at.X, at.distance
         order = np.lexsort((cells[which], np.round(distance, 12), point))  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        nearest[point[best]], Y[point[best]], apart[point[best]] = cells[which[best]], foot[best], distance[best]
+        nearest[point[best]], Y[point[best]], apart[point[best]] = (
+            cells[which[best]],
+            foot[best],
+            distance[best],
+        )
         return nearest, Y, apart
 
 
@@ -378,14 +427,18 @@ class MeridianTee(Tie):
         nodal = r0.x.array.reshape(-1, 2)
         rho = _refuse_rings_apart(r0, tied, material.h, key, joint)
         foot = int(cells[0][0])
-        length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(self._shapes[0][1] @ nodal[dofs[foot]])
+        length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(
+            self._shapes[0][1] @ nodal[dofs[foot]]
+        )
         stiff = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
         ties = _stiff(joint, material, stiff, np.array([length]), 2 * np.pi * np.array([rho]))
         of_u = self._numbers(2), *self._maps(AROUND_E3)
         super().__init__(joint, r0, u, *of_u, np.array([[0.0, 1.0]]), ties, log)
 
     def entries_of_waves(self, m: float) -> Entries:
-        """Those of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
+        """Those of the second variation along waves, by the coefficients (U + V, V, W), as
+        `shells.waves` has it.
+        """
         cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
         sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
         U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
@@ -396,7 +449,9 @@ class MeridianTee(Tie):
         return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
 
     def _maps(self, of: Array) -> tuple[Array, Array]:
-        """`gap` and `tangents`; `of` (2, 3, c) makes of a node's numbers its vector, and the derivative around e3."""
+        """`gap` and `tangents`; `of` (2, 3, c) makes of a node's numbers its vector, and the
+        derivative around e3.
+        """
         value, around = of
         places, tangents = [], []
         for N, along in self._shapes:
@@ -410,20 +465,28 @@ def _ends_of_cells(V: fem.FunctionSpace) -> Array:
     return np.asarray(V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0])
 
 
-def _rings(V: fem.FunctionSpace, tied: tuple[float, float]) -> tuple[list[Longs], list[tuple[Array, Array]]]:
+def _rings(
+    V: fem.FunctionSpace, tied: tuple[float, float]
+) -> tuple[list[Longs], list[tuple[Array, Array]]]:
     """Return the cells at both parameters of a junction, with their shape functions there and
     slopes, all in one row."""
     ends, shapes = _ends_of_cells(V), []
     inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
-    cells = [np.flatnonzero(of) for of in inside]  # a place on a vertex is tied to by the mean of two cells
+    cells = [
+        np.flatnonzero(of) for of in inside
+    ]  # a place on a vertex is tied to by the mean of two cells
     for s, of in zip(tied, cells, strict=True):
         lengths = (ends[of, 1] - ends[of, 0])[:, None]
-        N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(of)
+        N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(
+            of
+        )
         shapes.append((N.ravel(), (slopes / lengths).ravel()))
     return cells, shapes
 
 
-def _refuse_rings_apart(r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint) -> float:
+def _refuse_rings_apart(
+    r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint
+) -> float:
     """Return the radius of the ring of an edge, which must be on the other shell.
 
     Raises
@@ -433,13 +496,17 @@ def _refuse_rings_apart(r0: fem.Function, tied: tuple[float, float], h: float, k
     """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
     cells, shapes = _rings(V, tied)
-    (rho, z), other = (N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True))
+    (rho, z), other = (
+        N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True)
+    )
     apart = np.array([np.hypot(*(other - [rho, z]))])
     _refuse_apart(V.mesh.comm, apart, np.array([[rho, 0.0, z]]), h, key, joint)
     return float(rho)
 
 
-def refuse_misplaced_rings(joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float) -> None:
+def refuse_misplaced_rings(
+    joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float
+) -> None:
     """See that the edges of T-junctions are on the other shell, as a model of the meridian does.
 
     Raises
@@ -458,8 +525,14 @@ def _entries(unknowns: Longs, H: Array) -> Entries:
 
 
 def _stiff(joint: Joint, material: Material, factors: Array, length: Array, weight: Array) -> Array:
-    """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides of that length."""
-    turned = TIGHT * factors[:, 1] * material.bending_stiffness / length if joint.rigid else joint.stiffness
+    """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
+    of that length.
+    """
+    turned = (
+        TIGHT * factors[:, 1] * material.bending_stiffness / length
+        if joint.rigid
+        else joint.stiffness
+    )
     return np.column_stack([weight * TIGHT * factors[:, 0] / length, weight * turned])
 
 
@@ -477,7 +550,9 @@ def _refuse_apart(comm: MPI.Comm, apart: Array, x: Array, h: float, key: str, jo
 
 
 def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
-    """Local cells of this rank that have boundary facets, and both ends (n, 2, 2) of each in the reference cell."""
+    """Local cells of this rank that have boundary facets, and both ends (n, 2, 2) of each in the
+    reference cell.
+    """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
@@ -492,8 +567,12 @@ def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple
 
 
 def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> Expr:
-    """Sine and cosine of the angle between both normals about the edge, whose direction is the first two of `along`."""
-    a1, a2, b1, b2 = (ufl.as_vector([tangents[3 * i + c] + moved[3 * i + c] for c in range(3)]) for i in range(4))
+    """Sine and cosine of the angle between both normals about the edge, whose direction is the
+    first two of `along`.
+    """
+    a1, a2, b1, b2 = (
+        ufl.as_vector([tangents[3 * i + c] + moved[3 * i + c] for c in range(3)]) for i in range(4)
+    )
 
     def unit(v: Expr) -> Expr:
         return v / ufl.sqrt(ufl.dot(v, v))
@@ -502,15 +581,29 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
-def _tee_joints(joints: Sequence[Joint], surface: Midsurface) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
+def _tee_joints(
+    joints: Sequence[Joint], surface: Midsurface
+) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
     """Return the joints that are T-junctions, with their keys and which cells of this rank the
     other shell has."""
     pairs = enumerate(zip(joints, surface.joints, strict=True))
-    tied = [(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]]) for i, (joint, of) in pairs if of is None]
-    return [*tied, *((Joint((name, "the sheet"), rigid=True), "shell.file", on) for name, on in surface.feet.items())]
+    tied = [
+        (joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
+        for i, (joint, of) in pairs
+        if of is None
+    ]
+    return [
+        *tied,
+        *(
+            (Joint((name, "the sheet"), rigid=True), "shell.file", on)
+            for name, on in surface.feet.items()
+        ),
+    ]
 
 
-def refuse_misplaced_feet(joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float) -> None:
+def refuse_misplaced_feet(
+    joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float
+) -> None:
     """See that the edges of T-junctions are on the other shell, as a model does; collective.
 
     Raises
@@ -522,7 +615,9 @@ def refuse_misplaced_feet(joints: Sequence[Joint], surface: Midsurface, r0: fem.
     surfaces = Surfaces.of(r0) if tied else None
     for joint, key, on in tied:
         assert surfaces
-        surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(r0.function_space.mesh.comm, h, key, joint)
+        surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(
+            r0.function_space.mesh.comm, h, key, joint
+        )
 
 
 def tees(model: "ShellModel") -> list[Tee]:
@@ -557,5 +652,7 @@ def _factors(model: "ShellModel | MeridianModel") -> Array:
         t = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
         factors *= np.column_stack([t, t**3])
     if model.made_of is not None:
-        factors *= model.made_of.x.array.reshape(-1, 4)[model.made_of.function_space.dofmap.list[:, 0], :1]
+        factors *= model.made_of.x.array.reshape(-1, 4)[
+            model.made_of.function_space.dofmap.list[:, 0], :1
+        ]
     return factors

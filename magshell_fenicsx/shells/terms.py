@@ -75,7 +75,8 @@ class EnergyFactory:
     held
         The edges that hold the normal, and those on mirror planes, whose energies were made.
     pressed
-        Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for 1.
+        Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for
+        1.
     creases
         Joints with springs or hinges.
     made_of
@@ -139,7 +140,9 @@ class EnergyFactory:
         density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
         if self.creases:
             zero = self._constant(0.0)
-            density = self.creases.added(density, self.free.setdefault(FOLD, zero) if self.creases.grow else zero)
+            density = self.creases.added(
+                density, self.free.setdefault(FOLD, zero) if self.creases.grow else zero
+            )
         return self.carrier.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
@@ -152,7 +155,9 @@ class EnergyFactory:
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
         """Edges on a mirror plane with that normal."""
         plane = self._constant(normal)
-        density = self._elastic(Density(edges.symmetric, (self._penalty, plane), CURVED, SECOND, facets))
+        density = self._elastic(
+            Density(edges.symmetric, (self._penalty, plane), CURVED, SECOND, facets)
+        )
         self.held.append(HeldEdge(facets, plane=plane))
         return self.carrier.energy(name, density, column="bending")
 
@@ -160,14 +165,20 @@ class EnergyFactory:
         """A moment per length about the edge's first tangent; in E h R."""
         past = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
-        length = fem.assemble_scalar(self.log.compile(f"{name} length", self.carrier.length(facets)))
+        length = fem.assemble_scalar(
+            self.log.compile(f"{name} length", self.carrier.length(facets))
+        )
         total = self.carrier.whole * self._over_ranks(length)
         return self.carrier.energy(name, density, amplitude, counted=(past, intensity * total))
 
-    def dead_energies(self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]) -> list[Energy]:
+    def dead_energies(
+        self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
+    ) -> list[Energy]:
         """The moments and one's own potentials among the dead loads of an amplitude."""
         turning = [
-            self.edge_moment(f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name)
+            self.edge_moment(
+                f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name
+            )
             for i, load in enumerate(moments(loads))
         ]
         return turning + [self.own(term, amplitude=name) for term in potentials(loads)]
@@ -178,21 +189,29 @@ class EnergyFactory:
         density = self._elastic(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
         v = fem.Function(self.u.function_space)
         jets = carrier.j0, carrier.jet(self.u), carrier.jet(v)
-        energy = density.of(*jets, carrier.covector, carrier.widths[1], *density.parameters) * carrier.ds(facets)
+        energy = density.of(
+            *jets, carrier.covector, carrier.widths[1], *density.parameters
+        ) * carrier.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m; and what is soft.
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m;
+        and what is soft.
 
         A field in space is known at the displacement u.
         """
         applied = None
         if field.in_space:
-            applied = AppliedField(field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven)
+            applied = AppliedField(
+                field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven
+            )
             self.fields.append(applied)
         if field.soft is None:
             return self.remanent(field, applied)
-        return [*([] if field.soft.alone else self.remanent(field, applied)), self.soft(field, field.soft, applied)]
+        return [
+            *([] if field.soft.alone else self.remanent(field, applied)),
+            self.soft(field, field.soft, applied),
+        ]
 
     def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
@@ -203,7 +222,9 @@ class EnergyFactory:
         return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """The integrals of the polarisation over the undeformed volume of what is modelled, over h; and that volume."""
+        """The integrals of the polarisation over the undeformed volume of what is modelled, over h;
+        and that volume.
+        """
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
@@ -211,13 +232,20 @@ class EnergyFactory:
         by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
             by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *given))
-        return {f"induced {name}": self._over_area(self._thick(density)) for name, density in by_name.items()}
+        return {
+            f"induced {name}": self._over_area(self._thick(density))
+            for name, density in by_name.items()
+        }
 
     def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> list[Parameter]:
-        """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of the field."""
+        """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of
+        the field.
+        """
         chi = soft.susceptibility
         law = (
-            pattern_field(chi, self.carrier.r0, name="susceptibility", key="magnetic.susceptibility", size=1)[0]
+            pattern_field(
+                chi, self.carrier.r0, name="susceptibility", key="magnetic.susceptibility", size=1
+            )[0]
             if callable(chi)
             else self._constant(chi)
         )
@@ -226,10 +254,19 @@ class EnergyFactory:
             if not self.saturated:  # energy and observed forms share it
                 self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
             law = self.saturated[0]
-        return [law, *amplitudes, *map(self._constant, sheet.vectors), *([applied.polynomial] if applied else [])]
+        return [
+            law,
+            *amplitudes,
+            *map(self._constant, sheet.vectors),
+            *([applied.polynomial] if applied else []),
+        ]
 
     def _saturated(
-        self, sheet: Sheet, chi: Parameter, amplitudes: Sequence[fem.Constant], applied: AppliedField | None
+        self,
+        sheet: Sheet,
+        chi: Parameter,
+        amplitudes: Sequence[fem.Constant],
+        applied: AppliedField | None,
     ) -> PointField:
         """What is known of a material that saturates, at the points of cells."""
         carrier, followed = self.carrier, (self.carrier.r0, self.u)
@@ -249,10 +286,15 @@ class EnergyFactory:
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
         if applied:
-            density = self._magnetised(field, densities.in_space(full), Br, applied.polynomial, parts=MOVED)
+            density = self._magnetised(
+                field, densities.in_space(full), Br, applied.polynomial, parts=MOVED
+            )
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
-        directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
+        directions += [
+            (name, name.replace("lambda_", " "), Ba)
+            for name, Ba in zip(ACROSS, field.across, strict=False)
+        ]
         terms = [
             carrier.energy(
                 name + suffix,
@@ -269,19 +311,29 @@ class EnergyFactory:
             density = self._magnetised(
                 field, densities.in_gradient(full), Br, self._constant(field.gradient), parts=MOVED
             )
-            terms.append(carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic"))
+            terms.append(
+                carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic")
+            )
         return terms
 
     def _magnetised(
-        self, field: Magnetisation, of: Callable[..., Expr], *parameters: Parameter, parts: tuple[str, ...] = FIRST
+        self,
+        field: Magnetisation,
+        of: Callable[..., Expr],
+        *parameters: Parameter,
+        parts: tuple[str, ...] = FIRST,
     ) -> Density:
-        """A density of the remanence with the thickness and, if that thins with F, the natural shape."""
+        """A density of the remanence with the thickness and, if that thins with F, the natural
+        shape.
+        """
         density = Density(per_area(of), parameters, parts=parts)
         thins = self.material.law.some_thin and field.law == "deformation"
         return self._thick(self._thinning(density) if thins else density)
 
     def pressure(self, *, potential: bool) -> Energy:
-        """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
+        """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it
+        has none.
+        """
         unit = self._constant(self.material.classical_pressure / self.material.h)
         of, following = (self._on_pressed(f) for f in (densities.swept, densities.following))
         parameters = (unit,) if self.pressed is None else (unit, self.pressed)
@@ -293,8 +345,12 @@ class EnergyFactory:
         return of if self.pressed is None else lambda *given: given[-1][0] * of(*given[:-1])
 
     def swept_volume(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part when its points move straight to their places, where it is pressed."""
-        return self._volume(self._on_pressed(densities.swept), *([] if self.pressed is None else [self.pressed]))
+        """Delta V/R^3 of the modelled part when its points move straight to their places, where it
+        is pressed.
+        """
+        return self._volume(
+            self._on_pressed(densities.swept), *([] if self.pressed is None else [self.pressed])
+        )
 
     def volume_change(self, origin: Array) -> ufl.Form:
         """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
@@ -304,10 +360,16 @@ class EnergyFactory:
         jets = self.carrier.from_drawn(self.carrier.jet(self.u))
         return self.carrier.whole * of(*jets, *parameters) * self.carrier.dx()
 
-    def own(self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None) -> Energy:
-        """The energy of a part or one's own, with the amplitude of its name or another; `facets` of a term's edge."""
+    def own(
+        self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
+    ) -> Energy:
+        """The energy of a part or one's own, with the amplitude of its name or another; `facets` of
+        a term's edge.
+        """
         assert term.density
-        still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
+        still = tuple(
+            part for part in term.placed_parts if part not in term.parts
+        )  # asked for of r0 alone
         of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
         density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)
         density = self._weighty(density) if term.of_volume else density
@@ -325,17 +387,29 @@ class EnergyFactory:
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
-        """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
-        carrier, approach = self.carrier, self.free.setdefault(contact.amplitude, self._constant(0.0))
+        """The energy of a body, what it knows of it, and the integrals of its pressure and of that
+        times its radius.
+        """
+        carrier, approach = (
+            self.carrier,
+            self.free.setdefault(contact.amplitude, self._constant(0.0)),
+        )
         rule, thins = carrier.contact_rule, self.material.law.some_thin
-        thins_at = thinning(carrier, self.u, self.natural, self.law_of_cells.thins) if thins else None
-        pressing = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at)
+        thins_at = (
+            thinning(carrier, self.u, self.natural, self.law_of_cells.thins) if thins else None
+        )
+        pressing = Pressing(
+            contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at
+        )
         of, parts = (thinned_energy, MOVED) if thins else (contact_energy, ("r",))
         density = Density(per_area(of), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
-        by_name = {name: Density(per_area(of), pressing.parameters, quadrature=rule) for name, of in seen.items()}
+        by_name = {
+            name: Density(per_area(of), pressing.parameters, quadrature=rule)
+            for name, of in seen.items()
+        }
         integrals = {name: self._over_area(density) for name, density in by_name.items()}
         return carrier.energy(f"contact {contact.body}", density), pressing, integrals
 
@@ -364,7 +438,9 @@ class EnergyFactory:
 
         def of(*arguments: Expr, **keywords: Any) -> Expr:
             *given, numbers = arguments
-            return density.of(*given, thins=law.made_of(numbers[0], numbers[1], numbers[3]).thins, **keywords)
+            return density.of(
+                *given, thins=law.made_of(numbers[0], numbers[1], numbers[3]).thins, **keywords
+            )
 
         return replace(density, of=of, parameters=(*density.parameters, own))
 
@@ -372,15 +448,21 @@ class EnergyFactory:
     def law_of_cells(self) -> Law:
         """That of each cell of this rank, for arrays (cells, n) of places in them."""
         own = self.made_of
-        return self.material.law_in(own and own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[:, 0]])
+        return self.material.law_in(
+            own and own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[:, 0]]
+        )
 
     def _weighty(self, density: Density) -> Density:
-        """One of what has mass, with thickness and density of the material as they vary, if they do."""
+        """One of what has mass, with thickness and density of the material as they vary, if they
+        do.
+        """
         density = self._thick(density)
         return density if self.made_of is None else thick(density, self.made_of, 2)
 
     def _elastic(self, density: Density) -> Density:
-        """The density of the material with the thickness as it varies, and of the natural shape, if there is one."""
+        """The density of the material with the thickness as it varies, and of the natural shape, if
+        there is one.
+        """
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
         density = elastic(density, law.with_numbers(*numbers), self.thickness, self.made_of)
@@ -392,7 +474,9 @@ class EnergyFactory:
 
 
 def _along(term: OwnTerm, of: Callable[..., Expr]) -> Callable[..., Expr]:
-    """A density of a term per area of the coordinates or, on an edge, per length of its parameter; see `Density.of`."""
+    """A density of a term per area of the coordinates or, on an edge, per length of its parameter;
+    see `Density.of`.
+    """
     if term.on is None:
         return per_area(of)
 

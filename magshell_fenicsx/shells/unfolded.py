@@ -1,9 +1,11 @@
-"""Stability of a sector against the modes that its two planes exclude, on the half that its copies make.
+"""Stability of a sector against the modes that its two planes exclude, on the half that its copies
+make.
 
-The mesh of the half is that of the sector and its images, so the state of the half is that of the sector to rounding.
-Its own tangent and that of its antisymmetric modes count all modes of the shell. Where nothing but the buckled shape
-itself distinguishes one azimuth from another, that shape may turn about e3 without any force: this one direction is
-left out of the count, which would depend on rounding.
+The mesh of the half is that of the sector and its images, so the state of the half is that of the
+sector to rounding. Its own tangent and that of its antisymmetric modes count all modes of the
+shell. Where nothing but the buckled shape itself distinguishes one azimuth from another, that shape
+may turn about e3 without any force: this one direction is left out of the count, which would depend
+on rounding.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +42,9 @@ class UnfoldedModes:
         The same shell on the mid-surface of a half.
     """
 
-    families: Sequence[Family] = ()  # they are counted and not located: the turned shape is always neutral
+    families: Sequence[
+        Family
+    ] = ()  # they are counted and not located: the turned shape is always neutral
     tangents = None  # nor are changes of these located
 
     def __init__(self, model: "ShellModel", as_half: "Callable[[Midsurface], ShellModel]") -> None:
@@ -53,21 +57,29 @@ class UnfoldedModes:
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
         self._folding = folding_of(sector, patch)
-        half = self._as_half(distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm))
+        half = self._as_half(
+            distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm)
+        )
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))
         self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.back(chart))[1]
-        self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[self._folding.copies(chart)]
+        self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[
+            self._folding.copies(chart)
+        ]
         return half
 
     def unfolded(self, u: Vector) -> Vector:
         """A displacement of the sector as that of the half; collective."""
         half, system = self.half, self._model.system
         whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
-        return np.asarray(half.system.held(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel()))
+        return np.asarray(
+            half.system.held(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel())
+        )
 
     def counts(self, state: State) -> Sequence[int]:
-        """Unstable modes of the half that the sector excludes, and those that are antisymmetric to the half."""
+        """Unstable modes of the half that the sector excludes, and those that are antisymmetric to
+        the half.
+        """
         half, state_of_half = self.half, State(self.unfolded(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))
         own = self._own.negative_pivots
@@ -78,7 +90,9 @@ class UnfoldedModes:
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
         t = self._turning(state_of_half)
-        if t is not None and dot(half.system.comm, t, factors.solve(t)) < 0:  # of the tangent on the complement of t
+        if (
+            t is not None and dot(half.system.comm, t, factors.solve(t)) < 0
+        ):  # of the tangent on the complement of t
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]
 
@@ -87,7 +101,9 @@ class UnfoldedModes:
         return any(self.counts(state))
 
     def _turning(self, state: State) -> Vector | None:
-        """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None without any."""
+        """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None
+        without any.
+        """
         half, system, modes = self.half, self.half.system, self.half.excluded_modes
         if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
             return None
@@ -99,7 +115,11 @@ class UnfoldedModes:
         around = np.cross([0.0, 0.0, 1.0], r0[dofs])
         metric = np.einsum("nqdi,nqei->nqde", a, a)
         c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, around)[..., None])[..., 0]
-        by_angle, total, count = np.einsum("nqd,nqdi->nqi", c, du), np.zeros_like(u), np.zeros(len(u))
+        by_angle, total, count = (
+            np.einsum("nqd,nqdi->nqi", c, du),
+            np.zeros_like(u),
+            np.zeros(len(u)),
+        )
         np.add.at(total, dofs, by_angle)
         np.add.at(count, dofs, 1.0)
         t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]

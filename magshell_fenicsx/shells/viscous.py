@@ -1,8 +1,9 @@
 """Viscosity of a shell: stresses that follow the rates of its strains, in the elastic law's form.
 
-Kelvin and Voigt: the stress of tau dE/dt and tau dK/dt. A branch of Maxwell, a spring g in series with a dashpot: the
-stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the curvature. Rates are those of the exact
-strains, so that rigid motions are not damped. Strains are known at the nodes of each cell and interpolated.
+Kelvin and Voigt: the stress of tau dE/dt and tau dK/dt. A branch of Maxwell, a spring g in series
+with a dashpot: the stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the
+curvature. Rates are those of the exact strains, so that rigid motions are not damped. Strains are
+known at the nodes of each cell and interpolated.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -55,7 +56,8 @@ class Memory:
     strains
         q of each branch, (cells, places, 12).
     rate, dt
-        Mean rate of the strain along the step and its length; None where the motion begins or turns a corner.
+        Mean rate of the strain along the step and its length; None where the motion begins or turns
+        a corner.
     """
 
     strains: list[Array]
@@ -64,7 +66,8 @@ class Memory:
 
 
 class Viscosity:
-    """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles kernels.
+    """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles
+    kernels.
 
     Parameters
     ----------
@@ -96,57 +99,88 @@ class Viscosity:
         self._jets = carrier.tables(V, Q.element.basix_element.points)
         self._frame = TangentFrame.of(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
-        self._given = _Given(self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0))
+        self._given = _Given(
+            self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0)
+        )
         works = _works(model, self._given)
-        gradients = [ufl.derivative(carrier.whole * work, model.u, ufl.TestFunction(V)) for work in works]
-        self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
-        self._strained = [term.name for term in model.system.terms if term.column in ("stretching", "bending")]
+        gradients = [
+            ufl.derivative(carrier.whole * work, model.u, ufl.TestFunction(V)) for work in works
+        ]
+        self._forms = [
+            model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)
+        ]
+        self._strained = [
+            term.name for term in model.system.terms if term.column in ("stretching", "bending")
+        ]
         law = model.material.law
         self._slowing = _Slowing(model) if law.linear != law else None
         self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
-        self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
+        self._first: tuple[Vector, Array] = (
+            np.empty(0),
+            np.empty(0),
+        )  # displacements and their strains
         self._last: tuple[Vector, Array] = self._first
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         at = u0 + part * (u1 - u0)
-        stress = self.slowness * self._rate(at, v) if self.slowness else np.zeros((*self._places.shape, SIZE))
+        stress = (
+            self.slowness * self._rate(at, v)
+            if self.slowness
+            else np.zeros((*self._places.shape, SIZE))
+        )
         if self._branches:
-            for branch, q, end in zip(self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True):
+            for branch, q, end in zip(
+                self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True
+            ):
                 stress += branch.modulus * (part * end + (1 - part) * q)
         self._force = self._forces(stress, u0, at, self.stiffness(dt, 2 / dt) if dt else 0.0)
         return self._force
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """The system's tangent with that of these forces, which stiffen the shell, but no body that it touches."""
+        """The system's tangent with that of these forces, which stiffen the shell, but no body that
+        it touches.
+        """
         stiffness = self.stiffness(dt, rate)
         if self._slowing is None:
-            return self._model.system.tangent(u, mu, times=dict.fromkeys(self._strained, 1 + stiffness))
+            return self._model.system.tangent(
+                u, mu, times=dict.fromkeys(self._strained, 1 + stiffness)
+            )
         with self._slowing.by(stiffness):
             return self._model.system.tangent(u, mu)
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
-        return self.slowness * rate + sum(b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches)
+        return self.slowness * rate + sum(
+            b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches
+        )
 
     def begin(self) -> None:
-        """A motion begins or turns a corner: the rate of strain before it says nothing about the next step."""
+        """A motion begins or turns a corner: the rate of strain before it says nothing about the
+        next step.
+        """
         self.memory = Memory(self.memory.strains)
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the force that the step was solved with."""
         if self._branches:
-            self.memory = Memory(self._evolved(u0, u1, dt), np.asarray(self._change(u0, u1) / dt), dt)
+            self.memory = Memory(
+                self._evolved(u0, u1, dt), np.asarray(self._change(u0, u1) / dt), dt
+            )
         return self._force
 
     def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """The force at the end by which the curvature of the strain in time counts; None if nothing does."""
+        """The force at the end by which the curvature of the strain in time counts; None if nothing
+        does.
+        """
         rate = self.memory.rate
         if rate is None:
             return None
         bend = self._change(u0, u1) / dt - rate
-        return self._forces(sum(b.modulus * self._bend(b, dt) for b in self._branches) * bend, u1, u1, 0.0)
+        return self._forces(
+            sum(b.modulus * self._bend(b, dt) for b in self._branches) * bend, u1, u1, 0.0
+        )
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Of a stress at nodes, and of edges that open from u0 to u1."""
@@ -158,7 +192,9 @@ class Viscosity:
         return system.at(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
-        """q at the end of a step; the strain is quadratic in time through its ends and the begin of the step before."""
+        """q at the end of a step; the strain is quadratic in time through its ends and the begin of
+        the step before.
+        """
         change, rate = self._change(u0, u1), self.memory.rate
         bend = 0.0 if rate is None else change / dt - rate
         return [
@@ -168,7 +204,11 @@ class Viscosity:
 
     def _bend(self, branch: Branch, dt: float) -> float:
         """What a change of the mean rate from the step before to this one leaves in the spring."""
-        return 0.0 if self.memory.rate is None else _bent(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+        return (
+            0.0
+            if self.memory.rate is None
+            else _bent(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+        )
 
     def _change(self, u0: Vector, u1: Vector) -> Array:
         if self._first[0] is not u0:
@@ -188,15 +228,20 @@ class Viscosity:
         """(cells, places, 12): E and K as tensors in space."""
         jets = self._jets(self._model.system.with_ghosts(u, self._mu))
         tensors = [
-            self._frame.tensor(S) for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
+            self._frame.tensor(S)
+            for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
         ]
-        return np.concatenate([S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1)
+        return np.concatenate(
+            [S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1
+        )
 
 
 class _Slowing:
-    """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's `Couplings`.
+    """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's
+    `Couplings`.
 
-    Viscous stresses are those of small strains: they make stiff what the strains of a stretched shell leave soft.
+    Viscous stresses are those of small strains: they make stiff what the strains of a stretched
+    shell leave soft.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
@@ -204,7 +249,9 @@ class _Slowing:
         rates, v = _Rates(model), ufl.TestFunction(model.V)
         self._since, whole = rates.since, model.factory.carrier.whole
         self._forms = [
-            model.kernels.compile(f"viscous tangent {i}", whole * self._stiffness * ufl.derivative(work, model.u, v))
+            model.kernels.compile(
+                f"viscous tangent {i}", whole * self._stiffness * ufl.derivative(work, model.u, v)
+            )
             for i, work in enumerate(_works(model, rates))
         ]
         self._added = fem_petsc.create_matrix(self._forms[0])
@@ -251,7 +298,9 @@ def _bent(z: float) -> float:
 
 @dataclass(frozen=True)
 class _Given:
-    """What viscous forces depend on: stresses at nodes, and two displacements between which edges open, how stiffly."""
+    """What viscous forces depend on: stresses at nodes, and two displacements between which edges
+    open, how stiffly.
+    """
 
     field: fem.Function
     before: fem.Function
@@ -259,18 +308,24 @@ class _Given:
     stiffness: fem.Constant
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """The strain and the change of curvature that make the stress, on a side of an edge; "" within a cell."""
+        """The strain and the change of curvature that make the stress, on a side of an edge; ""
+        within a cell.
+        """
         at = self.field(side) if side else self.field
         return covariant(j, at, 0), covariant(j, at, 6)
 
     def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
-        after, before = (jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before))
+        after, before = (
+            jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before)
+        )
         return self.stiffness * (after - before)
 
 
 class _Rates:
-    """What takes the place of `_Given` in the forces' derivative: strains and jumps by a change of a displacement."""
+    """What takes the place of `_Given` in the forces' derivative: strains and jumps by a change of
+    a displacement.
+    """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self.since, self._change = fem.Function(model.V), ufl.TrialFunction(model.V)
@@ -279,7 +334,9 @@ class _Rates:
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
         """See `_Given`."""
         E, K = _strained(j, self._jet.side(side) if side else self._jet)
-        return ufl.derivative(E, self.since, self._change), ufl.derivative(K, self.since, self._change)
+        return ufl.derivative(E, self.since, self._change), ufl.derivative(
+            K, self.since, self._change
+        )
 
     def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
         """See `_Given`."""
@@ -311,9 +368,11 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 
 
 def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[ufl.Form]:
-    """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
+    """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its
+    gradient are forces.
 
-    Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.
+    Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it
+    opens.
     """
     factory, carrier = model.factory, model.factory.carrier
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
@@ -322,7 +381,11 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
         """That of the shell at small strains, which a viscous stress follows too."""
         of_shell, own = densities.law_at(model.material.law.linear, j), factory.made_of
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
-        return of_shell if own is None else of_shell.made_of(*((own(side) if side else own)[i] for i in (0, 1, 3)))
+        return (
+            of_shell
+            if own is None
+            else of_shell.made_of(*((own(side) if side else own)[i] for i in (0, 1, 3)))
+        )
 
     E, K = _strained(r0, u)
     strain, bend = given.strain(r0, "")
@@ -347,7 +410,12 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
         edge = kin.inverse_metric(j), (nu1, nu2), 1
         given_moment += law(j, side).edge_moment(*given.strain(j, side), *edge) / 2
         bent += law(j, side).edge_moment(*_strained(j, v), *edge) / 2
-        stiff += law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
+        stiff += (
+            law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge)
+            / 2
+            * model.sigma
+            / carrier.widths[0]
+        )
     S_J, J = given.opened(carrier, across), across(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * carrier.dS()
@@ -359,5 +427,9 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
     for held_edge in factory.held:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
         S_J, J = given.opened(carrier, jump), jump(r0 + u)
-        works.append((M * J + S_J * (bent + modelled_sides * stiff * J)) * stretch * carrier.ds(held_edge.facets))
+        works.append(
+            (M * J + S_J * (bent + modelled_sides * stiff * J))
+            * stretch
+            * carrier.ds(held_edge.facets)
+        )
     return works

@@ -1,4 +1,5 @@
-"""Stability of an axisymmetric state against waves cos(m theta), m >= 1, which its model does not see.
+"""Stability of an axisymmetric state against waves cos(m theta), m >= 1, which its model does not
+see.
 
 Along a wave v every component of a jet is a coefficient times cos(m theta) or sin(m theta),
 so the second variation of an axisymmetric energy is pi times the sum of that of the
@@ -61,10 +62,10 @@ class Waves:
     V
         Space of the waves' coefficients (U + V, V, W); see `carriers.wave`.
     largest
-        Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in
-        waves of length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which
-        1.73 (nu = 0.5) to 1.86 (nu = 0) times sqrt(R/h) fit around the equator; a wider circle has more, and
-        so has a surface of smaller radii of curvature.
+        Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in waves of
+        length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
+        sqrt(R/h) fit around the equator; a wider circle has more, and so has a surface of smaller
+        radii of curvature.
     """
 
     def __init__(
@@ -116,21 +117,27 @@ class Waves:
         """With the entries of contacts at a state."""
         if not self.touching:
             return K
-        entries = self._system.at(state).of(lambda: [each.entries_of_waves(m) for each in self.touching])
+        entries = self._system.at(state).of(
+            lambda: [each.entries_of_waves(m) for each in self.touching]
+        )
         rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
         fixed = np.zeros(K.getSize()[0], dtype=bool)
         fixed[self._rows(m)] = True
         return with_entries(K, (rows, columns, values), fixed)
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
-        """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi and m at a time."""
+        """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi
+        and m at a time.
+        """
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
             for e in self._kept:
                 energy, v = self._of_wave(e)
                 twice = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
                 form = ufl.replace(twice, {v: ufl.zero(3)})
-                self._energies.append(FormTerm(f"{e.name} along a wave", form, self._system.u, self._log, e.amplitude))
+                self._energies.append(
+                    FormTerm(f"{e.name} along a wave", form, self._system.u, self._log, e.amplitude)
+                )
         return self._energies
 
     def held(self, m: int) -> list[fem.DirichletBC]:
@@ -145,9 +152,10 @@ class Waves:
     def counts(self, state: State) -> list[int]:
         """Number of unstable directions among the waves 1, 2, ... `largest`.
 
-        A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are interpolated
-        between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
-        assembled. Only those that are not positive definite are factored for their inertia.
+        A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are
+        interpolated between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V,
+        W), and so three are assembled. Only those that are not positive definite are factored for
+        their inertia.
         """
         values = self.numbers(state)
         if not self.touching:
@@ -179,8 +187,12 @@ class Waves:
         finally:
             self._pieces = pieces  # fit for states of the path
 
-    def _entries(self, state: State, waves: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the system's displacement."""
+    def _entries(
+        self, state: State, waves: Sequence[float] | NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the
+        system's displacement.
+        """
         factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._kept}
         return self._points.entries(factors, [float(m) for m in waves])
 
@@ -191,15 +203,20 @@ class Waves:
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of these entries: those of one triangle, and all of the nodes' own blocks."""
+        """Rows and columns of these entries: those of one triangle, and all of the nodes' own
+        blocks.
+        """
         rows, columns = (
-            3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64) for a in (self._points.rows, self._points.columns)
+            3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64)
+            for a in (self._points.rows, self._points.columns)
         )
         return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
 
     @cached_property
     def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """The whole matrix in compressed rows: where they start, columns, and which of these entries stands there."""
+        """The whole matrix in compressed rows: where they start, columns, and which of these
+        entries stands there.
+        """
         rows, columns = self._sparsity
         below = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
         both = np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]])
@@ -207,11 +224,13 @@ class Waves:
         return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
 
     def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
-        """The waves whose matrices are not positive definite, from the entries (nodes, entries) at the nodes.
+        """The waves whose matrices are not positive definite, from the entries (nodes, entries) at
+        the nodes.
 
-        On a piece of the axis of m the matrix is a mean of its five Bernstein coefficients with weights that are not
-        negative: if these are positive definite, it is so for every m of the piece. Else the piece is halved, for the
-        next states too, until its waves are as few as coefficients.
+        On a piece of the axis of m the matrix is a mean of its five Bernstein coefficients with
+        weights that are not negative: if these are positive definite, it is so for every m of the
+        piece. Else the piece is halved, for the next states too, until its waves are as few as
+        coefficients.
         """
         once, twice = self._bands
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
@@ -234,11 +253,15 @@ class Waves:
         return self._counting.negative_pivots
 
     def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
-        """A matrix with these entries, in the order of `_sparsity`, with what is held; the next call overwrites it."""
+        """A matrix with these entries, in the order of `_sparsity`, with what is held; the next
+        call overwrites it.
+        """
         first, columns, places = self._rows_of_matrix
         data = entries[places]
         if name not in self._matrices:
-            made = PETSc.Mat().createAIJ((len(first) - 1,) * 2, csr=(first, columns, data), comm=self.V.mesh.comm)
+            made = PETSc.Mat().createAIJ(
+                (len(first) - 1,) * 2, csr=(first, columns, data), comm=self.V.mesh.comm
+            )
             made.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             made.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
             self._matrices[name] = made
@@ -257,7 +280,9 @@ class Waves:
 
     def unstable(self, state: State, largest: int | None = None) -> dict[int, int]:
         """m -> number of unstable directions, for the waves that have any."""
-        pivots = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
+        pivots = {
+            m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)
+        }
         return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
@@ -283,7 +308,9 @@ class _Piece:
     def __init__(self, first: int, last: int, nodes: NDArray[np.float64]) -> None:
         self.first, self.last, self.short = first, last, last - first < DEGREE
         places = np.arange(DEGREE + 1) / DEGREE
-        bernstein = [comb(DEGREE, i) * places**i * (1 - places) ** (DEGREE - i) for i in range(DEGREE + 1)]
+        bernstein = [
+            comb(DEGREE, i) * places**i * (1 - places) ** (DEGREE - i) for i in range(DEGREE + 1)
+        ]
         values = _lagrange(nodes, first + (last - first) * places)
         self.inner = np.linalg.solve(np.stack(bernstein, axis=1), values)[1:-1]
 
@@ -292,15 +319,24 @@ class _Piece:
         return [_Piece(self.first, middle, nodes), _Piece(middle, self.last, nodes)]
 
 
-def _lagrange(nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.float64]:
-    """What the values at some nodes weigh in their polynomial's values at other places; (places, nodes)."""
+def _lagrange(
+    nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """What the values at some nodes weigh in their polynomial's values at other places; (places,
+    nodes).
+    """
     others = [np.delete(nodes, i) for i in range(len(nodes))]
-    columns = [np.prod((at[:, None] - rest) / (node - rest), axis=1) for node, rest in zip(nodes, others, strict=True)]
+    columns = [
+        np.prod((at[:, None] - rest) / (node - rest), axis=1)
+        for node, rest in zip(nodes, others, strict=True)
+    ]
     return np.stack(columns, axis=1)
 
 
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P - 2 V."""
+    """The entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P
+    - 2 V.
+    """
     mirrored = entries.copy()
     mirrored[..., 1] = -2 * mirrored[..., 0] - mirrored[..., 1]
     mirrored[..., 1, :] = -2 * mirrored[..., 0, :] - mirrored[..., 1, :]
@@ -349,7 +385,8 @@ class ExcludedWaves:
 
 
 class Banded:
-    """Weighted sums of small symmetric matrices that share one sparsity pattern, and whether they are definite.
+    """Weighted sums of small symmetric matrices that share one sparsity pattern, and whether they
+    are definite.
 
     LAPACK's banded Cholesky factors answer that.
 
@@ -361,7 +398,9 @@ class Banded:
         Rows and columns that are replaced by those of the unit matrix.
     """
 
-    def __init__(self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]) -> None:
+    def __init__(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]
+    ) -> None:
         n = int(rows.max()) + 1
         both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
         pattern = coo_array((np.ones(2 * len(rows)), both), (n, n)).tocsr()
@@ -378,7 +417,9 @@ class Banded:
         self._ones = place[held]
 
     def bands(self, values: Iterable[Array]) -> Array:
-        """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what is held."""
+        """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what
+        is held.
+        """
         values = list(values)
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
         for band, v in zip(stacked, values, strict=True):

@@ -18,7 +18,8 @@ from magshell_fenicsx.simulate.touch import penetration_refused
 from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
 
 RISES = 4  # first steps of an energy that moves the undeformed shell
-BEYOND = "beyond the first instability the path stopped: "  # how the remark of a path begins that has its answer
+# how the remark of a path begins that has its answer
+BEYOND = "beyond the first instability the path stopped: "
 
 
 def warned(remark: str) -> None:
@@ -26,11 +27,13 @@ def warned(remark: str) -> None:
     warnings.warn(remark, stacklevel=3)
 
 
-def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warned) -> Iterator[Record]:
+def follow(
+    scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warned
+) -> Iterator[Record]:
     """Compute the history of a scene; yields every accepted point.
 
-    With `until: limit` as its end, a history has its answer at the first instability: what stops it beyond that is a
-    remark.
+    With `until: limit` as its end, a history has its answer at the first instability: what stops it
+    beyond that is a remark.
 
     Parameters
     ----------
@@ -42,7 +45,8 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     Raises
     ------
     Stopped
-        If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
+        If a path is lost, a step before the last ends at an instability, or the field alone makes
+        the shell unstable.
     """
     state, steps = scene.unloaded(), scene.problem.programme
     own = pulling(scene, state)
@@ -50,9 +54,17 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     try:
         _refuse_not_numbers(scene, state, "")
     except Stopped:
-        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0), scene=scene, shown=scene.displacement)
+        yield Record(
+            "start",
+            "",
+            Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0),
+            scene=scene,
+            shown=scene.displacement,
+        )
         raise
-    pivots = 0 if scene.loose or scene.free_in_time else scene.newton.factor_at(state).negative_pivots
+    pivots = (
+        0 if scene.loose or scene.free_in_time else scene.newton.factor_at(state).negative_pivots
+    )
     start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
     clock = dict[str, float]()
     if steps and (first_motion := steps[0].load.motion) and not own:
@@ -68,7 +80,9 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         yield from (replace(risen, scene=scene, shown=scene.displacement) for risen in rise)
         state = rise.end
     for step in steps:
-        where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
+        where = (
+            f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
+        )
         scene.progress.beginning(step.number)
         _refuse_not_numbers(scene, state, where)
         walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
@@ -81,7 +95,9 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
             if step.load.bound and not unstable:
-                remark(f"{where}there is no instability up to the target, where until: limit ends too")
+                remark(
+                    f"{where}there is no instability up to the target, where until: limit ends too"
+                )
             release = step.load.released_by
             if release and record and step.until == "bifurcation" and last == "bifurcation":
                 record = departure_of(scene, step, record).record(0)
@@ -90,7 +106,9 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             elif release and record:
                 if record.label != "fold" or record.mode:
                     at = record.mode or record.label
-                    raise Stopped(f"then: snap: the step ends at a {at}, not at a fold of the model itself")
+                    raise Stopped(
+                        f"then: snap: the step ends at a {at}, not at a fold of the model itself"
+                    )
                 if record.excluded_pivots:
                     remark(where + _buckled(scene, record, first))
             further = None
@@ -107,8 +125,14 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                     yield _recorded(scene, step, record, remark, where)
         except (Stopped, NotANumber) as e:
             names = scene.model.system.strange
-            strange = f"; where it was tried last, {' and '.join(names)} was not a number" if names else ""
-            if not (first and step is steps[-1] and step.until == "limit" and not step.load.released_by):
+            strange = (
+                f"; where it was tried last, {' and '.join(names)} was not a number"
+                if names
+                else ""
+            )
+            if not (
+                first and step is steps[-1] and step.until == "limit" and not step.load.released_by
+            ):
                 raise Stopped(f"{where}{e}{strange}") from None
             remark(f"{BEYOND}{where}{e}{strange}")
             return
@@ -122,7 +146,9 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
 
 
-def follow_alone(scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warned) -> Iterator[Record]:
+def follow_alone(
+    scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warned
+) -> Iterator[Record]:
     """The history of a scene for what reads all of it in the scene itself; see `follow`.
 
     Raises
@@ -139,13 +165,17 @@ def follow_alone(scene: Scene, *, search: bool = False, remark: Callable[[str], 
         yield record
 
 
-def _recorded(scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str) -> Record:
+def _recorded(
+    scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str
+) -> Record:
     """A record as a history gives it."""
     at = record.scene or scene
     if record.said:
         remark(where + record.said)
     state, moving = record.point.state, bool((record.clock or {}).get("kinetic"))
-    refused = scene.journal.noted(lambda: Finding({"said": penetration_refused(at, state, moving=moving)})).values
+    refused = scene.journal.noted(
+        lambda: Finding({"said": penetration_refused(at, state, moving=moving)})
+    ).values
     if refused["said"]:
         raise Stopped(refused["said"])
     return replace(record, step=step.number, scene=at, shown=at.displacement)
@@ -199,4 +229,6 @@ def _refuse_not_numbers(scene: Scene, state: State, where: str) -> None:
     system.strange = []
     system.residual(state.u, state.mu)
     if system.strange:
-        raise Stopped(f"{where}{' and '.join(system.strange)} is not a number at its begin, in value or derivative")
+        raise Stopped(
+            f"{where}{' and '.join(system.strange)} is not a number at its begin, in value or derivative"
+        )

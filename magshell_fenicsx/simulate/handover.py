@@ -1,9 +1,11 @@
-"""From a reduced model to the smallest one that has a mode which it excludes, and the branch of that mode.
+"""From a reduced model to the smallest one that has a mode which it excludes, and the branch of
+that mode.
 
-Waves cos(m theta) around a meridian have two planes of symmetry at 180/m degrees: they are followed in that sector,
-where a part has not these planes in a half, and else in the whole shell. A mode that is antisymmetric to a half
-is one of the whole shell. The state and the mode are carried over, and the bifurcation is located again
-(`continuation/bifurcation.py`): its load, energy and displacement differ by the error of the two meshes alone.
+Waves cos(m theta) around a meridian have two planes of symmetry at 180/m degrees: they are followed
+in that sector, where a part has not these planes in a half, and else in the whole shell. A mode
+that is antisymmetric to a half is one of the whole shell. The state and the mode are carried over,
+and the bifurcation is located again (`continuation/bifurcation.py`): its load, energy and
+displacement differ by the error of the two meshes alone.
 """
 
 from dataclasses import dataclass, replace
@@ -54,7 +56,8 @@ class Departure:
     path
         By arc length, in the amplitude of the step.
     point
-        The bifurcation, as a point of that path; its direction is the mode, in lengths of the system.
+        The bifurcation, as a point of that path; its direction is the mode, in lengths of the
+        system.
     said
         What handing over has changed, in words; "" where the model is the same.
     unstable
@@ -75,7 +78,12 @@ class Departure:
         """The point in the model's own amplitudes and displacements."""
         own = self.stage.point(self.point)
         point = replace(own, state=self.scene.model.system.advance(own.state, own.state.mu))
-        of = {"branch": number, "excluded_pivots": self.unstable, "said": self.said, "scene": self.scene}
+        of = {
+            "branch": number,
+            "excluded_pivots": self.unstable,
+            "said": self.said,
+            "scene": self.scene,
+        }
         return Record("step", self.path.name, point, **of)  # type: ignore[arg-type]
 
 
@@ -110,14 +118,22 @@ def departed(stage: Stage, bifurcation: Record, scale: float) -> Departure:
     try:
         mode = ShellModes(stage.scene.model).null_vector(bifurcation.point.state, bifurcation.mode)
     except ModesNotFound as e:
-        raise Stopped(f"the mode of the bifurcation ({bifurcation.mode}) is not found: {e}") from None
+        raise Stopped(
+            f"the mode of the bifurcation ({bifurcation.mode}) is not found: {e}"
+        ) from None
     u, phi = _carried(stage.scene, new, bifurcation, mode)
     mu = {**new.unloaded().mu, **bifurcation.point.state.mu}
     path = _by_arc(other, bifurcation.amplitude, scale)
     guess = _settled(other, path, State(u, mu), phi)
-    located = guess if isinstance(guess, str) else path.recorded(partial(_located, other, path, guess, phi))
+    located = (
+        guess
+        if isinstance(guess, str)
+        else path.recorded(partial(_located, other, path, guess, phi))
+    )
     if isinstance(located, str):
-        raise Stopped(f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: {located}")
+        raise Stopped(
+            f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: {located}"
+        )
     departure = Departure(other, path, located, unstable=bifurcation.excluded_pivots)
     return replace(departure, said=_differences(stage.scene, bifurcation, departure))
 
@@ -148,7 +164,8 @@ def larger(scene: Scene, mode: str) -> Scene:
 
 
 def leaving(stage: Stage, bifurcation: Record, goal: Goal, scale: float, number: int) -> Records:
-    """The records of the branch at a bifurcation in the model that has its mode; its value is the state at their end.
+    """The records of the branch at a bifurcation in the model that has its mode; its value is the
+    state at their end.
 
     One direction is followed: the other is the same shape, turned about e3 or mirrored.
 
@@ -182,7 +199,14 @@ def _by_arc(stage: Stage, name: str, scale: float) -> Path:
     return stage.path(name, "arc", StepOptions(FIRST, LONGEST * FIRST, 1e-5 * FIRST), scale)
 
 
-def _at(path: Path, state: State, phi: Vector, unstable: int, error: float = 0.0, load_error: float = 0.0) -> Point:
+def _at(
+    path: Path,
+    state: State,
+    phi: Vector,
+    unstable: int,
+    error: float = 0.0,
+    load_error: float = 0.0,
+) -> Point:
     comm = path.system.comm
     along = np.asarray(phi * path.system.length / max_abs(comm, phi))
     return Point(state, 0.0, along, 0.0, unstable, unstable, error=error, load_error=load_error)
@@ -211,7 +235,11 @@ def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | st
         held = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
         held = None
-    return _at(path, held[0], mode, 0) if held else "shells that touch do not come to rest there; take a finer mesh"
+    return (
+        _at(path, held[0], mode, 0)
+        if held
+        else "shells that touch do not come to rest there; take a finer mesh"
+    )
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
@@ -223,7 +251,9 @@ def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str
         return "Newton's method does not converge; take a finer mesh"
     comm = path.system.comm
     sign = 1.0 if dot(comm, located.phi, mode) > 0 else -1.0
-    point = _at(path, located.state, sign * located.phi, located.unstable, located.error, located.load_error)
+    point = _at(
+        path, located.state, sign * located.phi, located.unstable, located.error, located.load_error
+    )
     return replace(point, iterations=located.iterations, factorisations=located.factorisations)
 
 
@@ -270,17 +300,25 @@ def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
     return s, theta
 
 
-def _revolved(model: MeridianModel, s: Array, theta: Array, u: Vector, wave: Vector, m: int) -> tuple[Array, Array]:
-    """u(s) and the wave U cos e_rho + V sin e_theta + W cos e_z at places, (n, 3) each; the crest of u . n inwards."""
+def _revolved(
+    model: MeridianModel, s: Array, theta: Array, u: Vector, wave: Vector, m: int
+) -> tuple[Array, Array]:
+    """u(s) and the wave U cos e_rho + V sin e_theta + W cos e_z at places, (n, 3) each; the crest
+    of u . n inwards.
+    """
     radial, axial = _evaluated(model, model.V, u, s).T
     U_and_V, V, W = _evaluated(model, model.excluded_modes.waves.V, wave, s).T
     cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
     e_rho, e_theta = np.column_stack([cos, sin, zero]), np.column_stack([-sin, cos, zero])
 
     def in_space(a: Array, b: Array, c: Array) -> Array:
-        return np.asarray(a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c]))
+        return np.asarray(
+            a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c])
+        )
 
-    waved = in_space((U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta))
+    waved = in_space(
+        (U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta)
+    )
     return in_space(radial, zero, axial), _sign(model, wave) * waved
 
 
@@ -306,7 +344,9 @@ def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) 
 
 
 def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, Array]:
-    """u and its antisymmetric mode of a half at the nodes of the whole shell, (n, 3) each; collective."""
+    """u and its antisymmetric mode of a half at the nodes of the whole shell, (n, 3) each;
+    collective.
+    """
     comm, size = old.model.system.comm, old.model.system.size
     mirror = old.problem.mirror
     assert isinstance(mirror, Mirror)
@@ -315,8 +355,12 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     off = mirror.beyond(places) > 1e-9
     S = mirror.reflection
     x = np.concatenate([places, mirror.image(places[off])])
-    both = [np.concatenate([f, sign * f[off] @ S]) for f, sign in zip(fields, (1.0, -1.0), strict=True)]
-    Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T  # from the new frame to the old one
+    both = [
+        np.concatenate([f, sign * f[off] @ S]) for f, sign in zip(fields, (1.0, -1.0), strict=True)
+    ]
+    Q = (
+        rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
+    )  # from the new frame to the old one
     wanted = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
     values, at_nodes = np.hstack(both), np.zeros((len(wanted), 6))
     for inside, own in of_shells(old, new):
@@ -327,7 +371,9 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
 
 
 def through(x: Array, values: Array, wanted: Array) -> Array:
-    """Values (n, k) on a smooth surface at places (n, 3) near nodes x, by cubic polynomials of the tangent plane."""
+    """Values (n, k) on a smooth surface at places (n, 3) near nodes x, by cubic polynomials of the
+    tangent plane.
+    """
     count = min(NEAREST, len(x))
     near = scipy.spatial.cKDTree(x).query(wanted, count)[1].reshape(len(wanted), count)
     beside = x[near] - wanted[:, None]

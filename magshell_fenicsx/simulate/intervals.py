@@ -1,8 +1,10 @@
-"""The rows of a motion: its states at given times, from the journal where it has them, and their errors.
+"""The rows of a motion: its states at given times, from the journal where it has them, and their
+errors.
 
-Departures from unstable states magnify the errors of steps, by a factor that the end of the motion alone shows. So a
-motion whose error at the rows is asked for is rehearsed with longer steps. The first rehearsal shows when it is
-fastest: until then no step is longer than there. Two more show the error, which goes as the square of the steps.
+Departures from unstable states magnify the errors of steps, by a factor that the end of the motion
+alone shows. So a motion whose error at the rows is asked for is rehearsed with longer steps. The
+first rehearsal shows when it is fastest: until then no step is longer than there. Two more show the
+error, which goes as the square of the steps.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -54,7 +56,9 @@ class Rehearsal:
     part: float
 
     def error(self, scene: Scene, row: int, u: Vector | None) -> float:
-        """Estimated error of the motion's displacement over the system's length, at a row or, without u, before it."""
+        """Estimated error of the motion's displacement over the system's length, at a row or,
+        without u, before it.
+        """
         row, square = min(row, len(self.rows) - 1), self.part**2
         if u is None or self.part > CLEAR:
             return square * self.errors[row]
@@ -79,7 +83,8 @@ class Rehearsed:
     ends
         The times of rows.
     over
-        Whether a motion need not be followed beyond the second of two rows; the third is the largest kinetic energy.
+        Whether a motion need not be followed beyond the second of two rows; the third is the
+        largest kinetic energy.
     """
 
     scene: Scene
@@ -93,7 +98,9 @@ class Rehearsed:
         """Choose steps with which the error at all rows is below the tolerance."""
         scene, tolerance = self.scene, steps.tolerance
         coarse = replace(steps, tolerance=max(tolerance, min(COARSER * tolerance, COARSEST)))
-        speeds = [(max_abs(scene.model.system.comm, now.v), now.t, dt) for now, dt in self._rows(coarse)]
+        speeds = [
+            (max_abs(scene.model.system.comm, now.v), now.t, dt) for now, dt in self._rows(coarse)
+        ]
         speed, fastest, _ = max(speeds)
         longest = max(dt for v, _, dt in speeds if v >= FAST * speed)
         coarse, part = replace(coarse, longest=longest, fastest=fastest), 1.0
@@ -118,7 +125,9 @@ class Rehearsed:
         most = integrator.kinetic(now)
         for end in self.ends:
             before, count = now, integrator.steps
-            self.scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
+            self.scene.progress.trying(
+                Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t
+            )
             now, dt = walk.moved(before, dt, end)
             most = max(most, integrator.kinetic(now))
             yield now, (now.t - before.t) / (integrator.steps - count)
@@ -147,9 +156,13 @@ class Intervals:
     marks: Collection[float]
     rehearse: Rehearsed | None = None
     _rehearsal: Rehearsal | None = field(default=None, init=False)
-    _last: Point | None = field(default=None, init=False)  # of the journal, what the factors belonged to
+    _last: Point | None = field(
+        default=None, init=False
+    )  # of the journal, what the factors belonged to
 
-    def moved(self, now: Motion, dt: float, end: float, *, known: bool = False) -> tuple[Motion, float]:
+    def moved(
+        self, now: Motion, dt: float, end: float, *, known: bool = False
+    ) -> tuple[Motion, float]:
         """The motion at a later time, which may be `known` already, and the step to go on with."""
         between = partial(self.scene.journal.check, known)
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
@@ -158,7 +171,9 @@ class Intervals:
             now, dt = advance(self.integrator, now, t, self.steps, dt, between)
         return now, dt
 
-    def crossing(self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]) -> float:
+    def crossing(
+        self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]
+    ) -> float:
         """The time between two motions at which a function of them changes its sign."""
         close, ends = CLOSE * (end.t - now.t), {now.t: now, end.t: end}
         self._refactor()
@@ -172,23 +187,32 @@ class Intervals:
     def journalled(self, now: Motion, dt: float, end: float) -> tuple[Motion, float, Point]:
         """The motion at a later time, the step to go on with, and the point there.
 
-        In the journal these are three points: the motion, what it needs besides, and what the latest factors belong to.
+        In the journal these are three points: the motion, what it needs besides, and what the
+        latest factors belong to.
         """
         scene, integrator = self.scene, self.integrator
         points = list[Point]()
         while len(points) < 3 and isinstance(part := scene.journal.replay(), Point):
             points.append(part)
-        again = integrator.viscous is not None  # the journal has no place for a branch's strains: computed again
+        again = (
+            integrator.viscous is not None
+        )  # the journal has no place for a branch's strains: computed again
         if len(points) == 3 and not again:
             first, second, self._last = points
             scene.newton.factorisation.habit = first.habit
             mu, potentials = dict(first.state.mu), dict(second.state.mu)
             u, v, a = first.state.u, first.du, second.state.u
-            return Motion(first.s, u, v, a, mu, second.s, second.dmu, potentials, second.error), first.dmu, first
+            return (
+                Motion(first.s, u, v, a, mu, second.s, second.dmu, potentials, second.error),
+                first.dmu,
+                first,
+            )
         self._refactor()
         before = integrator.steps, integrator.iterations, integrator.factorisation.count
         try:
-            if self.rehearse and not self._rehearsal:  # not before it is needed: a journal may have all rows
+            if (
+                self.rehearse and not self._rehearsal
+            ):  # not before it is needed: a journal may have all rows
                 self._rehearsal = self.rehearse(self.steps)
                 self.steps = self._rehearsal.steps
             scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
@@ -204,11 +228,15 @@ class Intervals:
         state = scene.model.system.placed(State(now.u, now.mu))
         stage = staged(scene, state, self.held)
         # rigid motions that are free have no stiffness: the sign of their pivots is rounding
-        pivots = 0 if scene.free_in_time else stage.newton.factor_at(stage.enter(state)).negative_pivots
+        pivots = (
+            0 if scene.free_in_time else stage.newton.factor_at(stage.enter(state)).negative_pivots
+        )
         still = 0.0 * now.a
         habit = scene.newton.factorisation.habit
         point = Point(state, now.t, now.v, dt, pivots, pivots, *spent, error=error, habit=habit)
-        rest = Point(State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error)
+        rest = Point(
+            State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error
+        )
         made = integrator.factored or Factored(still, {}, 0.0, integrator.factorisation.habit)
         factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
         for part in (point, rest, factors)[len(points) :]:
@@ -216,9 +244,13 @@ class Intervals:
         return now, dt, point
 
     def _refactor(self) -> None:
-        """Make the factors that the run had kept: others end iterations elsewhere, within their tolerance."""
+        """Make the factors that the run had kept: others end iterations elsewhere, within their
+        tolerance.
+        """
         last, self._last = self._last, None
-        if self.integrator.averaged:  # beside a body factors belong to a whole step: each interval makes its own
+        if (
+            self.integrator.averaged
+        ):  # beside a body factors belong to a whole step: each interval makes its own
             self.integrator.factored = None
         if last and last.s and not self.integrator.averaged:
             self.integrator.factor(Factored(last.state.u, dict(last.state.mu), last.s, last.habit))

@@ -1,7 +1,7 @@
 """A scene with another number of its problem, on the same mesh: for derivatives by differences.
 
-The problem is the one that a file with this number would give: lengths with units stay, those over h or in the unit of
-a dimple's width change with these.
+The problem is the one that a file with this number would give: lengths with units stay, those over
+h or in the unit of a dimple's width change with these.
 """
 
 from collections.abc import Collection, Iterable
@@ -35,7 +35,16 @@ OF_MATERIAL = (
     "thickness_factor",
 )
 OF_DEVIATION = ("imperfections", "defect")
-BESIDE = ("mesh", "stability", "frequencies", "gradients", "ensemble", "design", "identify", "output")
+BESIDE = (
+    "mesh",
+    "stability",
+    "frequencies",
+    "gradients",
+    "ensemble",
+    "design",
+    "identify",
+    "output",
+)
 ELSEWHERE = (*BESIDE, "loading", "points", "boundary")
 
 
@@ -45,7 +54,8 @@ def number_of(context: Context, key: str) -> float:
     Raises
     ------
     CaseError
-        If there is no number, or one that changes the mesh, a target or the modes of the perfect shell.
+        If there is no number, or one that changes the mesh, a target or the modes of the perfect
+        shell.
     """
     part, _ = _at(context, key)
     if isinstance(part, bool) or not isinstance(part, int | float):
@@ -53,16 +63,26 @@ def number_of(context: Context, key: str) -> float:
     if isinstance(part, int):
         raise CaseError(f"{key}: is a whole number: it has no gradient")
     if key.startswith("magnetic.remanent.layers.") and key.endswith(".fraction"):
-        raise CaseError(f"{key}: the fractions of the layers add up to 1: one alone has no gradient")
+        raise CaseError(
+            f"{key}: the fractions of the layers add up to 1: one alone has no gradient"
+        )
     if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
-    own = key.split(".", 2)[2] if key.startswith("shells.") else key  # of one of several shells, in its own section
+    own = (
+        key.split(".", 2)[2] if key.startswith("shells.") else key
+    )  # of one of several shells, in its own section
     section, _, rest = own.partition(".")
     geometry = section == "shell" and rest.split(".")[0] not in (*OF_MATERIAL, *OF_DEVIATION)
     if section in ELSEWHERE or geometry:
-        raise CaseError(f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here")
+        raise CaseError(
+            f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here"
+        )
     flaws = [*(context.sections.get("imperfections") or {}).values()]
-    flaws += [flaw for each in (context.sections.get("shells") or {}).values() for flaw in each.shell.imperfections]
+    flaws += [
+        flaw
+        for each in (context.sections.get("shells") or {}).values()
+        for flaw in each.shell.imperfections
+    ]
     if any(flaw.of_perfect_shell for flaw in flaws) and ".imperfections." not in key:
         raise CaseError(
             f"{key}: the modes of the perfect shell, which the case has as imperfections, change with it: give their "
@@ -74,12 +94,17 @@ def number_of(context: Context, key: str) -> float:
 def size_of(context: Context, key: str) -> float:
     """What a change of the number at a key is small against.
 
-    The number itself; of a zero the largest number of its list, of a zero length R in the case's unit, else one.
+    The number itself; of a zero the largest number of its list, of a zero length R in the case's
+    unit, else one.
     """
     value, is_a_length = _at(context, key)
     beside, _ = _at(context, key.rpartition(".")[0])
     numbers = [v for v in beside if isinstance(v, float | int)] if isinstance(beside, list) else []
-    return abs(value) or max(map(abs, numbers), default=0.0) or (context.shell.reference if is_a_length else 1.0)
+    return (
+        abs(value)
+        or max(map(abs, numbers), default=0.0)
+        or (context.shell.reference if is_a_length else 1.0)
+    )
 
 
 def _at(context: Context, key: str) -> tuple[Any, bool]:
@@ -90,7 +115,9 @@ def _at(context: Context, key: str) -> tuple[Any, bool]:
     CaseError
         If there is no such key.
     """
-    part: Any = {name: section for name, section in context.sections.items() if name != "imperfections"}
+    part: Any = {
+        name: section for name, section in context.sections.items() if name != "imperfections"
+    }
     a_length = False
     for name in key.split("."):
         try:
@@ -128,11 +155,14 @@ def scene_with(scene: Scene, key: str, value: float) -> Scene:
     Raises
     ------
     CaseError
-        If the number breaks the symmetry by which only a part is modelled, or moves an edge of a patch.
+        If the number breaks the symmetry by which only a part is modelled, or moves an edge of a
+        patch.
     """
     old, new = scene.problem, scene.problem.again({key: value})
     if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
-        raise CaseError(f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none")
+        raise CaseError(
+            f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none"
+        )
     if new.patched and _rims(new) != _rims(old):
         raise CaseError(
             f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width with a unit "
@@ -145,12 +175,23 @@ def _rims(problem: Problem) -> list[object]:
     """Where the rims of patches are."""
     shell = problem.context.shell
     local = [each for each in problem.imperfections.values() if isinstance(each, LocalSection)]
-    return [(each.half_width(shell.R_over_h, shell.poisson_ratio), each.at) for each in local if each.patch]
+    return [
+        (each.half_width(shell.R_over_h, shell.poisson_ratio), each.at)
+        for each in local
+        if each.patch
+    ]
 
 
 def on_mesh_of(scene: Scene, new: Problem) -> Problem:
-    """What a problem changes beside the mesh, for the mesh of a scene in its chart; imperfections change too."""
-    old, model, meridian, shape = scene.problem, scene.model, scene.problem.meridian, scene.problem.shape
+    """What a problem changes beside the mesh, for the mesh of a scene in its chart; imperfections
+    change too.
+    """
+    old, model, meridian, shape = (
+        scene.problem,
+        scene.model,
+        scene.problem.meridian,
+        scene.problem.shape,
+    )
     if model.midsurface:
         shape = model.midsurface.reshaped(new.embedding)
     elif model.axisymmetric:
@@ -170,8 +211,11 @@ def on_mesh_of(scene: Scene, new: Problem) -> Problem:
     )
 
 
-def carried(old: Scene, new: Scene, state: State, own: Collection[str] = (), steps: int | None = None) -> State:
-    """The state with the loads of the new scene: where its targets are other numbers, amplitudes are in proportion.
+def carried(
+    old: Scene, new: Scene, state: State, own: Collection[str] = (), steps: int | None = None
+) -> State:
+    """The state with the loads of the new scene: where its targets are other numbers, amplitudes
+    are in proportion.
 
     Parameters
     ----------
@@ -180,24 +224,37 @@ def carried(old: Scene, new: Scene, state: State, own: Collection[str] = (), ste
     steps
         How many steps of the programme led to the state; None: all.
     """
-    ratios, fields = goals(old, new, "load", steps), [name for name in state.mu if name.startswith("lambda_")]
+    ratios, fields = (
+        goals(old, new, "load", steps),
+        [name for name in state.mu if name.startswith("lambda_")],
+    )
     for contact, other in zip(old.problem.loads.contacts, new.problem.loads.contacts, strict=True):
         ratios[contact.setting] = other.stiffness / contact.stiffness
     given, now = old.unloaded().mu, new.unloaded().mu  # stiffnesses of parts are amplitudes too
     ratios |= {name: now[name] / value for name, value in given.items() if value and name in now}
     if "lambda_m" in state.mu and new.problem.lambda_m != old.problem.lambda_m:
         if not old.problem.lambda_m:
-            raise CaseError("magnetic: a field of zero has no derivative by a number: take by: lambda_m")
+            raise CaseError(
+                "magnetic: a field of zero has no derivative by a number: take by: lambda_m"
+            )
         ratios |= dict.fromkeys(fields, new.problem.lambda_m / old.problem.lambda_m)
     return State(
-        state.u, {name: value * (1.0 if name in own else ratios.get(name, 1.0)) for name, value in state.mu.items()}
+        state.u,
+        {
+            name: value * (1.0 if name in own else ratios.get(name, 1.0))
+            for name, value in state.mu.items()
+        },
     )
 
 
 def goals(old: Scene, new: Scene, quantity: str, steps: int | None = None) -> dict[str, float]:
-    """Amplitude -> target of the new scene over that of the old one, where they differ: those that have units."""
+    """Amplitude -> target of the new scene over that of the old one, where they differ: those that
+    have units.
+    """
     targets = dict[str, float]()
-    for before, after in zip(old.problem.programme[:steps], new.problem.programme[:steps], strict=True):
+    for before, after in zip(
+        old.problem.programme[:steps], new.problem.programme[:steps], strict=True
+    ):
         one, two = before.load.target, after.load.target
         if one and two and one[0].quantity == quantity and one[1] and one[1] != two[1]:
             targets[before.name] = two[1] / one[1]
@@ -207,7 +264,11 @@ def goals(old: Scene, new: Scene, quantity: str, steps: int | None = None) -> di
 def alike(one: object, two: object) -> bool:
     """Whether two shapes have the same bounds of their charts, as far as these are known."""
     a, b = box_of(one), box_of(two)
-    return a is None or b is None or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
+    return (
+        a is None
+        or b is None
+        or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
+    )
 
 
 def box_of(shape: object) -> tuple[Array, Array] | None:

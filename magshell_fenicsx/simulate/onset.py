@@ -1,6 +1,8 @@
-"""Where on the way to a first guess shells begin to touch: a step ends just before, and the next one just behind.
+"""Where on the way to a first guess shells begin to touch: a step ends just before, and the next
+one just behind.
 
-A guess from before a contact knows nothing of it: shells would lie deep in each other, and Newton's method circle.
+A guess from before a contact knows nothing of it: shells would lie deep in each other, and Newton's
+method circle.
 """
 
 from collections.abc import Callable
@@ -14,7 +16,8 @@ from magshell_fenicsx.parts.touching.touching import NEARER, Touching
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
-DEEP = 2e-3  # of the thickness: how far before and past the first contact the guesses of two steps lead
+# of the thickness: how far before and past the first contact the guesses of two steps lead
+DEEP = 2e-3
 CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
 
@@ -22,10 +25,12 @@ MOST = 40  # looks at a way
 def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> Ahead:
     """Where shells meet that do not touch yet, and whether all that touch let go; collective.
 
-    Of pairs that meet on the straight way between two states of a step the first one counts. A step ends just behind
-    where it meets if the first state is near that, else just before.
+    Of pairs that meet on the straight way between two states of a step the first one counts. A step
+    ends just behind where it meets if the first state is near that, else just before.
     """
-    touchings = [each for each in scene.model.touchings if isinstance(each, Touching)]  # not those on meridians
+    touchings = [
+        each for each in scene.model.touchings if isinstance(each, Touching)
+    ]  # not those on meridians
     if not touchings:
         return Ahead()
     ends = leave(here), leave(guess)

@@ -44,7 +44,9 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         r0 = meridian.placement(V)
         refuse_misplaced_rings(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(given, r0, meridian.patches) if given else None
-        curves.touchings(pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness)
+        curves.touchings(
+            pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness
+        )
         return
     from magshell_fenicsx.parts.touching.building import touchings
 
@@ -57,7 +59,9 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     if given and given.given:
         given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
     thickness = thickness_field(given, r0, surface.patches) if given else None
-    touchings(pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness)
+    touchings(
+        pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness
+    )
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:

@@ -1,4 +1,6 @@
-"""The modes of the perfect shell that a problem has as imperfections: computed once, before a scene is built."""
+"""The modes of the perfect shell that a problem has as imperfections: computed once, before a scene
+is built.
+"""
 
 import json
 from typing import TYPE_CHECKING
@@ -58,7 +60,9 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
 
 
 def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, ...]:
-    """The lowest modes of a shell at its first instability, or at the end of its history without one; collective."""
+    """The lowest modes of a shell at its first instability, or at the end of its history without
+    one; collective.
+    """
     scene = Scene(problem, comm)
     state = scene.unloaded()
     try:
@@ -69,13 +73,19 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
     except Stopped:  # the last point that was reached
         pass
     if not any(state.mu.values()):
-        raise CaseError("shell.imperfections: kind: modes: are those of a shell under a load, and there is none")
+        raise CaseError(
+            "shell.imperfections: kind: modes: are those of a shell under a load, and there is none"
+        )
     try:
         modes = ShellModes(scene.model).lowest(state, count)[:count]
     except ModesNotFound as e:
-        raise CaseError(f"shell.imperfections: the modes of the perfect shell are not found: {e}") from None
+        raise CaseError(
+            f"shell.imperfections: the modes of the perfect shell are not found: {e}"
+        ) from None
     if len(modes) < count:
-        raise CaseError(f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not {count}")
+        raise CaseError(
+            f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not {count}"
+        )
     return tuple(_shape(scene, mode) for mode in modes)
 
 
@@ -83,7 +93,10 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
     """One function of the place, or of several shells one for each that it moves."""
     model, mirror = scene.model, None
     if model.axisymmetric:
-        (x, w), order = _along_meridian(model, mode), np.argsort(model.V.tabulate_dof_coordinates()[:, 0])
+        (x, w), order = (
+            _along_meridian(model, mode),
+            np.argsort(model.V.tabulate_dof_coordinates()[:, 0]),
+        )
         inside = [of[order] for of in nodes_of_shells(scene)]
     else:
         assert model.thin
@@ -130,7 +143,9 @@ def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
     numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))
     table = V.element.basix_element.tabulate(1, compat.interpolation_points(V))[:, :, :, 0]
-    r0, v = (x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector)))
+    r0, v = (
+        x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector))
+    )
     _, r_1, r_2 = np.matmul(table[:, None], r0)
     parts = comm.allgather((numbers, *(a.reshape(-1, 3) for a in (r0, v, np.cross(r_1, r_2)))))
     where, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -1,8 +1,8 @@
 """Compile kernels ahead of time, for images and clusters without a compiler at run time.
 
-These are the kernels of hemispheres, of their solids, and of any mid-surface under dead loads. Remanences by formula,
-fields with a gradient, approximate energies, surfaces with kinks and loads of other solids compile theirs on the first
-run.
+These are the kernels of hemispheres, of their solids, and of any mid-surface under dead loads.
+Remanences by formula, fields with a gradient, approximate energies, surfaces with kinks and loads
+of other solids compile theirs on the first run.
 """
 
 import time
@@ -27,7 +27,13 @@ SCENES = (
 )
 SOLIDS = SCENES[::2]  # of one degree
 OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its own
-    "shell": {"geometry": "cylinder", "radius": 1, "length": 1, "azimuth": [0, 90], "thickness": 0.05}
+    "shell": {
+        "geometry": "cylinder",
+        "radius": 1,
+        "length": 1,
+        "azimuth": [0, 90],
+        "thickness": 0.05,
+    }
     | {"youngs_modulus": 1, "poisson_ratio": 0.3},
     "magnetic": {"lambda_m": 1e-3},
     "boundary": {"left": "symmetry", "right": "symmetry", "bottom": "symmetry"},
@@ -57,8 +63,23 @@ def precompile(degree: int, made: Callable[[Source], Problem]) -> float:
 
 def _cases(degree: int) -> Iterator[dict[str, Any]]:
     for symmetry, loading in SCENES:
-        yield {**HEMISPHERE, "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5, "degree": degree}}
+        yield {
+            **HEMISPHERE,
+            "symmetry": symmetry,
+            "loading": loading,
+            "mesh": {"refinement": 0.5, "degree": degree},
+        }
     for symmetry, loading in SOLIDS:
-        yield {**HEMISPHERE, "model": "solid", "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5}}
+        yield {
+            **HEMISPHERE,
+            "model": "solid",
+            "symmetry": symmetry,
+            "loading": loading,
+            "mesh": {"refinement": 0.5},
+        }
     for factor in ({}, {"thickness_factor": "1 + z/2"}):
-        yield {**OCTANT, "shell": {**OCTANT["shell"], **factor}, "mesh": {"size": 0.5, "degree": degree}}
+        yield {
+            **OCTANT,
+            "shell": {**OCTANT["shell"], **factor},
+            "mesh": {"size": 0.5, "degree": degree},
+        }

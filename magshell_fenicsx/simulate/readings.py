@@ -1,11 +1,13 @@
-"""What an instrument reads on the path of a scene: results at places of the last step, or at its end; with slopes.
+"""What an instrument reads on the path of a scene: results at places of the last step, or at its
+end; with slopes.
 
-A place is a value of what the last step prescribes, its load or the displacement conjugate to it, in the case's unit.
-There the equilibrium is solved, and a result y has the derivative
+A place is a value of what the last step prescribes, its load or the displacement conjugate to it,
+in the case's unit. There the equilibrium is solved, and a result y has the derivative
 
     dy/dp at the place = dy/dp + dy/dmu dmu/dp,
 
-with dmu/dp of the load that keeps the place: where its unit depends on p, as the buckling pressure does on a thickness.
+with dmu/dp of the load that keeps the place: where its unit depends on p, as the buckling pressure
+does on a thickness.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +30,12 @@ from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import BEYOND, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
+from magshell_fenicsx.simulate.gradients.instabilities import (
+    FOLDS,
+    Lost,
+    instabilities,
+    refuse_moving,
+)
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import number_of, size_of
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -119,7 +126,9 @@ class Places:
         if self.by_conjugate:
             own = {of: (column, unit) for column, (of, unit) in conjugates(scene).items()}
             if self.name not in own:
-                raise CaseError(f"{self.step.key}: what it prescribes is no column: give it control: load or arc")
+                raise CaseError(
+                    f"{self.step.key}: what it prescribes is no column: give it control: load or arc"
+                )
             self.bare, self._unit = own[self.name]
         self._size = scene.sizes.size(self.bare)
         shown = scene.sizes.column(self.bare)
@@ -135,7 +144,11 @@ class Places:
     def row(self, system: System, place: float) -> Row:
         """What holds at a place."""
         value = place / self._size * self._unit
-        return GivenConjugate(system, self.name, value) if self.by_conjugate else GivenLoad(self.name, value)
+        return (
+            GivenConjugate(system, self.name, value)
+            if self.by_conjugate
+            else GivenLoad(self.name, value)
+        )
 
     def rate(self, key: str) -> float:
         """d ln mu/dp of the load that keeps its place, less that of the load which gradients keep.
@@ -153,7 +166,9 @@ class Places:
         over = 2 * step
         needed, used = -(sizes[1] - sizes[0]) / (over * self._size), (kept[1] - kept[0]) / over
         if self.by_conjugate and abs(needed - used) * abs(value or 1.0) > SAME:
-            raise CaseError(f"{key}: changes the unit of {self.column}: give the target of {self.step.key} that unit")
+            raise CaseError(
+                f"{key}: changes the unit of {self.column}: give the target of {self.step.key} that unit"
+            )
         return 0.0 if self.by_conjugate else float(needed - used)
 
     def _kept(self, other: Problem) -> float:
@@ -223,7 +238,9 @@ class Read:
         """Places and rows of the points of the last step."""
         states = [record.point.state for record in self._way()]
         rows = [(state, self.scene.observe(state)) for state in states]
-        return [(self.places.of(state), {**row, **self.scene.sizes.values(row)}) for state, row in rows]
+        return [
+            (self.places.of(state), {**row, **self.scene.sizes.values(row)}) for state, row in rows
+        ]
 
     def adjoint(self, reading: Reading) -> Adjoint:
         """That of a reading, not of a change.
@@ -239,7 +256,9 @@ class Read:
                 raise Lost(self._lost)
             try:
                 if of in FOLDS:
-                    return instabilities(scene, self._records, of, begins=self._history.begins)[0][1]
+                    return instabilities(scene, self._records, of, begins=self._history.begins)[0][
+                        1
+                    ]
                 refuse_moving(scene, self._records[-1], of)
                 return adjoint_at_end(scene, self._history, of)[1]
             except FoldLost as e:
@@ -251,7 +270,9 @@ class Read:
         return adjoint(self.scene, record, of, None, self._history.begins)
 
     def slopes(self, adjoints: Sequence[Adjoint], key: str, placed: Sequence[bool]) -> Array:
-        """Derivatives of results by a number of the case; a place stays where `placed` says that there is one."""
+        """Derivatives of results by a number of the case; a place stays where `placed` says that
+        there is one.
+        """
         others = dict[float, Scene]()  # the same for all results
         slopes = np.array([float(derivative(each, key, others)) for each in adjoints])  # type: ignore[arg-type]
         if not any(placed) or not (rate := self.places.rate(key)):
@@ -266,7 +287,9 @@ class Read:
     @property
     def begin(self) -> Record:
         """Where the last step begins, as a point of it."""
-        return replace(self._way()[0], label="target", amplitude=self.places.name, step=self.places.step.number)
+        return replace(
+            self._way()[0], label="target", amplitude=self.places.name, step=self.places.step.number
+        )
 
     def record_at(self, place: float) -> Record:
         """The equilibrium at a place, where the path first passes it; collective.
@@ -286,24 +309,47 @@ class Read:
         way, places = self._way(), self.places
         values = [places.of(each.point.state) for each in way]
         slack = SLACK * (max(values) - min(values)) if values else 0.0
-        k = next((k for k in range(len(way) - 1) if self._between(values[k], values[k + 1], place, slack)), None)
+        k = next(
+            (
+                k
+                for k in range(len(way) - 1)
+                if self._between(values[k], values[k + 1], place, slack)
+            ),
+            None,
+        )
         if k is None:
-            reached = f"goes from {min(values):.6g} to {max(values):.6g}" if len(values) > 1 else "has no such point"
+            reached = (
+                f"goes from {min(values):.6g} to {max(values):.6g}"
+                if len(values) > 1
+                else "has no such point"
+            )
             why = f" ({self._lost})" if self._lost else ""
-            raise Outside(f"{places.column} = {place:.6g} is outside the path, which {reached}{why}", place)
+            raise Outside(
+                f"{places.column} = {place:.6g} is outside the path, which {reached}{why}", place
+            )
         low, high = ((values[i], way[i].point.state) for i in (k, k + 1))
         try:
-            state = self._between_states(stage_of(self.scene, places.step, low[1]), low, high, place)
+            state = self._between_states(
+                stage_of(self.scene, places.step, low[1]), low, high, place
+            )
         except Lost as e:
-            raise NotRead(f"no equilibrium is found at {places.column} = {place:.6g}: {e}", place) from None
+            raise NotRead(
+                f"no equilibrium is found at {places.column} = {place:.6g}: {e}", place
+            ) from None
         point = Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0)
         return Record("target", places.name, point, step=places.step.number)
 
-    def _between_states(self, stage: Stage, low: Placed, high: Placed, place: float, tries: int = TRIES) -> State:
-        """The equilibrium at a place between two; where Newton's method fails, first one halfway to the nearer."""
+    def _between_states(
+        self, stage: Stage, low: Placed, high: Placed, place: float, tries: int = TRIES
+    ) -> State:
+        """The equilibrium at a place between two; where Newton's method fails, first one halfway to
+        the nearer.
+        """
         (first, a), (last, b) = low, high
         part = float(np.clip((place - first) / ((last - first) or 1.0), 0.0, 1.0))
-        mu = {name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()}
+        mu = {
+            name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()
+        }
         guess = self.scene.model.system.placed(State((1 - part) * a.u + part * b.u, mu))
         row = self.places.row(stage.newton.system, place)
         ended = stage.newton.solve(stage.enter(guess), self.places.name, row)
@@ -340,8 +386,8 @@ def read(
     slopes
         Whether they are; else slopes are zero.
     fields
-        Fields that they are differentiated by too (see `gradients.gradient`) -> how many numbers they have, and
-        what makes the derivatives by these of a gradient; they follow those by keys.
+        Fields that they are differentiated by too (see `gradients.gradient`) -> how many numbers
+        they have, and what makes the derivatives by these of a gradient; they follow those by keys.
 
     Raises
     ------
@@ -352,7 +398,9 @@ def read(
     """
     path = Read(scene, wanted)
     changed = list(dict.fromkeys(each.of for each in wanted if each.change))
-    adjoints = [path.adjoint(each) for each in wanted] + [path.adjoint_at(path.begin, of) for of in changed]
+    adjoints = [path.adjoint(each) for each in wanted] + [
+        path.adjoint_at(path.begin, of) for of in changed
+    ]
     placed = [each.at is not None for each in wanted] + [True for _ in changed]
     values = np.array([each.shown for each in adjoints])
     by = np.zeros((len(adjoints), len(keys) + sum(count for count, _ in (fields or {}).values())))
@@ -367,5 +415,7 @@ def read(
         if reading.change:
             at_begin = len(wanted) + changed.index(reading.of)
             values[i], by[i] = values[i] - values[at_begin], by[i] - by[at_begin]
-    curves = {each.of: path.curve(each.of, change=each.change) for each in wanted if each.at is not None}
+    curves = {
+        each.of: path.curve(each.of, change=each.change) for each in wanted if each.at is not None
+    }
     return Readings(values[: len(wanted)], by[: len(wanted)], curves)

@@ -22,19 +22,19 @@ class Record:
     Attributes
     ----------
     label
-        "field": during the growth of the field; "step": between targets; "target": a requested point;
-        "fold" and "bifurcation": a located instability; "solution": a further equilibrium at the amplitudes of the
-        point where its step ends.
+        "field": during the growth of the field; "step": between targets; "target": a requested
+        point; "fold" and "bifurcation": a located instability; "solution": a further equilibrium at
+        the amplitudes of the point where its step ends.
     amplitude
         The amplitude that varied ("" at the start).
     mode
-        For a mode that a reduced model excludes and that becomes unstable or stable here: "antisymmetric" to the
-        mirror plane of a half shell, or "m = 7" waves around an axisymmetric one.
-        For a bifurcation of the model itself: "symmetric" if the load changes equally in both directions of the
-        branch (a pitchfork), or "asymmetric".
+        For a mode that a reduced model excludes and that becomes unstable or stable here:
+        "antisymmetric" to the mirror plane of a half shell, or "m = 7" waves around an axisymmetric
+        one. For a bifurcation of the model itself: "symmetric" if the load changes equally in both
+        directions of the branch (a pitchfork), or "asymmetric".
     branch
-        0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation; of a solution its
-        number.
+        0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation;
+        of a solution its number.
     excluded_pivots
         Number of unstable directions that the model excludes; see `continuation.watch.Watch`.
     step
@@ -68,8 +68,8 @@ class Record:
     def u(self) -> "fem.Function":
         """The displacement as a dolfinx function; collective.
 
-        It is on the mesh that a program has given, in the lengths of its coordinates; else on the scene's own mesh,
-        which is flat triangles or the meridian, in R.
+        It is on the mesh that a program has given, in the lengths of its coordinates; else on the
+        scene's own mesh, which is flat triangles or the meridian, in R.
         """
         assert self.shown, "of a record of follow or trace"
         return self.shown(self.point.state)

@@ -1,7 +1,9 @@
-"""A meridian's scene for other numbers of its case: the same forms and kernels, with other values in place.
+"""A meridian's scene for other numbers of its case: the same forms and kernels, with other values
+in place.
 
-Terms take what differs between two cases from the placement and from the parameters of their densities. So where two
-models have these alike, one of them serves both: each evaluation puts the values of its case in place first.
+Terms take what differs between two cases from the placement and from the parameters of their
+densities. So where two models have these alike, one of them serves both: each evaluation puts the
+values of its case in place first.
 """
 
 from dataclasses import dataclass, field
@@ -50,7 +52,11 @@ class Renumbered:
     """
 
     def __init__(self, scene: Scene, model: MeridianModel, places: Numbers) -> None:
-        self._scene, self._model, self._numbers = scene, model, _InPlace(places, {np.inf: _copied(places)})
+        self._scene, self._model, self._numbers = (
+            scene,
+            model,
+            _InPlace(places, {np.inf: _copied(places)}),
+        )
 
     @staticmethod
     def of(scene: Scene) -> "Renumbered | None":
@@ -60,13 +66,17 @@ class Renumbered:
         return Renumbered(scene, model, places) if model.axisymmetric and places else None
 
     def at(self, value: float, problem: Problem) -> Scene | None:
-        """The scene of a problem at a value of what varies; None if its numbers are not in the same places."""
+        """The scene of a problem at a value of what varies; None if its numbers are not in the same
+        places.
+        """
         model = build_meridian_model(problem, assembled=False)
         numbers, places = model.numbers(), self._numbers.places
         if numbers is None or _shapes(numbers) != _shapes(places):
             return None
         self._numbers.of_values[value] = _copied(numbers)
-        return self._scene.renumbered(problem, self._model.with_numbers(model, self._numbers, value))
+        return self._scene.renumbered(
+            problem, self._model.with_numbers(model, self._numbers, value)
+        )
 
     def leave(self) -> None:
         """Let the scene have its own numbers again."""

@@ -1,6 +1,8 @@
-"""Numbers of a state that can be differentiated, with their derivatives by the state; the energy barrier of a run.
+"""Numbers of a state that can be differentiated, with their derivatives by the state; the energy
+barrier of a run.
 
-The barrier is what a probing force passes: its work from zero, over its largest value, back to zero.
+The barrier is what a probing force passes: its work from zero, over its largest value, back to
+zero.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -50,7 +52,8 @@ class Functional:
     deflections
         Name of a point -> what u . n0 there is multiplied by in J.
     slope
-        What J is of a room, with its derivatives by a field; then J is no amplitude itself, whatever `by_mu` is.
+        What J is of a room, with its derivatives by a field; then J is no amplitude itself,
+        whatever `by_mu` is.
     """
 
     value: float
@@ -65,12 +68,14 @@ class Functional:
 
 
 def functional(scene: Scene, state: State, of: str | Target) -> Functional:
-    """A column of path.csv, or the mean square distance to a target over the area, in R^2; collective.
+    """A column of path.csv, or the mean square distance to a target over the area, in R^2;
+    collective.
 
     Raises
     ------
     CaseError
-        If the scene has no such column, or it has no derivative here; the message has those that have one.
+        If the scene has no such column, or it has no derivative here; the message has those that
+        have one.
     """
     model, system = scene.model, scene.model.system
     if callable(of):
@@ -93,7 +98,9 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
     if of in AT_POLE and "pole" in model.normals:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         by_normal = {"pole": -1 / scene.problem.material.h}
-        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u), deflections=by_normal)
+        return Functional(
+            scene.observe(state)["w_pole_over_h"], system.held(by_u), deflections=by_normal
+        )
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
     for room in SEEN:
@@ -102,22 +109,36 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
     name = next((name for name in state.mu if of in (name, amplitude(name).column)), "")
     if name:
         return Functional(state.mu[name], still, {name: 1.0})
-    raise CaseError(f"{of}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}")
+    raise CaseError(
+        f"{of}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}"
+    )
 
 
 def differentiable(scene: Scene, state: State) -> list[str]:
     """The columns of path.csv that `functional` takes, and those of them in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
     rooms = (column for room in SEEN for column in room.differentiable(scene.problem.loads))
-    amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.history)
+    amplitudes = (
+        amplitude(name).column for name in state.mu if name not in scene.model.system.history
+    )
     columns = dict.fromkeys(
-        ("energy", *conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *rooms, *amplitudes)
+        (
+            "energy",
+            *conjugates(scene),
+            *_displacements(scene),
+            *_forces(scene),
+            *at_pole,
+            *rooms,
+            *amplitudes,
+        )
     )
     return [*columns, *scene.sizes.columns(columns)]
 
 
 def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
-    """The dimensionless column of a column in units, and the scale of its unit; else the column itself, and ""."""
+    """The dimensionless column of a column in units, and the scale of its unit; else the column
+    itself, and "".
+    """
     for name in differentiable(scene, state):
         if (of_unit := scene.sizes.column(name)) and of_unit.name == of:
             return name, quantity(name).scale
@@ -126,7 +147,11 @@ def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
 
 def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
     """Columns of named points -> the point and the axis."""
-    return {f"{point}_u{axis}": (point, i) for point in scene.problem.context.points for i, axis in enumerate("xyz")}
+    return {
+        f"{point}_u{axis}": (point, i)
+        for point in scene.problem.context.points
+        for i, axis in enumerate("xyz")
+    }
 
 
 def force_unit(scene: Scene) -> float:
@@ -144,7 +169,9 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
     """A force of a support."""
     system, problem = scene.model.system, scene.problem
     if scene.model.without_potential and problem.loads.pressure:
-        raise CaseError(f"{of}: has no gradient under a pressure at a free edge, which has no potential")
+        raise CaseError(
+            f"{of}: has no gradient under a pressure at a free edge, which has no potential"
+        )
     way = rotation(problem.azimuth)[:, axis]
     e = force_unit(scene) * weights(scene.model, name, way, problem.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
@@ -211,14 +238,16 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
 def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:
     """The work of a step's load between two states without this load, over E h R^2; collective.
 
-    It is the change of the energy under the other loads as they are held: that of Pi, plus the integral of q dmu for
-    each amplitude whose conjugate q is held.
+    It is the change of the energy under the other loads as they are held: that of Pi, plus the
+    integral of q dmu for each amplitude whose conjugate q is held.
     """
     held = held_by(scene, step, begin)
     before, after = (sum(scene.energies(state).values()) for state in (begin, end))
     change = after - before
     for name, q in held.items():
         a, b = begin.mu[name], end.mu[name]
-        work = scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
+        work = (
+            scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
+        )
         change += scene.model.multiplicity * work
     return float(change)

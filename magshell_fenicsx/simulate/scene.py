@@ -88,12 +88,17 @@ def build_meridian(problem: Problem) -> Meridian:
     """Its mesh, on every rank."""
     span = problem.meridian
     assert span
-    named = {name: next(of for of, at in problem.points.items() if at is x) for name, x in problem.points.items()}
+    named = {
+        name: next(of for of, at in problem.points.items() if at is x)
+        for name, x in problem.points.items()
+    }
     points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
     pieces = [(piece.name, piece.ends) for piece in span.pieces]
     held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
     vertices = meridian_vertices(problem)
-    return make_meridian(span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints)
+    return make_meridian(
+        span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints
+    )
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
@@ -107,8 +112,17 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
 
     solid = problem.body
     assert solid
-    body = sweep(from_first(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor)
-    return SolidModel(body, problem.material, solid.material, problem.conditions, problem.loads, problem.mirror or Y0)
+    body = sweep(
+        from_first(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor
+    )
+    return SolidModel(
+        body,
+        problem.material,
+        solid.material,
+        problem.conditions,
+        problem.loads,
+        problem.mirror or Y0,
+    )
 
 
 def build_midsurface(problem: Problem, comm: MPI.Comm) -> Midsurface:
@@ -129,10 +143,11 @@ class Scene:
     model, newton
         The shell as a system of terms, and the solver of its bordered systems.
     journal, progress
-        The record of the solver's results for an interrupted run, and the listener to its status. The caller that
-        runs the scene sets both.
+        The record of the solver's results for an interrupted run, and the listener to its status.
+        The caller that runs the scene sets both.
     meshed
-        Changes the mesh of a larger model to which a mode hands over; by default that of the case stays.
+        Changes the mesh of a larger model to which a mode hands over; by default that of the case
+        stays.
     warnings
         What is unphysical, or may be too large.
     loose
@@ -151,7 +166,9 @@ class Scene:
             )
         self.problem, self.comm = problem, comm
         from_first(comm, check_compiler)
-        self.warnings = [said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said]
+        self.warnings = [
+            said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said
+        ]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:
             self.model = build_meridian_model(self.problem)
@@ -160,7 +177,9 @@ class Scene:
         else:
             self.model = build_model(self.problem, comm)
         surface = self.model.midsurface
-        several = surface is not None and surface.read  # a file may have pieces, of which each must be held
+        several = (
+            surface is not None and surface.read
+        )  # a file may have pieces, of which each must be held
         unsure = self.model.axisymmetric or several or not self.problem.fixed
         self.loose = unsure and self.problem.at_rest
         motion = self.model.free_motion(self.unloaded().mu) if unsure and not self.loose else ""
@@ -169,11 +188,13 @@ class Scene:
         self.free_in_time = bool(motion)
         if motion:
             self.warnings.append(NOT_COUNTED)
-        # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
-        # matrices only find what touches
+        # a body's penetration changes over far less than h: factors of a state near by are no
+        # tangent's, and the first matrices only find what touches
         faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
         stiff = self.model.contacts or faces
-        options = NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces, corners=True) if stiff else None
+        options = (
+            NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces, corners=True) if stiff else None
+        )
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
@@ -182,11 +203,15 @@ class Scene:
 
     def retuned(self, context: Context) -> "Scene":
         """The same model and solver for what differs by the strength of the field alone."""
-        return self._with(problem=replace(self.problem, context=context, lambda_m=strength(context)))
+        return self._with(
+            problem=replace(self.problem, context=context, lambda_m=strength(context))
+        )
 
     def renumbered(self, problem: Problem, model: MeridianModel) -> "Scene":
         """The same for a problem that differs in numbers, with the model that has these."""
-        return self._with(problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options))
+        return self._with(
+            problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
+        )
 
     def _with(self, **others: Any) -> "Scene":
         other = object.__new__(Scene)
@@ -205,7 +230,9 @@ class Scene:
     def flat_triangle(self) -> str:
         """Where a triangle is too flat for the penalty, in words; empty if none is."""
         surface = self.model.midsurface
-        return self.problem.flat_triangle(surface.patch) if surface and not self.problem.body else ""
+        return (
+            self.problem.flat_triangle(surface.patch) if surface and not self.problem.body else ""
+        )
 
     @property
     def cells(self) -> int:
@@ -214,7 +241,10 @@ class Scene:
 
     @cached_property
     def watch(self) -> Watch:
-        """The watch over the modes that the model excludes. Its first use compiles their kernels."""
+        """The watch over the modes that the model excludes.
+
+        Its first use compiles their kernels.
+        """
         return Watch(self.model.excluded_modes)
 
     @cached_property
@@ -223,10 +253,14 @@ class Scene:
         model, formulas = self.model, written(self.problem.context)
         if not formulas:
             return []
-        return unshown(formulas, model.cells_of_fields(), self.problem.azimuth, self.problem.material.h)
+        return unshown(
+            formulas, model.cells_of_fields(), self.problem.azimuth, self.problem.material.h
+        )
 
     def nowhere(self) -> str:
-        """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
+        """Where a step since the beginning of a walk has found no field, in words after a message;
+        collective.
+        """
         lost_here = [field.lost for field in self.model.fields if field.lost]
         said = [each for part in self.model.system.comm.allgather(lost_here) for each in part]
         return f"; on this way a step has found no field: {said[0]}" if said else ""
@@ -234,16 +268,28 @@ class Scene:
     @property
     def left_out(self) -> list[str]:
         """What the model lacks, for people."""
-        return [*self.problem.left_out, *(said for room in SEEN for said in room.left_out(self.sight))]
+        return [
+            *self.problem.left_out,
+            *(said for room in SEEN for said in room.left_out(self.sight)),
+        ]
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
         field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
-        own = {*self.motions, *self.sources, *turns, *self.model.contacts, *self.model.system.parameters}
+        own = {
+            *self.motions,
+            *self.sources,
+            *turns,
+            *self.model.contacts,
+            *self.model.system.parameters,
+        }
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
-        return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
+        return State(
+            self.model.zero(),
+            {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})},
+        )
 
     def displacement(self, state: State) -> fem.Function:
         """See `Record.u`; collective."""
@@ -255,7 +301,9 @@ class Scene:
         if not (surface and given and given.home):
             return displacement
         if self.problem.half:
-            raise ValueError("u: symmetry: half: half of the mesh is not modelled: take symmetry: none")
+            raise ValueError(
+                "u: symmetry: half: half of the mesh is not modelled: take symmetry: none"
+            )
         if MPI.Comm.Compare(self.comm, given.home.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
                 f"u: {self.comm.size} processes solve the scene and the mesh belongs to {given.home.comm.size}: "
@@ -285,10 +333,14 @@ class Scene:
         others = state.mu.keys() - own.mu.keys() - {*self.model.system.history}
         if own.mu.keys() - state.mu.keys() or (others and not more):
             theirs, ours = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
-            raise ValueError(f"this state is of another scene: its amplitudes are {theirs}, those of this scene {ours}")
+            raise ValueError(
+                f"this state is of another scene: its amplitudes are {theirs}, those of this scene {ours}"
+            )
 
     def observe(self, state: State) -> dict[str, float]:
-        """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
+        """The physical columns of a table row: loads, displacements over h, volume, energies over E
+        h R^2.
+        """
         self.refuse_foreign(state, more=True)
         model, h, loads, sight = self.model, self.problem.material.h, self.model.loads, self.sight
         force = loads.forces.get("force")
@@ -301,7 +353,9 @@ class Scene:
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "force": 0.0,
-            "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h if loads.displaced else pole,
+            "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h
+            if loads.displaced
+            else pole,
             "w_pole_over_h": pole,
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u, state.mu),
@@ -312,7 +366,11 @@ class Scene:
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
-            **{column: value for room in SEEN for column, value in room.observe(sight, state).items()},
+            **{
+                column: value
+                for room in SEEN
+                for column, value in room.observe(sight, state).items()
+            },
             **{
                 column: (state.mu[term.name] if term.density else 1.0)
                 * model.multiplicity
@@ -327,12 +385,16 @@ class Scene:
         model, by_group = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
         for t in model.system.terms:
-            by_group[t.group] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
+            by_group[t.group] += (
+                model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
+            )
         return by_group
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """The amplitudes of natural shape, imperfections, user-defined energies and parameters, with initial values."""
+        """The amplitudes of natural shape, imperfections, user-defined energies and parameters,
+        with initial values.
+        """
         return own_amplitudes(self.problem.loads)
 
     @property
@@ -352,14 +414,18 @@ class Scene:
 
     @cached_property
     def extra_columns(self) -> tuple[str, ...]:
-        """The columns of a row besides those of every run; the last ones are those in the case's units."""
+        """The columns of a row besides those of every run; the last ones are those in the case's
+        units.
+        """
         return extra_columns(self.problem)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
         system, of = self.model.system, self.model.multiplicity
         loads = (name for name in state.mu if name not in system.coordinates)
-        return energy - of * sum(state.mu[name] * system.potential(state.u, state.mu, name) for name in loads)
+        return energy - of * sum(
+            state.mu[name] * system.potential(state.u, state.mu, name) for name in loads
+        )
 
     @property
     def sight(self) -> Sight:
@@ -370,9 +436,11 @@ class Scene:
         return Sight(self.model, problem.length, problem.modulus, *place, problem.reactions, sense)
 
     def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
-        """The magnetised shell of a record as a source of magpylib, of charged triangles; collective.
+        """The magnetised shell of a record as a source of magpylib, of charged triangles;
+        collective.
 
-        In m and T; of a case without units over R and |Br|. Each side of a cell is divided into `parts`.
+        In m and T; of a case without units over R and |Br|. Each side of a cell is divided into
+        `parts`.
 
         Raises
         ------
@@ -384,7 +452,9 @@ class Scene:
         return to_magpylib(self.sight, record.point.state, parts)
 
     def conjugate_unit(self, name: str) -> float:
-        """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
+        """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length
+        of dead loads.
+        """
         units = (room.conjugate_unit(self.sight, name) for room in SEEN)
         return next((unit for unit in units if unit is not None), 0.0)
 
@@ -392,13 +462,21 @@ class Scene:
         """The displacements of named points in the unit of the shell's lengths."""
         displacements: dict[str, float] = {}
         for point in self.problem.context.points:
-            u = self.problem.length * self.model.displacement(state.u, point) @ rotation(self.problem.azimuth)
-            displacements |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
+            u = (
+                self.problem.length
+                * self.model.displacement(state.u, point)
+                @ rotation(self.problem.azimuth)
+            )
+            displacements |= {
+                f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)
+            }
         return displacements
 
 
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
-    """See `refuse_beyond_memory`; every rank asks its own machine, and the first refusal is that of all."""
+    """See `refuse_beyond_memory`; every rank asks its own machine, and the first refusal is that of
+    all.
+    """
     if comm.size == 1:
         return refuse_beyond_memory(problem)
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)

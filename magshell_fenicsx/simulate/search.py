@@ -1,8 +1,10 @@
-"""Further solutions at the amplitudes of a known state, by deflation from guesses of snapped shapes.
+"""Further solutions at the amplitudes of a known state, by deflation from guesses of snapped
+shapes.
 
-A guess is the shell with a part of it mirrored in a plane, as Pogorelov's dents are. The mirrored part is an isometric
-copy of itself, so only the fold around it costs energy. The plane is parallel to that of the supports; the fold is as
-wide as the boundary layer of a sphere, sqrt(2 h H) for a dent of depth H.
+A guess is the shell with a part of it mirrored in a plane, as Pogorelov's dents are. The mirrored
+part is an isometric copy of itself, so only the fold around it costs energy. The plane is parallel
+to that of the supports; the fold is as wide as the boundary layer of a sphere, sqrt(2 h H) for a
+dent of depth H.
 """
 
 import time
@@ -37,7 +39,10 @@ THIN = 1e-6  # a smaller mean square distance from a plane or a line, over the l
 
 
 def dented(scene: Scene, state: State) -> Iterator[State]:
-    """Dented copies of a state, none of flat shells; of several shells each alone, then all. Collective."""
+    """Dented copies of a state, none of flat shells; of several shells each alone, then all.
+
+    Collective.
+    """
     system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
     parts = [Curved.of(scene, x, inside) for inside in nodes_of_shells(scene)]
@@ -88,7 +93,8 @@ class Curved:
 
 
 def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, float]:
-    """The unit normal of the plane of the supports and its height along it; the best plane of a shell without any.
+    """The unit normal of the plane of the supports and its height along it; the best plane of a
+    shell without any.
 
     Parameters
     ----------
@@ -116,7 +122,9 @@ def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, fl
 
 
 def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
-    """The mean (3,) and the covariance (3, 3) of places of all ranks, of a part of a shell with their images."""
+    """The mean (3,) and the covariance (3, 3) of places of all ranks, of a part of a shell with
+    their images.
+    """
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
         x = mirror.everywhere(x)
@@ -149,7 +157,8 @@ def solutions(
     stable: bool = False,
     seconds: float | None = None,
 ) -> Iterator[Record]:
-    """Further equilibria at the amplitudes of a known one, such as snapped shapes; all amplitudes are loads.
+    """Further equilibria at the amplitudes of a known one, such as snapped shapes; all amplitudes
+    are loads.
 
     Every one is confirmed by Newton's method, and differs from all others. There may be more.
 
@@ -167,7 +176,11 @@ def solutions(
     """
     state = start.point.state if isinstance(start, Record) else start
     scene.refuse_foreign(state)
-    name = start.amplitude if isinstance(start, Record) and start.amplitude in state.mu else next(iter(state.mu))
+    name = (
+        start.amplitude
+        if isinstance(start, Record) and start.amplitude in state.mu
+        else next(iter(state.mu))
+    )
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
@@ -196,7 +209,9 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
 
 
 def _rules(stage: Stage) -> Rules:
-    """What solutions have to keep: penalties and cuts of their own, within the bound, and no shell through another."""
+    """What solutions have to keep: penalties and cuts of their own, within the bound, and no shell
+    through another.
+    """
     scene = stage.scene
 
     def own(state: State) -> State | None:

@@ -2,11 +2,11 @@
 
 The derivative d mu*/dp = -(phi . R_p)/(phi . R_mu) takes one dot product for each parameter p.
 
-By the numbers of an imperfection R_p is a central difference, (R(r0 + s dr0/dp) - R(r0 - s dr0/dp))/(2 s): where the
-chart's nodes stay, r0 alone depends on an imperfection. A rim makes r0 rough in p beside it, but R is smooth in r0.
-Differences of folds converge to these derivatives on the same mesh: for depths with the square of their step, for what
-moves a rim with the step itself. Between new meshes, whose edges follow the rim, they have the meshes' noise over the
-step.
+By the numbers of an imperfection R_p is a central difference, (R(r0 + s dr0/dp) - R(r0 - s
+dr0/dp))/(2 s): where the chart's nodes stay, r0 alone depends on an imperfection. A rim makes r0
+rough in p beside it, but R is smooth in r0. Differences of folds converge to these derivatives on
+the same mesh: for depths with the square of their step, for what moves a rim with the step itself.
+Between new meshes, whose edges follow the rim, they have the meshes' noise over the step.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,12 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.shell.patterns import Pattern, WithinRims
 from magshell_fenicsx.parts.imperfections.growth import grown_by
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionSection,
+    LocalSection,
+    flaws,
+    in_frame,
+)
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
@@ -45,7 +50,10 @@ from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 SOME_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
 Array = NDArray[np.float64]
 Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
-STEP, TINY = 1e-3, 1e-6  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
+STEP, TINY = (
+    1e-3,
+    1e-6,
+)  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
@@ -86,21 +94,30 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
 
     - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
     - "defect.amplitude", "imperfections.0.width", ...: numbers of imperfections;
-    - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within a
-      dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m times
-      the derivative in lambda_m.
+    - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within
+      a
+      dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m
+      times the derivative in lambda_m.
     """
     stage = stage_at(scene, record) if record else plain(scene)
     system, state, history = stage.newton.system, fold.state, scene.model.system.history
-    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *history)}
+    columns = {
+        name: system.load(state.u, state.mu, name)
+        for name in state.mu
+        if name not in (fold.name, *history)
+    }
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
-    columns |= {name: stage.padded(column) for name, column in (by_patch | _field_column(scene, state)).items()}
+    columns |= {
+        name: stage.padded(column)
+        for name, column in (by_patch | _field_column(scene, state)).items()
+    }
     by_column = {name: sensitivity(system, fold, column) for name, column in columns.items()}
     return by_column | to_imperfections(stage, fold) | to_shells(stage, fold)
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """The load column of lambda_m for a problem whose field is zero: the slope of the magnetic energy in it.
+    """The load column of lambda_m for a problem whose field is zero: the slope of the magnetic
+    energy in it.
 
     Empty without a section magnetic, and where the field leaves less symmetry than the model has.
     """
@@ -114,7 +131,11 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     assert with_field.loads.magnetic
     size = scene.model.system.size
     own = State(state.u[:size], state.mu)
-    return {"lambda_m": _magnetic_column(scene, own, with_field.loads.magnetic)} if whole or alike else {}
+    return (
+        {"lambda_m": _magnetic_column(scene, own, with_field.loads.magnetic)}
+        if whole or alike
+        else {}
+    )
 
 
 @dataclass(frozen=True)
@@ -146,7 +167,9 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
     alone = {patch: _Within(field.remanent, only(patch)) for patch in (*within, "rest")}
     return {
-        f"remanence {patch}": _magnetic_column(scene, fold.state, replace(field, remanent=remanence))
+        f"remanence {patch}": _magnetic_column(
+            scene, fold.state, replace(field, remanent=remanence)
+        )
         for patch, remanence in alone.items()
     }
 
@@ -164,8 +187,13 @@ def _of_shells(
         assert model.axisymmetric
         own, count = model.meridian.patches, len(model.meridian.order)
     none = dict.fromkeys(patches, np.zeros(3))
-    alone = {name: replace(field, patches={**none, name: of}).on(own, count) for name, of in patches.items()}
-    return {f"remanence {name}": _magnetic_column(scene, state, each) for name, each in alone.items()}
+    alone = {
+        name: replace(field, patches={**none, name: of}).on(own, count)
+        for name, of in patches.items()
+    }
+    return {
+        f"remanence {name}": _magnetic_column(scene, state, each) for name, each in alone.items()
+    }
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
@@ -186,7 +214,9 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
 
 
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """The model's terms of a remanence with another one, in the fields of a state; none of what is soft alone."""
+    """The model's terms of a remanence with another one, in the fields of a state; none of what is
+    soft alone.
+    """
     terms, fields = _made(scene, field)
     for applied in fields:
         applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
@@ -207,8 +237,8 @@ def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Seque
 def to_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:
     """Derivatives by the key of each number below `shell`, angles in degrees; collective.
 
-    A number of a rim that separates patches of a remanence or of a natural shape is left out: the mesh has no place
-    for a rim that moves. What a half or a meridian excludes by symmetry is zero.
+    A number of a rim that separates patches of a remanence or of a natural shape is left out: the
+    mesh has no place for a rim that moves. What a half or a meridian excludes by symmetry is zero.
     """
     problem = stage.scene.problem
     return {
@@ -236,7 +266,9 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     problem = scene.problem
     unit = _unit(problem, key, name)
     step, tiny = STEP * unit, TINY * unit
-    further, back = (_deviation(scene, changed(problem.imperfections, key, name, c), key) for c in (tiny, -tiny))
+    further, back = (
+        _deviation(scene, changed(problem.imperfections, key, name, c), key) for c in (tiny, -tiny)
+    )
 
     def out_of_balance(change: float) -> float:
         return _in_other(stage, fold, reshaped(scene, Along(further, back, change / (2 * tiny))))
@@ -250,20 +282,29 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
 
 
 def _in_other(stage: Stage, fold: Fold, other: Scene) -> float:
-    """-(left . R)/(left . R_mu) of the same state in a scene with a slightly different shell on the same mesh.
+    """-(left . R)/(left . R_mu) of the same state in a scene with a slightly different shell on the
+    same mesh.
 
     What touches there is what touches in the state, see `expand`.
     """
     scene, size = stage.scene, stage.scene.model.system.size
     assert same_mesh(scene, other)
-    u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in (fold.state.u, fold.left))
+    u, left = (
+        np.concatenate([transfer(scene, other, v[:size]), v[size:]])
+        for v in (fold.state.u, fold.left)
+    )
     expand(scene, other, stage.leave(fold.state))
-    moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
+    moved, system = (
+        replace(fold, state=State(u, fold.state.mu), left=left),
+        stage.on(other).newton.system,
+    )
     return sensitivity(system, moved, system.residual(u, fold.state.mu))
 
 
 def expand(scene: Scene, other: Scene, state: State) -> None:
-    """Take the penalties of contact in another scene on the same mesh as polynomials about a state of the first one."""
+    """Take the penalties of contact in another scene on the same mesh as polynomials about a state
+    of the first one.
+    """
     touch_as_in(scene, other, state)
     at = scene.model.system.at(state)
     for name, (pressing, _) in scene.model.contacts.items():
@@ -271,7 +312,9 @@ def expand(scene: Scene, other: Scene, state: State) -> None:
 
 
 def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
-    """Take contact between shells in another scene on the same mesh as polynomials about a state of the first one."""
+    """Take contact between shells in another scene on the same mesh as polynomials about a state of
+    the first one.
+    """
     at = scene.model.system.at(state)
     of_one: Sequence[Any] = scene.model.touchings
     of_other: Sequence[Any] = other.model.touchings
@@ -298,7 +341,9 @@ def _by_number(stage: Stage, fold: Fold, key: str) -> float:
     """The derivative by a number of the case, as a central difference of the residual."""
     scene, context = stage.scene, stage.scene.problem.context
     value, step = number_of(context, key), STEP * size_of(context, key)
-    ahead, back = (_in_other(stage, fold, scene_with(scene, key, value + change)) for change in (step, -step))
+    ahead, back = (
+        _in_other(stage, fold, scene_with(scene, key, value + change)) for change in (step, -step)
+    )
     return (ahead - back) / (2 * step)
 
 
@@ -323,7 +368,9 @@ def _changed(part: Any, path: str, change: float) -> Any:
         return part + change
     first, _, rest = path.partition(".")
     if isinstance(part, list):
-        return [_changed(item, rest, change) if i == int(first) else item for i, item in enumerate(part)]
+        return [
+            _changed(item, rest, change) if i == int(first) else item for i, item in enumerate(part)
+        ]
     return part.model_copy(update={first: _changed(getattr(part, first), rest, change)})
 
 
@@ -369,6 +416,8 @@ def reshaped(scene: Scene, deviation: Deviation) -> Scene:
         return replace(embedding, deviations=(*embedding.deviations, deviation))
 
     embedding = moved(problem.embedding)
-    meridian = problem.meridian and replace(problem.meridian, embedding=moved(problem.meridian.embedding))
+    meridian = problem.meridian and replace(
+        problem.meridian, embedding=moved(problem.meridian.embedding)
+    )
     shape = model.midsurface.reshaped(embedding) if model.midsurface else problem.shape
     return Scene(replace(problem, embedding=embedding, meridian=meridian, shape=shape), scene.comm)

@@ -61,7 +61,9 @@ class Stage:
         return self.device.padded(u) if self.device else u
 
     def displaced(self, x: Vector) -> Vector:
-        """A vector of the step's system with zeros for the unknown amplitudes and where nodes are held."""
+        """A vector of the step's system with zeros for the unknown amplitudes and where nodes are
+        held.
+        """
         held = self.scene.model.system.held
         return self.device.padded(held(self.device.displacement(x))) if self.device else held(x)
 
@@ -75,22 +77,36 @@ class Stage:
         """
         if control == "conjugate":
             _refuse_open(self.scene, name)
-        scene, given = self.scene, (self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
-        return Path(*given, partial(way_to_touch, scene, self.leave)) if scene.model.touchings else Path(*given)
+        scene, given = (
+            self.scene,
+            (self.newton, name, control, options, scale, self.scene.journal, self.scene.progress),
+        )
+        return (
+            Path(*given, partial(way_to_touch, scene, self.leave))
+            if scene.model.touchings
+            else Path(*given)
+        )
 
-    def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
-        """A path from a state of the model in equilibrium; its first step changes the amplitude by about `first`.
+    def begin(
+        self, name: str, control: Control, state: State, first: float, scale: float = 1.0
+    ) -> tuple[Path, Point]:
+        """A path from a state of the model in equilibrium; its first step changes the amplitude by
+        about `first`.
 
         `scale` is that of `Path`.
         """
         return self.resume(name, control, self.enter(state), first, scale)
 
-    def resume(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
+    def resume(
+        self, name: str, control: Control, state: State, first: float, scale: float = 1.0
+    ) -> tuple[Path, Point]:
         """The same from a state of the step's system."""
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
         step = abs(first / start.dmu)
-        return path.in_steps(StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)), start
+        return path.in_steps(
+            StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
+        ), start
 
 
 def _refuse_open(scene: Scene, name: str) -> None:

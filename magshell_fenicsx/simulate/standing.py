@@ -1,4 +1,6 @@
-"""A scene that stands, with the fields of another problem: nothing is meshed, compiled or made a form again."""
+"""A scene that stands, with the fields of another problem: nothing is meshed, compiled or made a
+form again.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -58,7 +60,11 @@ def refilled(scene: Scene, problem: Problem) -> bool:
     same = bool(old.document.data) and _apart_from_fields(old) == _apart_from_fields(problem)
     if not same or not model.thin or model.contacts or model.touchings or old.loads.dead:
         return False
-    if (old.axisymmetric, old.mirror, old.azimuth) != (problem.axisymmetric, problem.mirror, problem.azimuth):
+    if (old.axisymmetric, old.mirror, old.azimuth) != (
+        problem.axisymmetric,
+        problem.mirror,
+        problem.azimuth,
+    ):
         return False
     if _fields(problem) != _fields(old) or _patches(problem) or _patches(old):
         return False
@@ -73,7 +79,9 @@ def refilled(scene: Scene, problem: Problem) -> bool:
 def _apart_from_fields(problem: Problem) -> dict[str, Any]:
     """What was written of it, without what may be refilled."""
     return {
-        key: {name: v for name, v in section.items() if name not in FIELDS[key]} if key in FIELDS else section
+        key: {name: v for name, v in section.items() if name not in FIELDS[key]}
+        if key in FIELDS
+        else section
         for key, section in problem.document.data.items()
     }
 
@@ -89,17 +97,26 @@ def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
 def _patches(problem: Problem) -> bool:
     """Whether one is given by patches of a mesh."""
     magnetic, natural, thickness = problem.loads.magnetic, problem.loads.natural, problem.thickness
-    drawn = natural is not None and any(isinstance(v, Mapping) for v in (natural.curvature, natural.stretch))
+    drawn = natural is not None and any(
+        isinstance(v, Mapping) for v in (natural.curvature, natural.stretch)
+    )
     return drawn or bool((magnetic and magnetic.patches) or (thickness and thickness.patches))
 
 
 def _put(model: "ShellModel | MeridianModel", problem: Problem) -> None:
     magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
-    coefficients = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
+    coefficients = {
+        c.name: c
+        for t in model.system.terms
+        if isinstance(t, FormTerm)
+        for c in t.form.coefficients()
+    }
     if magnetic and callable(magnetic.remanent):
         coefficients["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
     if problem.thickness and model.thickness:
         patches = model.midsurface.patches if model.midsurface else {}
         model.thickness.x.array[:] = thickness_field(problem.thickness, r0, patches).x.array
     if natural:
-        coefficients["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array
+        coefficients["natural"].x.array[:] = natural_field(
+            natural, patterns.cells_of(r0), model.V
+        ).x.array

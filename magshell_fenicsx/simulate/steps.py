@@ -52,16 +52,22 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
             if not left:
                 raise Stopped(meeting)
             drive = replace(drive, targets=left, end=left[-1])
-    stage = staged(scene, state, held_by(scene, step, state), course.curves and (step.name, *course.curves))
+    stage = staged(
+        scene, state, held_by(scene, step, state), course.curves and (step.name, *course.curves)
+    )
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     for finer in (course.finer, along_contact if scene.model.touchings else None):
         path = path.in_steps(finer(path.options)) if finer else path
-    if drive.end is not None and not drive.targets and (course.until == "target" or load.bound):  # it is there
+    if (
+        drive.end is not None and not drive.targets and (course.until == "target" or load.bound)
+    ):  # it is there
         yield Record("target", step.name, stage.point(start))
         return state
-    goal = Goal(course.until, drive.targets, drive.quantity, course.steps or MOST_STEPS, drive.first)
+    goal = Goal(
+        course.until, drive.targets, drive.quantity, course.steps or MOST_STEPS, drive.first
+    )
     walked = Walked(followed(stage, path, start, goal, load.branch_points))
     wrong, first = "", None
     for record in walked:
@@ -81,7 +87,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
 
 
 def followed_on(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Records:
-    """The records of the branch at the bifurcation that ends a step, to its target or for `points` steps.
+    """The records of the branch at the bifurcation that ends a step, to its target or for `points`
+    steps.
 
     The model is the smallest that has the mode, and so is that of the state at the end.
 
@@ -90,9 +97,16 @@ def followed_on(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Recor
     Stopped
         If the branch is not found, or lost.
     """
-    stage, drive = stage_of(scene, step, bifurcation.point.state), _drive(scene, step, bifurcation.point.state)
+    stage, drive = (
+        stage_of(scene, step, bifurcation.point.state),
+        _drive(scene, step, bifurcation.point.state),
+    )
     end = drive.end
-    goal = Goal("points", steps=step.load.points) if end is None else Goal("target", [end], drive.quantity)
+    goal = (
+        Goal("points", steps=step.load.points)
+        if end is None
+        else Goal("target", [end], drive.quantity)
+    )
     return (yield from leaving(stage, bifurcation, goal, abs(drive.scale), 0))
 
 
@@ -103,8 +117,12 @@ def departure_of(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Depa
 
 
 def leaves_path(step: ProgrammeStep) -> bool:
-    """Whether what follows the bifurcation that ends a step is not on the path: a branch, or a snap."""
-    return step.until == "bifurcation" and (step.load.follows_branch or step.load.released_by is not None)
+    """Whether what follows the bifurcation that ends a step is not on the path: a branch, or a
+    snap.
+    """
+    return step.until == "bifurcation" and (
+        step.load.follows_branch or step.load.released_by is not None
+    )
 
 
 def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
@@ -117,11 +135,15 @@ def excluded(record: Record) -> bool:
 
 
 def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: Drive) -> Records:
-    """The records to the first instability of a shell whose conjugate the step drives, and not the load itself."""
+    """The records to the first instability of a shell whose conjugate the step drives, and not the
+    load itself.
+    """
     held, name = held_by(scene, step, state), step.name
     q = -scene.model.system.potential(state.u, state.mu, name)
     others = {key: how for key, how in held.items() if key != name}
-    steps = staged(scene, state, others).begin(name, "arc", state, drive.first, drive.scale)[0].options
+    steps = (
+        staged(scene, state, others).begin(name, "arc", state, drive.first, drive.scale)[0].options
+    )
     driven = f"conjugate of {name}"
     stage = staged(scene, state, {**others, name: driven})
     path, start = stage.begin(driven, "arc", State(state.u, state.mu | {driven: q}), drive.first)

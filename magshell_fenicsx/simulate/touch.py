@@ -1,4 +1,6 @@
-"""Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
+"""Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff
+bodies must be.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,9 +27,14 @@ from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
 
-TRIED = tuple(DEEP / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
+TRIED = tuple(
+    DEEP / 4**i for i in range(7)
+)  # of h: how far past the first contact the path begins, at the first try
 NEAR = 1e-7  # of h: a smaller gap is none
-FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
+FALLEN, ALIKE = (
+    0.1,
+    0.02,
+)  # of h, how far a path that returns is from its turn; of that, how far from the way there
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 NEARLY = 0.75  # of the bound, at points: between them, with other cuts, shells may be deeper
@@ -35,13 +42,19 @@ CERTAIN = 0.5  # of a critical mode's stiffness: what closer points of contact m
 PASSED = 8  # halvings of a way on which shells would pass through each other
 HIT = 0.03  # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT = 100.0  # times the bound: a penetration that lasts for a moment
-AT_A_CORNER = 1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
-WAYS, HALVINGS = 65, 30  # places on the way of supports that are looked at, and halvings of the part they meet in
+AT_A_CORNER = (
+    1e6  # how much stiffer a shell becomes at most: the point of a corner has a small weight
+)
+WAYS, HALVINGS = (
+    65,
+    30,
+)  # places on the way of supports that are looked at, and halvings of the part they meet in
 RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
 
 def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
-    """The state just after the body of a step first touches; the given one if it touches, or its target is nearer.
+    """The state just after the body of a step first touches; the given one if it touches, or its
+    target is nearer.
 
     Raises
     ------
@@ -73,7 +86,9 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
 
 
 def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
-    """The settings of what penetrates too much at a state, `STIFFER` times as stiff; of a given stiffness none."""
+    """The settings of what penetrates too much at a state, `STIFFER` times as stiff; of a given
+    stiffness none.
+    """
     h, raised = scene.problem.material.h, dict[str, float]()
     for contact in scene.problem.loads.contacts:
         k = state.mu.get(contact.setting, contact.stiffness)
@@ -88,10 +103,11 @@ def stiffnesses(scene: Scene, state: State) -> dict[str, float]:
 
 
 def stiff_for(pair: Pair, speed: float, h: float) -> float:
-    """The stiffness of a pair that meets flat with this speed, over that of waves, and goes `HIT` deep; h is over R.
+    """The stiffness of a pair that meets flat with this speed, over that of waves, and goes `HIT`
+    deep; h is over R.
 
-    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with half the mass per
-    area of the first shell.
+    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with
+    half the mass per area of the first shell.
     """
     wanted, k = (speed / (HIT * h)) ** 2 / 2, pair.stiffness
     while k < wanted:
@@ -136,7 +152,9 @@ def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
     except NoEigenpair:
         return True
     error = abs(compared.eigenvalue - mode.eigenvalue)
-    return compared.negative_pivots == mode.negative_pivots and error < CERTAIN * abs(mode.eigenvalue)
+    return compared.negative_pivots == mode.negative_pivots and error < CERTAIN * abs(
+        mode.eigenvalue
+    )
 
 
 def better_cuts(scene: Scene, state: State) -> dict[str, float]:
@@ -147,30 +165,42 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
-    """A state, as one that another model gives, with the cuts of shells at its own displacement; collective."""
+    """A state, as one that another model gives, with the cuts of shells at its own displacement;
+    collective.
+    """
     at = scene.model.system.at(state)
-    return State(state.u, {**state.mu, **{each.pair.cuts: at.of(each.numbered) for each in _with_cuts(scene)}})
+    return State(
+        state.u,
+        {**state.mu, **{each.pair.cuts: at.of(each.numbered) for each in _with_cuts(scene)}},
+    )
 
 
 def _with_cuts(scene: Scene) -> list[Touching]:
-    return [each for each in scene.model.touchings if isinstance(each, Touching)]  # on meridians are no cuts
+    return [
+        each for each in scene.model.touchings if isinstance(each, Touching)
+    ]  # on meridians are no cuts
 
 
 def of_its_own(scene: Scene, state: State) -> State | None:
     """A state with penalties that are stiffer where shells or bodies are too deep in each other, and with cuts of its
     own; None if it needs none of these. Collective."""
-    changed = {**stiffnesses(scene, state), **better_cuts(scene, state)} if scene.model.touchings else {}
+    changed = (
+        {**stiffnesses(scene, state), **better_cuts(scene, state)} if scene.model.touchings else {}
+    )
     return State(state.u, {**state.mu, **changed}) if changed else None
 
 
 def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
-    """The pairs of shells that may touch, with their penetrations over the thickness there; collective."""
+    """The pairs of shells that may touch, with their penetrations over the thickness there;
+    collective.
+    """
     at = scene.model.system.at(state)
     return [(each.pair, at.of(each.depth)) for each in scene.model.touchings]
 
 
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
-    """See that no shell passes through another one, or itself, on the straight way between two points.
+    """See that no shell passes through another one, or itself, on the straight way between two
+    points.
 
     Raises
     ------
@@ -181,7 +211,10 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     if not model.touchings:
         return
     if model.axisymmetric:
-        places = [model.system.with_ghosts(s.u, s.mu).reshape(-1, 2) for s in map(stage.leave, (low.state, high.state))]
+        places = [
+            model.system.with_ghosts(s.u, s.mu).reshape(-1, 2)
+            for s in map(stage.leave, (low.state, high.state))
+        ]
         _refuse_through(model.touchings, places)
         return
     end = stage.leave(high.state)
@@ -207,8 +240,13 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
 
 
 def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
-    """Whether a shell passes through another one, itself or a mirror plane on the straight way between two points."""
-    ends = (end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0) for end in (low, high))
+    """Whether a shell passes through another one, itself or a mirror plane on the straight way
+    between two points.
+    """
+    ends = (
+        end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0)
+        for end in (low, high)
+    )
     try:
         refuse_passing(stage, *ends)
     except (StepTooLong, PathStopped):
@@ -242,7 +280,9 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
 
 
 def before_passing(stage: Stage, low: State, high: State) -> State:
-    """The second of two states of a stage, or one on the straight way to it, before shells pass through each other."""
+    """The second of two states of a stage, or one on the straight way to it, before shells pass
+    through each other.
+    """
     if not stage.scene.model.touchings or not passes(stage, low, high):
         return high
     part, beyond, way = 0.0, 1.0, high.u - low.u
@@ -254,7 +294,8 @@ def before_passing(stage: Stage, low: State, high: State) -> State:
 
 
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
-    """See that a body does not go back the way it came, as behind a fold at which it holds the shell in place no more.
+    """See that a body does not go back the way it came, as behind a fold at which it holds the
+    shell in place no more.
 
     Parameters
     ----------
@@ -282,7 +323,9 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
         x, y = a.state.mu[name], b.state.mu[name]
         if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
             continue
-        t = scipy.interpolate.CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
+        t = scipy.interpolate.CubicHermiteSpline(
+            [x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu]
+        )(mu[-1])
         if max_abs(comm, high.state.u - t) < ALIKE * fallen:
             said = "the body goes back the way it came: at its fold the shell snaps under a given approach"
             raise PathStopped(said, low, final=True)
@@ -320,9 +363,11 @@ def penetration_refused(scene: Scene, state: State, *, moving: bool = False) -> 
 
 
 def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:
-    """How far supports can move before what they hold meets, and why no farther: the end, and no words, if they can.
+    """How far supports can move before what they hold meets, and why no farther: the end, and no
+    words, if they can.
 
-    What two supports hold does not give way. Nodes stand for it, so that edges which cross are not seen.
+    What two supports hold does not give way. Nodes stand for it, so that edges which cross are not
+    seen.
     """
     model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
     if name not in scene.motions or not model.touchings:
@@ -336,7 +381,9 @@ def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, s
 
     def met(part: float) -> str:
         at = state.with_(state.u, name, begin + part * (end - begin))
-        u = np.concatenate(comm.allgather(model.system.with_ghosts(at.u, at.mu)[: model.system.size])).reshape(-1, dim)
+        u = np.concatenate(
+            comm.allgather(model.system.with_ghosts(at.u, at.mu)[: model.system.size])
+        ).reshape(-1, dim)
         for each in model.touchings:
             if each.held_gap(held, u) < -each.pair.bound * scene.problem.material.h:
                 return each.pair.words
@@ -356,7 +403,11 @@ def blocked(scene: Scene, state: State, name: str, end: float) -> tuple[float, s
 def pressing(scene: Scene, state: State) -> list[Contact]:
     """The bodies that touch."""
     contacts = scene.problem.loads.contacts
-    return [contact for contact in contacts if scene.model.region(state, contact.amplitude).penetration > 0]
+    return [
+        contact
+        for contact in contacts
+        if scene.model.region(state, contact.amplitude).penetration > 0
+    ]
 
 
 def refuse_meeting(scene: Scene, state: State, of: str) -> None:
@@ -377,7 +428,9 @@ def refuse_meeting(scene: Scene, state: State, of: str) -> None:
 
 @contextmanager
 def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
-    """Contact between shells as polynomials about a state, for what is evaluated beside it; None: as it is."""
+    """Contact between shells as polynomials about a state, for what is evaluated beside it; None:
+    as it is.
+    """
     if state is None:
         yield
         return
@@ -392,20 +445,32 @@ def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
 
 
 def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
-    """The equilibrium near a state with these bodies `STIFFER` times as stiff; None if there is none within `MOVED`."""
-    k = {contact.setting: STIFFER * state.mu.get(contact.setting, contact.stiffness) for contact in bodies}
+    """The equilibrium near a state with these bodies `STIFFER` times as stiff; None if there is
+    none within `MOVED`.
+    """
+    k = {
+        contact.setting: STIFFER * state.mu.get(contact.setting, contact.stiffness)
+        for contact in bodies
+    }
     name = bodies[0].amplitude
-    outcome = scene.newton.solve(State(state.u, {**state.mu, **k}), name, GivenLoad(name, state.mu[name]))
-    if not outcome.converged or _moved(scene, state, outcome.state) > MOVED * scene.problem.material.h:
+    outcome = scene.newton.solve(
+        State(state.u, {**state.mu, **k}), name, GivenLoad(name, state.mu[name])
+    )
+    if (
+        not outcome.converged
+        or _moved(scene, state, outcome.state) > MOVED * scene.problem.material.h
+    ):
         return None
     return outcome.state
 
 
 def rigid(scene: Scene, state: State) -> State:
-    """The state between bodies so stiff that their stiffness does not decide where the shell touches; collective.
+    """The state between bodies so stiff that their stiffness does not decide where the shell
+    touches; collective.
 
-    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become stiffer, until the
-    shell moves by at most `RIGID` times the penetration. A given stiffness stays.
+    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become
+    stiffer, until the shell moves by at most `RIGID` times the penetration. A given stiffness
+    stays.
     """
     for _ in range(MOST_RAISED):
         bodies = [contact for contact in pressing(scene, state) if not contact.given]

@@ -27,8 +27,11 @@ from magshell_fenicsx.simulate.walked import followed
 Amount = float | str
 
 
-def goals(scene: Scene, name: str, key: str, amounts: Sequence[Amount] | Amount, *, of_load: bool) -> list[float]:
-    """Amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers; one alone is a list of one.
+def goals(
+    scene: Scene, name: str, key: str, amounts: Sequence[Amount] | Amount, *, of_load: bool
+) -> list[float]:
+    """Amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers; one alone is a list of
+    one.
 
     Parameters
     ----------
@@ -55,7 +58,9 @@ def _number(scene: Scene, name: str, where: str, amount: Any, of_load: bool) -> 
     varied = amplitude(name)
     column = varied.column if of_load else varied.conjugate
     unit, scale = scene.sizes.unit(column), quantity(column).scale
-    sized = of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
+    sized = (
+        of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
+    )
     text = unit.text if unit else next((each.text for each in quantity(column).units), "")
     if not (text and sized):
         of = name if of_load else f"the conjugate of {name}"
@@ -84,46 +89,51 @@ def trace(
 ) -> Iterator[Record]:
     """Follow the equilibria of a scene while one amplitude varies and the others are constant.
 
-    The first record is the start, after Newton's method at its amplitudes. As in `follow`, the last record may be an
-    earlier instability that a reduced model excludes (`Record.mode`). Where the path ends before its last target, the
-    last record has `reached=False`, and a warning names the place.
+    The first record is the start, after Newton's method at its amplitudes. As in `follow`, the last
+    record may be an earlier instability that a reduced model excludes (`Record.mode`). Where the
+    path ends before its last target, the last record has `reached=False`, and a warning names the
+    place.
 
     Parameters
     ----------
     name
-        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of a user-defined term.
+        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of a
+        user-defined term.
     start
         A record or a state; by default the undeformed shell with all amplitudes zero.
     control
         "load": prescribe the amplitude; "conjugate": prescribe the conjugate displacement -Pi_i(u)
-        (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes folds of both.
+        (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes
+        folds of both.
     until
-        The end of the path, see `Goal`: "limit" at the first instability or the last target, "bifurcation",
-        "target" at the last target, "points" after `steps` steps.
+        The end of the path, see `Goal`: "limit" at the first instability or the last target,
+        "bifurcation", "target" at the last target, "points" after `steps` steps.
     targets
-        Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers, or text with a unit
-        such as "100 Pa" where the case has units; -Pi_i(u) is then the change of volume ("-80 mm^3"), or the
-        displacement of a force ("2 mm").
+        Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers,
+        or text with a unit such as "100 Pa" where the case has units; -Pi_i(u) is then the change
+        of volume ("-80 mm^3"), or the displacement of a force ("2 mm").
     quantity
         "load": the amplitude; "conjugate": -Pi_i(u). Only with arc length.
     first
-        Change of the amplitude in the first step; its sign is the direction. By default a tenth of the distance to the
-        last target; required for conjugate targets with arc length.
+        Change of the amplitude in the first step; its sign is the direction. By default a tenth of
+        the distance to the last target; required for conjugate targets with arc length.
     steps
         Largest number of steps; with "points" the number of steps.
 
     Raises
     ------
     ValueError
-        If the scene has no such amplitude, a target has a unit that the case or the amplitude has not, or the length of
-        the first step is unknown.
+        If the scene has no such amplitude, a target has a unit that the case or the amplitude has
+        not, or the length of the first step is unknown.
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)
     if name not in state.mu:
-        raise ValueError(f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}")
+        raise ValueError(
+            f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}"
+        )
     of_load = control == "load" or (control == "arc" and quantity == "load")
     targets = goals(scene, name, "targets", targets, of_load=of_load)
     first = None if first is None else goals(scene, name, "first", first, of_load=True)[0]
@@ -134,22 +144,33 @@ def trace(
     if first is None and targets and control == "conjugate":
         first = 1.0  # the targets determine the step length
     if not first:
-        raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
+        raise ValueError(
+            f"trace: {name}: give first, the change of the amplitude in the first step, not zero"
+        )
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     if control == "conjugate":
         moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), exact=True).du
-        if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
-            raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
+        if (
+            max_abs(scene.newton.system.comm, moved) * abs(first)
+            < SEEN * scene.newton.system.length
+        ):
+            raise Stopped(
+                f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length"
+            )
     path, first_point = plain(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
         path = path.in_steps(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * first_point.dmu))
-    records_of_path = followed(plain(scene), path, first_point, Goal(until, targets, quantity, steps, sense))
+    records_of_path = followed(
+        plain(scene), path, first_point, Goal(until, targets, quantity, steps, sense)
+    )
     records = chain([Record("start", "", first_point)], records_of_path)
-    yield from _marked((replace(record, shown=scene.displacement) for record in records), name, targets)
+    yield from _marked(
+        (replace(record, shown=scene.displacement) for record in records), name, targets
+    )
 
 
 def _marked(records: Iterator[Record], name: str, targets: Sequence[float]) -> Iterator[Record]:
@@ -160,5 +181,7 @@ def _marked(records: Iterator[Record], name: str, targets: Sequence[float]) -> I
         last, missed = record, missed - (record.label == "target")
     if missed > 0:
         where = f"{last.label}{f' ({last.mode})' if last.mode else ''} at {name} = {last.point.state.mu[name]:.6g}"
-        warnings.warn(f"trace: {name}: ends at a {where}, before its target {targets[-1]:.6g}", stacklevel=2)
+        warnings.warn(
+            f"trace: {name}: ends at a {where}, before its target {targets[-1]:.6g}", stacklevel=2
+        )
     yield replace(last, reached=missed <= 0)

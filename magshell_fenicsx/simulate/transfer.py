@@ -22,8 +22,8 @@ ROUNDING = 1e-9
 def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     """A displacement of one scene in the unknowns of another; collective.
 
-    On the same mesh it is copied. Otherwise it is interpolated in the chart and scaled with the thickness or, on
-    dimpled spheres, like a shallow shell, see `_Stretch`.
+    On the same mesh it is copied. Otherwise it is interpolated in the chart and scaled with the
+    thickness or, on dimpled spheres, like a shallow shell, see `_Stretch`.
 
     Parameters
     ----------
@@ -43,13 +43,17 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
         return np.asarray(values[matching].ravel())
     nodes, wanted, stretch = _all_nodes(source), chart(target), _stretch(source, target)
     if stretch:
-        moved = stretch.turn(_interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted)
+        moved = stretch.turn(
+            _interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted
+        )
     else:
         scale = system.length / source.model.system.length
         moved = np.zeros((len(wanted), values.shape[1]))
         for inside, own in of_shells(source, target):
             if own.any():
-                moved[own] = scale * _interpolated(nodes[inside], values[inside], wanted[own], np.inf)
+                moved[own] = scale * _interpolated(
+                    nodes[inside], values[inside], wanted[own], np.inf
+                )
     return system.held(moved.ravel())
 
 
@@ -78,14 +82,23 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
-    """The number of each node of this rank among all nodes of the source; None on all ranks if the nodes differ."""
+    """The number of each node of this rank among all nodes of the source; None on all ranks if the
+    nodes differ.
+    """
     return matching(_all_nodes(source), chart(target), source.model.system.comm)
 
 
-def matching(nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF) -> NDArray[np.int64] | None:
-    """The number of each of this rank's places `wanted` among all `nodes`; None on all ranks if they differ."""
+def matching(
+    nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF
+) -> NDArray[np.int64] | None:
+    """The number of each of this rank's places `wanted` among all `nodes`; None on all ranks if
+    they differ.
+    """
     distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
-    equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
+    equal = (
+        comm.allreduce(len(wanted)) == len(nodes)
+        and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
+    )
     return np.asarray(number) if equal else None
 
 
@@ -93,9 +106,10 @@ def matching(nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF) -> NDA
 class _Stretch:
     """The map between the charts of two dimpled spheres with the same edge and different rims.
 
-    The charts are similar up to the rim and equal at the edge. With the ratio q of the rims, displacements normal to
-    the surface are scaled by q^2 and tangential ones by q^3. This preserves the shape of the strains
-    u_n/R + u_t,s + u_n,s^2/2 of a shallow shell, which Newton's method is most sensitive to.
+    The charts are similar up to the rim and equal at the edge. With the ratio q of the rims,
+    displacements normal to the surface are scaled by q^2 and tangential ones by q^3. This preserves
+    the shape of the strains u_n/R + u_t,s + u_n,s^2/2 of a shallow shell, which Newton's method is
+    most sensitive to.
     """
 
     rim: float
@@ -115,7 +129,10 @@ class _Stretch:
         across, along = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
         sideways = u - across * from_frame[0] - along * from_frame[1]
         ratio = self.rim / self.source_rim
-        return np.asarray(ratio**2 * (across * to_frame[0] + (along * to_frame[1] + sideways) / self._slope(polar)))
+        return np.asarray(
+            ratio**2
+            * (across * to_frame[0] + (along * to_frame[1] + sideways) / self._slope(polar))
+        )
 
     def _polar(self, polar: Array) -> Array:
         t = self._beyond(polar)
@@ -133,8 +150,12 @@ class _Stretch:
 
 
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
-    """Unit vectors normal to the sphere and along its meridians, for unit vectors (n, 1 or 2) of the azimuth."""
-    return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack([np.cos(polar) * azimuth, -np.sin(polar)])
+    """Unit vectors normal to the sphere and along its meridians, for unit vectors (n, 1 or 2) of
+    the azimuth.
+    """
+    return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack(
+        [np.cos(polar) * azimuth, -np.sin(polar)]
+    )
 
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
@@ -143,15 +164,23 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
         spherical = isinstance(embedding, Deviated) and embedding.perfect is sphere
-        if not spherical or not isinstance(shape, DiscShape) or len(shape.circles) != 1 or shape.rims:
+        if (
+            not spherical
+            or not isinstance(shape, DiscShape)
+            or len(shape.circles) != 1
+            or shape.rims
+        ):
             return None
         rims.append(shape.circles[0])
         edges.append(shape.radius)
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 
 
-def of_shells(source: Scene, target: Scene) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Of each shell, which of all nodes of a scene are its own, and which of this rank's nodes of another one.
+def of_shells(
+    source: Scene, target: Scene
+) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Of each shell, which of all nodes of a scene are its own, and which of this rank's nodes of
+    another one.
 
     Shells that touch are near each other, and move in different ways. Collective.
     """
@@ -168,7 +197,10 @@ def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     """Which of this rank's nodes are of each shell, one for all of a shell alone."""
     model = scene.model
     nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
-    return [np.isin(np.arange(count), nodes[np.flatnonzero(cells)].ravel()) for cells in cells_of_shells(scene)]
+    return [
+        np.isin(np.arange(count), nodes[np.flatnonzero(cells)].ravel())
+        for cells in cells_of_shells(scene)
+    ]
 
 
 def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
@@ -176,7 +208,13 @@ def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
     if len(names) < 2:
         return [np.ones(len(model.V.dofmap.list), dtype=bool)]
-    patches = model.meridian.patches if model.axisymmetric else model.midsurface.patches if model.midsurface else {}
+    patches = (
+        model.meridian.patches
+        if model.axisymmetric
+        else model.midsurface.patches
+        if model.midsurface
+        else {}
+    )
     return [patches[name] for name in names]
 
 
@@ -188,7 +226,7 @@ def _all_nodes(scene: Scene) -> Array:
 def chart(scene: Scene) -> Array:
     """Coordinates (n, 1 or 2) of this rank's nodes in the chart, independent of a defect.
 
-    For a solid with the height in its thickness: its displacements are carried to the same mesh only. For a mesh file
-    these are positions (n, 3).
+    For a solid with the height in its thickness: its displacements are carried to the same mesh
+    only. For a mesh file these are positions (n, 3).
     """
     return scene.model.chart()

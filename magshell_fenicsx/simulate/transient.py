@@ -1,7 +1,8 @@
-"""A step in time: the records of a motion, with its energies, from any state, to its end or to rest.
+"""A step in time: the records of a motion, with its energies, from any state, to its end or to
+rest.
 
-It begins along a mode of vibration or with a velocity by formulas; its loads are functions of time in the scales of the
-model.
+It begins along a mode of vibration or with a velocity by formulas; its loads are functions of time
+in the scales of the model.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -62,20 +63,28 @@ def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Ve
     if abs(inward) < SMALL:
         inward = dot(comm, phi, phi**2)
     h = np.copysign(scene.problem.material.h, inward)
-    return state.u + push.displacement * h * phi, v + push.velocity * (scene.problem.time_unit or 1.0) * h * phi
+    return state.u + push.displacement * h * phi, v + push.velocity * (
+        scene.problem.time_unit or 1.0
+    ) * h * phi
 
 
 def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
-    """The velocity with these components, formulas of the undeformed place, at the nodes; zero at supports."""
+    """The velocity with these components, formulas of the undeformed place, at the nodes; zero at
+    supports.
+    """
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     axes = model.axes
     places = in_space(model.r0.x.array, len(axes))
     velocity = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
-    return np.asarray(model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]))
+    return np.asarray(
+        model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size])
+    )
 
 
 def thrown(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
-    """The clock of the state before a step, with the energy of its initial velocity; empty without one."""
+    """The clock of the state before a step, with the energy of its initial velocity; empty without
+    one.
+    """
     v = by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
     if load.push and load.push.velocity:
         v = pushed(scene, load.push, state, v)[1]
@@ -122,7 +131,9 @@ class LoadsInTime:
         If one of these does at the begin.
     """
 
-    def __init__(self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]) -> None:
+    def __init__(
+        self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]
+    ) -> None:
         self._mu, time = dict(state.mu), partial(time_of, problem)
         histories = dict(zip(load.drives, load.history.values(), strict=True))
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
@@ -137,13 +148,22 @@ class LoadsInTime:
             self.marks |= set(marks(history, time, time(load.duration)))
             first, given = self._curves[name](0.0, False), state.mu[name]
             if name in motions and abs(first - given) > SAME * max(1.0, abs(given)):
-                raise CaseError(f"history.{name}: begins at {first:.6g}, but the support is at {given:.6g}")
+                raise CaseError(
+                    f"history.{name}: begins at {first:.6g}, but the support is at {given:.6g}"
+                )
 
-        times = [time(load.duration), *(time(t) for history in histories.values() for t in times_of(history))]
+        times = [
+            time(load.duration),
+            *(time(t) for history in histories.values() for t in times_of(history)),
+        ]
         self._close = CLOSE * min(t for t in times if t)
 
-    def rates(self, t: float, before: bool, names: Collection[str]) -> dict[str, tuple[float, float]]:
-        """First and second derivatives by time of some of them, from values on one side, to second order."""
+    def rates(
+        self, t: float, before: bool, names: Collection[str]
+    ) -> dict[str, tuple[float, float]]:
+        """First and second derivatives by time of some of them, from values on one side, to second
+        order.
+        """
         back = before and t >= 3 * self._close
         slopes, step = {}, -self._close if back else self._close
         for name in set(self._curves) & set(names):
@@ -164,7 +184,8 @@ class _Ends:
 
 
 class Pressings:
-    """All contacts of a system in steps in time, with bodies and between shells; a `continuation.motion.Averaged`.
+    """All contacts of a system in steps in time, with bodies and between shells; a
+    `continuation.motion.Averaged`.
 
     Attributes
     ----------
@@ -175,7 +196,10 @@ class Pressings:
     """
 
     def __init__(
-        self, system: FiniteElementSystem, pressings: Mapping[str, Pressing], between: Sequence[InSteps]
+        self,
+        system: FiniteElementSystem,
+        pressings: Mapping[str, Pressing],
+        between: Sequence[InSteps],
     ) -> None:
         self._system, self._pressings, self._between = system, list(pressings.values()), between
         self.names = frozenset(pressings)
@@ -188,8 +212,12 @@ class Pressings:
             return {}
         comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
         fastest = np.max(comm.allgather(np.max([nodes, -nodes], axis=1, initial=0.0)), axis=0)
-        speed = float(np.linalg.norm(fastest.sum(axis=0)))  # of no two places relative to each other is it larger
-        wanted = {each.pair: stiff_for(each.pair, speed, self._system.length) for each in self._between}
+        speed = float(
+            np.linalg.norm(fastest.sum(axis=0))
+        )  # of no two places relative to each other is it larger
+        wanted = {
+            each.pair: stiff_for(each.pair, speed, self._system.length) for each in self._between
+        }
         at, found = self._system.at(begin), dict[str, float]()
         for each in self._between:
             k = begin.mu.get(each.pair.setting, each.pair.stiffness)
@@ -200,7 +228,9 @@ class Pressings:
     def along(self, begin: State, end: State, part: float) -> None:
         """Take the forces of a step at a part of it."""
         before, after = self._at_begin(begin), self._places(end)
-        for pressing, low, high in zip(self._pressings, before.of_bodies, after.of_bodies, strict=True):
+        for pressing, low, high in zip(
+            self._pressings, before.of_bodies, after.of_bodies, strict=True
+        ):
             pressing.average(low, high, part)
         for contact, u, v in zip(self._between, before.of_shells, after.of_shells, strict=True):
             contact.looks = ()
@@ -215,8 +245,12 @@ class Pressings:
 
     def passes(self, begin: State, end: State) -> str:
         """Which shells pass through each other in a step."""
-        ends = zip(self._between, self._at_begin(begin).of_shells, self._places(end).of_shells, strict=True)
-        through = [contact.pair.words for contact, before, after in ends if contact.passes(before, after)]
+        ends = zip(
+            self._between, self._at_begin(begin).of_shells, self._places(end).of_shells, strict=True
+        )
+        through = [
+            contact.pair.words for contact, before, after in ends if contact.passes(before, after)
+        ]
         return f"{through[0]} pass through each other" if through else ""
 
     def stored(self, u: Vector, mu: Amplitudes) -> float:
@@ -231,7 +265,9 @@ class Pressings:
 
     def _places(self, state: State) -> _Ends:
         return self._system.at(state).of(
-            lambda: _Ends([each.where for each in self._pressings], [each.where for each in self._between])
+            lambda: _Ends(
+                [each.where for each in self._pressings], [each.where for each in self._between]
+            )
         )
 
 
@@ -269,16 +305,30 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         viscous, device, ground = viscosity(scene, state), staged(scene, state, held).device, None
         if moving := scene.motions & set(load.drives):
             if viscous:
-                raise CaseError(f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest")
+                raise CaseError(
+                    f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest"
+                )
             carried = state.ground if isinstance(state, Moving) else None
             ground = Ground(
-                system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried
+                system,
+                whole_mass(scene.model),
+                lambda t, b: (loads(t, b), loads.rates(t, b, moving)),
+                carried,
             )
         pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
         between = scene.model.touchings
         touching = Pressings(system, pressings, between) if pressings or between else None
         integrator = Integrator(
-            system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
+            system,
+            mass(scene.model),
+            loads,
+            load.rho_inf,
+            drag,
+            viscous,
+            load.drives,
+            device,
+            ground,
+            touching,
         )
         return integrator, integrator.begin(0.0, u, v)
 
@@ -292,10 +342,15 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     watched, ended, size = _watched(scene, load.event, state), "", scene.model.multiplicity
 
     def crossed(before: Motion, now: Motion) -> bool:
-        return bool(watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before))
+        return bool(
+            watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before)
+        )
 
     def over(before: Motion, now: Motion, most: float) -> bool:
-        quiet = load.until == "rest" and max(integrator.kinetic(before), integrator.kinetic(now)) <= QUIET * most
+        quiet = (
+            load.until == "rest"
+            and max(integrator.kinetic(before), integrator.kinetic(now)) <= QUIET * most
+        )
         return quiet or crossed(before, now)
 
     whole = load.errors == "motion" and fixed is None
@@ -305,7 +360,9 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         before, first = now, dt
         now, dt, point = walk.journalled(before, first, end)
         if watched and crossed(before, now):
-            now, dt, point = walk.journalled(before, first, walk.crossing(before, first, now, watched))
+            now, dt, point = walk.journalled(
+                before, first, walk.crossing(before, first, now, watched)
+            )
             ended = "event"
         kinetic = integrator.kinetic(now)
         most = max(most, kinetic)
@@ -314,7 +371,8 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             "kinetic": size * kinetic,
             "dissipated": size * now.dissipated,
             "work": size * now.work,
-            "imbalance": size * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
+            "imbalance": size
+            * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
         }
         excluded = None if scene.free_in_time else scene.model.excluded_modes
         unseen = sum(excluded.counts(point.state)) if excluded else 0
@@ -323,17 +381,30 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             ended = "instability"
         if load.until == "duration" and end == outputs[-1]:
             ended = "duration"
-        yield Record("target" if ended else "step", "time", point, excluded_pivots=unseen, clock=clock)
+        yield Record(
+            "target" if ended else "step", "time", point, excluded_pivots=unseen, clock=clock
+        )
         if rest:
             pull = system.coordinates  # constant loads do work on the way to rest
-            moved = {n: system.potential(rest.u, rest.mu, n) - q for n, q in now.potentials.items() if n not in pull}
+            moved = {
+                n: system.potential(rest.u, rest.mu, n) - q
+                for n, q in now.potentials.items()
+                if n not in pull
+            }
             work = now.work - sum(now.mu[name] * change for name, change in moved.items())
             lacks = system.stored(rest.u, rest.mu) + now.dissipated - work - total
             still = {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * lacks}
-            yield Record("target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still)
+            yield Record(
+                "target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still
+            )
             return rest
         if ended:
-            return Moving(point.state.u, point.state.mu, now.v, ground.velocity(now.t, True) if ground else None)
+            return Moving(
+                point.state.u,
+                point.state.mu,
+                now.v,
+                ground.velocity(now.t, True) if ground else None,
+            )
     if load.until == "rest":
         raise Stopped(
             f"the shell still moves at the end of its duration, kinetic energy {kinetic / most:.2g} of its largest"
@@ -341,15 +412,22 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     raise Stopped(f"until: {load.until}: it has not come within the duration")
 
 
-def _watched(scene: Scene, event: EventSection | None, state: State) -> Callable[[Motion], float] | None:
+def _watched(
+    scene: Scene, event: EventSection | None, state: State
+) -> Callable[[Motion], float] | None:
     """What changes its sign at an event; None without one."""
     if event is None:
         return None
     if event.column not in (columns := scene.observe(state)):
-        raise CaseError(f"loading: event.column: {event.column}: no such column; allowed: {', '.join(columns)}")
+        raise CaseError(
+            f"loading: event.column: {event.column}: no such column; allowed: {', '.join(columns)}"
+        )
 
     def beyond(now: Motion) -> float:
-        return scene.observe(scene.model.system.placed(State(now.u, now.mu)))[event.column] - event.value
+        return (
+            scene.observe(scene.model.system.placed(State(now.u, now.mu)))[event.column]
+            - event.value
+        )
 
     return beyond
 
@@ -369,12 +447,14 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:
-    """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state at its end.
+    """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state
+    at its end.
 
     Loads are constant, except those whose conjugates are `held`.
 
-    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its drag is in proportion
-    to the frequency of its third mode of vibration: the first one has none there.
+    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its
+    drag is in proportion to the frequency of its third mode of vibration: the first one has none
+    there.
 
     Raises
     ------
@@ -405,7 +485,9 @@ def _rest(scene: Scene, held: Mapping[str, Held], state: State) -> State | None:
     start, raised = start.with_(start.u, IDLE, 0.0), dict[str, float]()
     while True:
         outcome = stage.newton.solve(start, IDLE, GivenLoad(IDLE, 0.0))
-        moved = max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
+        moved = (
+            max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
+        )
         if not outcome.converged or moved > NEAR:
             return None
         stiffer = stiffnesses(scene, at_rest := stage.leave(outcome.state))

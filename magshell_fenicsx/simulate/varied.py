@@ -1,8 +1,10 @@
-"""A scene in one number of its case: the systems of `continuation.boundary`, and the instability where it starts.
+"""A scene in one number of its case: the systems of `continuation.boundary`, and the instability
+where it starts.
 
-A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays in one scene. Every
-other one has a scene for each value, on the same mesh in the chart; where the chart changes its size, the mesh with it.
-Of meridians these scenes share forms and kernels (`renumbered`).
+A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays
+in one scene. Every other one has a scene for each value, on the same mesh in the chart; where the
+chart changes its size, the mesh with it. Of meridians these scenes share forms and kernels
+(`renumbered`).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +37,9 @@ from magshell_fenicsx.simulate.transfer import transfer
 
 Again = Callable[[float], Problem]
 STEP = 1e-4  # of the range: of differences by p
-ASIDE = 0.1  # of the range: how far the test looks whether a number has influence, and whether by amplitudes alone
+# of the range: how far the test looks whether a number has influence, and whether by amplitudes
+# alone
+ASIDE = 0.1
 SAME = 1e-10  # relative differences of forces that are rounding
 SHARED = 1e-7  # differences of forces in shared forms, over their change by the number
 KEPT = 8  # scenes
@@ -83,7 +87,9 @@ def refuse_excluded(mode: str) -> None:
         If it has not.
     """
     if mode.startswith(WAVES) or mode == "antisymmetric":
-        raise Excluded(f"the instability is one that the model excludes ({mode}): take symmetry: none")
+        raise Excluded(
+            f"the instability is one that the model excludes ({mode}): take symmetry: none"
+        )
 
 
 class Varied:
@@ -115,7 +121,9 @@ class Varied:
         If the number has no influence, or the instability cannot be followed.
     """
 
-    def __init__(self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]) -> None:
+    def __init__(
+        self, scene: Scene, record: Record, again: Again, value: float, ends: tuple[float, float]
+    ) -> None:
         self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
         self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
@@ -128,7 +136,9 @@ class Varied:
         self._origin, self.alone = scene, False
         self._aside = self._value_aside(value)
         base = self._origin if self._origin is not scene else self._scene(value)
-        self._first = replace(record, point=replace(record.point, state=self._state_in(base, value)))
+        self._first = replace(
+            record, point=replace(record.point, state=self._state_in(base, value))
+        )
         self._record_value = value
         self._stages[value] = self._base = stage_at(base, self._first)
         self.alone = self._by_amplitudes_alone(value)
@@ -136,15 +146,25 @@ class Varied:
             self._share(value)
         self._line = self._affine(value, self._aside) if self.alone else None
 
-    def _affine(self, a: float, b: float) -> tuple[float, dict[str, float], dict[str, float]] | None:
-        """A value, the amplitudes there and their rates, if they are linear in the value: no problem is made then."""
+    def _affine(
+        self, a: float, b: float
+    ) -> tuple[float, dict[str, float], dict[str, float]] | None:
+        """A value, the amplitudes there and their rates, if they are linear in the value: no
+        problem is made then.
+        """
         low, middle, high = (self._mu(p) for p in (a, (a + b) / 2, b))
-        if all(isclose(2 * middle[name], low[name] + high[name], rel_tol=1e-12, abs_tol=1e-300) for name in low):
+        if all(
+            isclose(2 * middle[name], low[name] + high[name], rel_tol=1e-12, abs_tol=1e-300)
+            for name in low
+        ):
             return a, low, {name: (high[name] - low[name]) / (b - a) for name in low}
         return None
 
     def _value_aside(self, value: float) -> float:
-        """Another value, to compare forces there. A term that is zero at the start, as a field may be, is there."""
+        """Another value, to compare forces there.
+
+        A term that is zero at the start, as a field may be, is there.
+        """
         low, high = self._ends
         step = ASIDE * (high - low)
         others = [other for other in (value + step, value - step) if low <= other <= high]
@@ -153,12 +173,24 @@ class Varied:
         own = {other: made.unloaded().mu.keys() for other, made in scenes.items()}
         aside = max(others, key=lambda other: len(own[other]))
         if own[aside] > names:  # its scene serves all values
-            u, mu = transfer(self._origin, scenes[aside], self._record.point.state.u), dict(self._record.point.state.mu)
+            u, mu = (
+                transfer(self._origin, scenes[aside], self._record.point.state.u),
+                dict(self._record.point.state.mu),
+            )
             self._origin = scenes[aside]
-            new = {name: self._origin.problem.lambda_m if name == "lambda_m" else 0.0 for name in own[aside] - names}
+            new = {
+                name: self._origin.problem.lambda_m if name == "lambda_m" else 0.0
+                for name in own[aside] - names
+            }
             point = replace(self._record.point, state=State(u, mu | new))
-            self._record = replace(self._record, point=point, step=len(self._origin.problem.programme))
-            return min(others, key=lambda other: other == aside) if len(others) > 1 else (value + aside) / 2
+            self._record = replace(
+                self._record, point=point, step=len(self._origin.problem.programme)
+            )
+            return (
+                min(others, key=lambda other: other == aside)
+                if len(others) > 1
+                else (value + aside) / 2
+            )
         return aside
 
     def _refuse_unknown(self, scene: Scene) -> None:
@@ -168,11 +200,15 @@ class Varied:
         earlier = programme[: record.step - 1]
         step = programme[record.step - 1]
         if earlier and any(how != "load" for how in step.load.hold.values()):
-            raise CaseError(f"{step.key}.hold: a boundary needs what is held to be held from the start: give one step")
+            raise CaseError(
+                f"{step.key}.hold: a boundary needs what is held to be held from the start: give one step"
+            )
         for each in earlier:
             target = each.load.target or each.load.bound
             if each.load.hold or (target and target[0].quantity == "conjugate"):
-                raise CaseError(f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary")
+                raise CaseError(
+                    f"{each.key}: ends at a displacement or a volume, so its load changes along a boundary"
+                )
 
     @cached_property
     def start(self) -> tuple[State, Vector]:
@@ -204,10 +240,15 @@ class Varied:
             return self.kind
         system, phi = self.at(at.p).system, self.mode_at(at, 0, self.m)
         load = system.load(at.state.u, at.state.mu, self.name)
-        return "fold" if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi) else "bifurcation"
+        return (
+            "fold"
+            if abs(phi @ load) > NO_WORK * np.linalg.norm(load) * np.linalg.norm(phi)
+            else "bifurcation"
+        )
 
     def mode_at(self, crossing: Locus, m: int, before: int) -> Vector:
-        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary `before`.
+        """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary
+        `before`.
 
         Raises
         ------
@@ -218,8 +259,12 @@ class Varied:
             try:
                 return critical_mode(self.at(crossing.p), crossing.state).vector
             except NoEigenpair as e:
-                raise BoundaryLost(f"the mode that becomes critical has no null vector: {e}") from None
-        return self.null_vector(crossing.p, crossing.state, m, crossing.phi if m == before else None)
+                raise BoundaryLost(
+                    f"the mode that becomes critical has no null vector: {e}"
+                ) from None
+        return self.null_vector(
+            crossing.p, crossing.state, m, crossing.phi if m == before else None
+        )
 
     def null_vector(self, p: float, state: State, m: int, beside: Vector | None = None) -> Vector:
         """That of m waves at a state where these are neutral, nearly; across another one."""
@@ -270,8 +315,8 @@ class Varied:
         return not self.alone
 
     def beside(self, p: float, *, rough: bool = False) -> list[tuple[float, float]]:
-        """Weights and values of a difference of second order, on the side where values are allowed; a rough one of
-        first order, with one scene beside that of p itself.
+        """Weights and values of a difference of second order, on the side where values are allowed;
+        a rough one of first order, with one scene beside that of p itself.
         """
         d = STEP * abs(self._ends[1] - self._ends[0])
         if self._line:
@@ -291,7 +336,11 @@ class Varied:
                 self.problem(p + 2 * d)
             except NoSystem:
                 sign = -1.0
-            return [(-1.5 * sign / d, p), (2 * sign / d, p + sign * d), (-0.5 * sign / d, p + 2 * sign * d)]
+            return [
+                (-1.5 * sign / d, p),
+                (2 * sign / d, p + sign * d),
+                (-0.5 * sign / d, p + 2 * sign * d),
+            ]
         return [(0.5 / d, p + d), (-0.5 / d, p - d)]
 
     def problem(self, p: float) -> Problem:
@@ -315,7 +364,11 @@ class Varied:
         stage = self._stages.pop(p, None)
         if stage is None:
             scene = self._scene(p)
-            stage = self._base.on(scene) if self._base.device or self._base.along else Stage(scene, scene.newton)
+            stage = (
+                self._base.on(scene)
+                if self._base.device or self._base.along
+                else Stage(scene, scene.newton)
+            )
         self._stages[p] = stage
         while len(self._stages) > KEPT:
             self._stages.pop(next(iter(self._stages)))
@@ -324,8 +377,14 @@ class Varied:
     def _scene(self, p: float) -> Scene:
         """The scene at a value, on the mesh of the first one in its chart."""
         old, new = self._origin.problem, self.problem(p)
-        if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
-            raise NoSystem("the symmetry of the model changes on the way: give the case symmetry: none")
+        if (old.axisymmetric, old.mirror, old.azimuth) != (
+            new.axisymmetric,
+            new.mirror,
+            new.azimuth,
+        ):
+            raise NoSystem(
+                "the symmetry of the model changes on the way: give the case symmetry: none"
+            )
         try:
             on_mesh = moved(self._origin, new)
             if self._shared and (scene := self._shared.at(p, on_mesh)):
@@ -340,20 +399,35 @@ class Varied:
         return State(transfer(self._origin, base, state.u), self._mu(p))
 
     def _mu(self, p: float) -> dict[str, float]:
-        """The amplitudes of the model at the instability, those that are given being those of another problem."""
+        """The amplitudes of the model at the instability, those that are given being those of
+        another problem.
+        """
         if self._line:
             at, amplitudes, rates = self._line
             return {name: v + rates[name] * (p - at) for name, v in amplitudes.items()}
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
-        for before, after in zip(old.programme[: self._record.step - 1], new.programme, strict=False):
+        for before, after in zip(
+            old.programme[: self._record.step - 1], new.programme, strict=False
+        ):
             one, two = (each.load.target or each.load.bound for each in (before, after))
-            if one and two and one[0].quantity == "load" and isclose(mu.get(before.name, np.nan), one[1], rel_tol=1e-9):
+            if (
+                one
+                and two
+                and one[0].quantity == "load"
+                and isclose(mu.get(before.name, np.nan), one[1], rel_tol=1e-9)
+            ):
                 mu[before.name] = two[1]
         given, now = own_amplitudes(old.loads), own_amplitudes(new.loads)
-        mu |= {name: now[name] for name, v in given.items() if name in now and v and mu.get(name) == v}
+        mu |= {
+            name: now[name] for name, v in given.items() if name in now and v and mu.get(name) == v
+        }
         if old.lambda_m and new.lambda_m != old.lambda_m:
             ratio = new.lambda_m / old.lambda_m
-            mu |= {name: ratio * v for name, v in mu.items() if name.startswith("lambda_") and name != self.name}
+            mu |= {
+                name: ratio * v
+                for name, v in mu.items()
+                if name.startswith("lambda_") and name != self.name
+            }
         return mu
 
     def _by_amplitudes_alone(self, value: float) -> bool:
@@ -373,7 +447,9 @@ class Varied:
         return max_abs(comm, after - moved_only) <= SAME * size
 
     def _share(self, value: float) -> None:
-        """Take the forms of one scene for all values, if the forces of those that have a scene are then the same."""
+        """Take the forms of one scene for all values, if the forces of those that have a scene are
+        then the same.
+        """
         shared = Renumbered.of(self._base.scene)
         if shared is None:
             return
@@ -389,17 +465,23 @@ class Varied:
         self._shared, self._stages = None, stages
 
     def _forces(self, stage: Stage, p: float) -> Vector:
-        """At the instability, with other numbers: residual, load, and the tangent along the null vector."""
+        """At the instability, with other numbers: residual, load, and the tangent along the null
+        vector.
+        """
         system, (state, phi) = stage.newton.system, self.start
         mu = {**self._fixed(stage, p), self.name: state.mu[self.name]}
         here = State(state.u, mu)
         if self.m:
             along = self._times(stage, here, self.m, phi)
-        elif stage.scene.model.axisymmetric:  # its matrices cost little, and differences are less exact
+        elif (
+            stage.scene.model.axisymmetric
+        ):  # its matrices cost little, and differences are less exact
             along = stage.newton.factor_at(here).times(phi)
         else:
             along = times_tangent(system, here, phi)
-        return np.concatenate([system.residual(state.u, mu), system.load(state.u, mu, self.name), along])
+        return np.concatenate(
+            [system.residual(state.u, mu), system.load(state.u, mu, self.name), along]
+        )
 
     def _fixed(self, stage: Stage, p: float) -> dict[str, float]:
         mu = stage.enter(State(self._first.point.state.u, self._mu(p))).mu
@@ -424,7 +506,9 @@ def moved(scene: Scene, new: Problem) -> Problem:
         knots, places = old.meridian.knots, new.meridian.knots
         if knots.shape != places.shape:
             raise NoSystem("a rim of a dimple appears or vanishes on the way")
-        return replace(made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places)))
+        return replace(
+            made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places))
+        )
     if scene.model.midsurface and not alike(old.shape, new.shape):
         patch = scene.model.midsurface.reshaped(new.embedding)
         one, two = box_of(old.shape), box_of(new.shape)

@@ -9,7 +9,13 @@ import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import Branching, branching
 from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import Finding, PathStopped, Point, StepOptions, StepTooLong
+from magshell_fenicsx.continuation.point import (
+    Finding,
+    PathStopped,
+    Point,
+    StepOptions,
+    StepTooLong,
+)
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
@@ -31,7 +37,9 @@ from magshell_fenicsx.simulate.touch import (
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 MOST_CHANGED = 10  # times that a first point gets stiffer penalties or new cuts
-ASKED = 1 / 16  # of the first step: where load control fails in so short a step, a fold is looked for first
+ASKED = (
+    1 / 16
+)  # of the first step: where load control fails in so short a step, a fold is looked for first
 
 
 Records = Generator[Record, None, State]  # records, and the model's state at the end
@@ -50,10 +58,12 @@ class Walked:
 def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int = 0) -> Records:
     """The records of a walk, with instabilities that the reduced model excludes, and of branches.
 
-    Each direction of the branch at the first bifurcation is followed for that number of steps, or to the target.
+    Each direction of the branch at the first bifurcation is followed for that number of steps, or
+    to the target.
 
-    With `until: bifurcation` an excluded instability ends the walk. With `until: limit` the walk continues to the first
-    instability of the model itself, up to `BEYOND` times the load of the first excluded one.
+    With `until: bifurcation` an excluded instability ends the walk. With `until: limit` the walk
+    continues to the first instability of the model itself, up to `BEYOND` times the load of the
+    first excluded one.
 
     Raises
     ------
@@ -114,7 +124,9 @@ class _Checks:
         if "too_long" in found:
             raise StepTooLong(found["too_long"])
         if "stopped" in found:
-            raise PathStopped(found["stopped"], high if found["at_high"] else low, final=found["final"])
+            raise PathStopped(
+                found["stopped"], high if found["at_high"] else low, final=found["final"]
+            )
         changed, of_cuts = found["stiffer"], not found["stiffer"]
         if of_cuts:
             self._cut_at, changed = low.s, found["cuts"]
@@ -171,17 +183,28 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 if excluded and goal.until == "limit":
                     furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
                 if label == "bifurcation":
-                    crossing_at_point = branching(_by_arc(stage, path), point, partial(passes, stage))
+                    crossing_at_point = branching(
+                        _by_arc(stage, path), point, partial(passes, stage)
+                    )
                     crossing = crossing or crossing_at_point
-                    mode = ("symmetric" if crossing_at_point.symmetric else "asymmetric") if crossing_at_point else ""
+                    mode = (
+                        ("symmetric" if crossing_at_point.symmetric else "asymmetric")
+                        if crossing_at_point
+                        else ""
+                    )
                 if label == "fold":
                     fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
                 said = words_of_cluster(stage.scene, walk, point)
-                yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable, said=said)
+                yield Record(
+                    label, path.name, point, mode, excluded_pivots=watch.unstable, said=said
+                )
                 if abs(point.state.mu[path.name]) > furthest:
                     break
         except PathStopped as e:
-            lost, final = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere(), e.final
+            lost, final = (
+                _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere(),
+                e.final,
+            )
         excluded = list(_excluded(path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]
@@ -193,7 +216,9 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
         if lost:
             ahead, onward = _beyond(stage, walk, finest, final=final)
         if onward:
-            stage.scene.progress.doing("going on by arc length" if onward.path.control == "arc" else "in shorter steps")
+            stage.scene.progress.doing(
+                "going on by arc length" if onward.path.control == "arc" else "in shorter steps"
+            )
             lost = ""
             watch.begin(onward.path, onward.points[0], stage.leave)
     yield from ahead
@@ -211,10 +236,14 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     return walk.points[-1].state
 
 
-def _beyond(stage: Stage, walk: Walk, finest: float, *, final: bool) -> tuple[list[Record], Walk | None]:
-    """What ends a walk that has stopped, a fold with the excluded instabilities before it; or the walk that goes on.
+def _beyond(
+    stage: Stage, walk: Walk, finest: float, *, final: bool
+) -> tuple[list[Record], Walk | None]:
+    """What ends a walk that has stopped, a fold with the excluded instabilities before it; or the
+    walk that goes on.
 
-    Under load control it goes on in steps down to `finest`, unless a fold explains why the last step failed.
+    Under load control it goes on in steps down to `finest`, unless a fold explains why the last
+    step failed.
     """
     path, goal, last = walk.path, walk.goal, walk.points[-1]
     if path.control != "load" or not goal.targets:
@@ -239,20 +268,28 @@ def _asking(path: Path, first: float, finest: float) -> Path:
 def _onward(stage: Stage, walk: Walk) -> Walk | None:
     """A walk by arc length from where another one stopped; None if it must not or cannot be.
 
-    An instability is where it is however the path is controlled: only a target belongs to its control.
+    An instability is where it is however the path is controlled: only a target belongs to its
+    control.
     """
     path, goal, points = walk.path, walk.goal, walk.points
     if path.control == "arc" or goal.targets:
         return None
     last, name, metric = points[-1], path.name, path.metric
-    moved = [metric.norm(b.state.u - a.state.u, b.state.mu[name] - a.state.mu[name]) for a, b in pairwise(points)]
+    moved = [
+        metric.norm(b.state.u - a.state.u, b.state.mu[name] - a.state.mu[name])
+        for a, b in pairwise(points)
+    ]
     first = float(np.median(moved or [path.options.first * metric.norm(last.du, last.dmu)]))
-    by_arc = stage.path(name, "arc", StepOptions(first, LONGEST * first, 1e-6 * first), metric.scale)
+    by_arc = stage.path(
+        name, "arc", StepOptions(first, LONGEST * first, 1e-6 * first), metric.scale
+    )
     start = by_arc.start(last.state, last.dmu * (last.s - points[-2].s if moved else goal.sense))
     return _walk(stage, by_arc, start, goal)
 
 
-def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
+def _branches(
+    stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int
+) -> Iterator[Record]:
     """Follow both directions of a branch, to the target of the path or for a number of steps."""
     lost = []
     for number, start in enumerate(crossing.starts, 1):
@@ -270,7 +307,8 @@ def off_path(goal: Goal, steps: int) -> Goal:
 
 
 def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> Records:
-    """The records of a branch, by arc length, with its `number`; the state at the end of the step's system.
+    """The records of a branch, by arc length, with its `number`; the state at the end of the step's
+    system.
 
     Raises
     ------
@@ -289,10 +327,14 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
     yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
     try:
         for label, point in walk:
-            for record in _excluded(path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))):
+            for record in _excluded(
+                path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))
+            ):
                 yield replace(record, branch=number)
             said = words_of_cluster(stage.scene, walk, point)
-            yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable, said=said)
+            yield Record(
+                label, path.name, point, branch=number, excluded_pivots=watch.unstable, said=said
+            )
     except PathStopped as e:
         lost = _why(stage.scene, path, e, walk.points)
     for record in _excluded(path, watch.end()):
@@ -309,7 +351,8 @@ def _by_arc(stage: Stage, path: Path) -> Path:
 
 
 def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
-    """The fold that ended a path under load control, located by arc length, after any excluded instabilities.
+    """The fold that ended a path under load control, located by arc length, after any excluded
+    instabilities.
 
     None if there is none `within` so small a change of the load.
     """
@@ -326,7 +369,10 @@ def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
             if abs(point.state.mu[name] - last.s) > within:
                 return []
             if label == "fold":
-                return [*passed, Record(label, name, point, excluded_pivots=stage.scene.watch.unstable)]
+                return [
+                    *passed,
+                    Record(label, name, point, excluded_pivots=stage.scene.watch.unstable),
+                ]
     except PathStopped:
         pass
     return []
@@ -335,7 +381,13 @@ def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
 def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Records of the points where excluded modes become unstable or stable."""
     for crossing in crossings:
-        yield Record("bifurcation", path.name, crossing.point, crossing.label, excluded_pivots=crossing.unstable)
+        yield Record(
+            "bifurcation",
+            path.name,
+            crossing.point,
+            crossing.label,
+            excluded_pivots=crossing.unstable,
+        )
 
 
 def words_of_cluster(scene: Scene, walk: Walk, point: Point) -> str:

@@ -1,4 +1,6 @@
-"""The boundary of stability of a case: its instability followed in a second key, with cusps, as table and picture."""
+"""The boundary of stability of a case: its instability followed in a second key, with cusps, as
+table and picture.
+"""
 
 import copy
 import hashlib
@@ -44,7 +46,11 @@ from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, rest_said
 
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
-FOLDER = Folder("a boundary", ("boundary.json", "boundary.csv", "boundary.png"), ("case", "key", "load", "special"))
+FOLDER = Folder(
+    "a boundary",
+    ("boundary.json", "boundary.csv", "boundary.png"),
+    ("case", "key", "load", "special"),
+)
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
 REACHED = 1e-6  # of the range: so close to its end a boundary is there
@@ -60,7 +66,9 @@ CHANGED = "a fold and a bifurcation change their order"
 
 @dataclass(frozen=True)
 class Range:
-    """The key that varies, from its first to its last value in a unit, and the least number of steps between these."""
+    """The key that varies, from its first to its last value in a unit, and the least number of
+    steps between these.
+    """
 
     key: str
     first: float
@@ -153,25 +161,28 @@ def boundary(
 ) -> StabilityBoundary:
     """Follow the instability at the end of a case in a second key; collective, two ranks work.
 
-    The case is run once. From its instability both directions are followed, through turning points, until the key
-    leaves its range; what the folder has of an interrupted boundary is kept. See `continuation.boundary`.
+    The case is run once. From its instability both directions are followed, through turning points,
+    until the key leaves its range; what the folder has of an interrupted boundary is kept. See
+    `continuation.boundary`.
 
     Parameters
     ----------
     over
-        `key.path=first:last`, or with the least number of steps from the one to the other: `first:last:steps`.
+        `key.path=first:last`, or with the least number of steps from the one to the other:
+        `first:last:steps`.
     out
         Folder of boundary.csv, boundary.json, boundary.png and points/.
     made
         Makes a case of its source.
     start
-        Another instability: "DIR:POINT", a located point of the run in a folder, whose case takes the place of `file`.
+        Another instability: "DIR:POINT", a located point of the run in a folder, whose case takes
+        the place of `file`.
 
     Raises
     ------
     CaseError
-        If the case or an end of the range is invalid, the case ends without an instability, or the key has no
-        influence on it or changes what a boundary cannot follow.
+        If the case or an end of the range is invalid, the case ends without an instability, or the
+        key has no influence on it or changes what a boundary cannot follow.
     Stopped
         If the path to the instability is lost.
     DiskError
@@ -188,18 +199,24 @@ def boundary(
         say = once if comm.rank == 0 else say
         journal = partial(Journal, folder / "points", _identity(source, span, made, begun_at.text))
         value = _value(source, span, made, outside=not start)
-        begin = by_first(comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at))
+        begin = by_first(
+            comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at)
+        )
         name_of_mode = begin["mode"]
         if name_of_mode == "antisymmetric":
             once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             again = begun_at.anywhere()
-            begin = by_first(comm, lambda: _begin(source, span, value, made, journal("whole"), say, again))
+            begin = by_first(
+                comm, lambda: _begin(source, span, value, made, journal("whole"), say, again)
+            )
         if not begin["label"]:
             instability([])
         name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
         begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
-        once(f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}")
+        once(
+            f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}"
+        )
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
         def followed(sense: int) -> Iterator[str]:
@@ -210,7 +227,10 @@ def boundary(
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
         compute(senses, followed, comm, say)
-        outcomes = by_first(comm, lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses})
+        outcomes = by_first(
+            comm,
+            lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses},
+        )
         done = _put_together(outcomes, begin, span, name, settings)
         by_first(comm, lambda: _write(done, folder))
     for line in done.content["said"]:
@@ -219,7 +239,9 @@ def boundary(
 
 
 def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
-    """Where the boundary starts: the case's own value, or where that may be outside, the end that is nearest to it."""
+    """Where the boundary starts: the case's own value, or where that may be outside, the end that
+    is nearest to it.
+    """
     words = span.key.split(".")
     raw = value_at(source.data, words)
     raw = value_at(made(source).model_dump(mode="json"), words) if raw is None else raw
@@ -227,10 +249,14 @@ def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
         value = in_unit(str(raw), span.unit)
     except ValueError:
         if isinstance(raw, dict | list | bool):
-            raise CaseError(f"--over {span.key}: is no number in the case, but {type(raw).__name__}") from None
+            raise CaseError(
+                f"--over {span.key}: is no number in the case, but {type(raw).__name__}"
+            ) from None
         value = span.first
     if not outside and not span.ends[0] <= value <= span.ends[1]:
-        raise CaseError(f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the range")
+        raise CaseError(
+            f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the range"
+        )
     return float(np.clip(value, *span.ends))
 
 
@@ -301,7 +327,14 @@ def _begin(
 
 
 def _followed(
-    source: Source, span: Range, value: float, sense: int, made: Made, begin: dict[str, Any], own: Journal, say: Say
+    source: Source,
+    span: Range,
+    value: float,
+    sense: int,
+    made: Made,
+    begin: dict[str, Any],
+    own: Journal,
+    say: Say,
 ) -> dict[str, Any]:
     """One direction of the boundary: its rows from the start, and why it stopped if it did."""
     scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
@@ -319,7 +352,9 @@ def _followed(
     def take(label: Label, locus: Locus, mode: Boundary) -> None:
         row = _row(varied, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
-        part = max((each["key"] - value) / (end - value) for each in rows)  # of the way, which may turn back
+        part = max(
+            (each["key"] - value) / (end - value) for each in rows
+        )  # of the way, which may turn back
         left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
         beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
         at = f"{row['key']:.9g} {span.unit}".rstrip()
@@ -335,7 +370,9 @@ def _followed(
         if begin["is_first"]:
             mode, start = first_mode(curve, varied.mode_at, mode, start)
         rows.append(_row(varied, "start", start, mode, begin["name_of_mode"]))
-        for label, locus, on in critical(curve, varied.mode_at, mode, start, sense, span.ends, span.steps):
+        for label, locus, on in critical(
+            curve, varied.mode_at, mode, start, sense, span.ends, span.steps
+        ):
             take(label, locus, on)
     except (BoundaryLost, NoSystem) as e:
         if not rows:
@@ -344,7 +381,9 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": varied.alone}
 
 
-def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mode: str) -> dict[str, Any]:
+def _row(
+    varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mode: str
+) -> dict[str, Any]:
     """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
     whole."""
     families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
@@ -357,7 +396,9 @@ def _row(varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mod
         "kind": label if label in SPECIAL else mode.kind,
         "mode": ", ".join(f"{WAVES}{m}" if m else own for m in families),
         "error": float(locus.load_error),
-        "unstable": int(locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)),
+        "unstable": int(
+            locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
+        ),
         "factorisations": int(locus.factorisations),
     }
 
@@ -369,7 +410,11 @@ def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
 
 
 def _put_together(
-    outcomes: dict[int, dict[str, Any]], begin: dict[str, Any], span: Range, name: str, settings: Sequence[str]
+    outcomes: dict[int, dict[str, Any]],
+    begin: dict[str, Any],
+    span: Range,
+    name: str,
+    settings: Sequence[str],
 ) -> StabilityBoundary:
     """Both directions as one curve, and what it says."""
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
@@ -385,7 +430,9 @@ def _put_together(
     reached = min(row["key"] for row in rows), max(row["key"] for row in rows)
     for end, key in zip(sorted((span.first, span.last)), reached, strict=True):
         if not stopped and abs(key - end) > REACHED * abs(span.last - span.first):
-            said.append(f"between {span.text(end)} and {span.text(key)} it has no points: it turns back before")
+            said.append(
+                f"between {span.text(end)} and {span.text(key)} it has no points: it turns back before"
+            )
     content = {
         "case": name,
         "settings": list(settings),
@@ -399,7 +446,10 @@ def _put_together(
         "points": len(rows),
         "special": special,
         "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],
-        "factorisations": {"run": begin["factorisations"], "boundary": sum(row["factorisations"] for row in rows)},
+        "factorisations": {
+            "run": begin["factorisations"],
+            "boundary": sum(row["factorisations"] for row in rows),
+        },
         "stopped": stopped,
     }
     return StabilityBoundary(rows, content)

@@ -20,7 +20,10 @@ from magshell_fenicsx.studies.points import Axis, parse_axis
 from magshell_fenicsx.studies.runner import Folder, Made, Say
 
 FOLDER = Folder(
-    "a map of boundaries", ("map.json", "boundary.csv", "boundary.png"), ("case", "keys", "without"), "boundaries"
+    "a map of boundaries",
+    ("map.json", "boundary.csv", "boundary.png"),
+    ("case", "keys", "without"),
+    "boundaries",
 )
 
 
@@ -33,14 +36,23 @@ def second_axis(text: str, first: str) -> Axis:
         If it is no list of numbers of one other key, each once.
     """
     axis = parse_axis(text)
-    if len(axis.keys) > 1 or axis.numbers is None or axis.name == first or axis.name.split(".")[0] in BESIDE:
+    if (
+        len(axis.keys) > 1
+        or axis.numbers is None
+        or axis.name == first
+        or axis.name.split(".")[0] in BESIDE
+    ):
         raise CaseError(
             f"--over {text}: the second key of a map is another number of the shell or its loads, written as "
             "key.path=first:last:count or key.path=value,value,..."
         )
     numbers = [axis.number(value) for value in axis.values]
-    if twice := next((value for i, value in enumerate(axis.values) if numbers[i] in numbers[:i]), None):
-        raise CaseError(f"--over {text}: {twice} stands twice: each value of the second key has one boundary")
+    if twice := next(
+        (value for i, value in enumerate(axis.values) if numbers[i] in numbers[:i]), None
+    ):
+        raise CaseError(
+            f"--over {text}: {twice} stands twice: each value of the second key has one boundary"
+        )
     return axis
 
 
@@ -55,15 +67,17 @@ def boundary_map(
     made: Made,
     start: str | None = None,
 ) -> StabilityBoundary:
-    """Follow the instability of a case in one key, for each value of a second one if there is one; collective.
+    """Follow the instability of a case in one key, for each value of a second one if there is one;
+    collective.
 
     Parameters
     ----------
     overs
-        The first key with its range, as for `boundary`, and the second with its values, as for a sweep.
+        The first key with its range, as for `boundary`, and the second with its values, as for a
+        sweep.
     out
-        Folder of boundary.csv (with the columns `second` and `amplitude`, whose load it is), map.json, boundary.png and
-        boundaries/, a folder for each value; what these have is kept.
+        Folder of boundary.csv (with the columns `second` and `amplitude`, whose load it is),
+        map.json, boundary.png and boundaries/, a folder for each value; what these have is kept.
 
     Returns
     -------
@@ -77,9 +91,13 @@ def boundary_map(
     if len(overs) == 1:
         return boundary(file, overs[0], settings, out, comm, say, made=made, start=start)
     if start:
-        raise CaseError(f"--from {start}: a map starts at the end of each of its cases: give one --over")
+        raise CaseError(
+            f"--from {start}: a map starts at the end of each of its cases: give one --over"
+        )
     if len(overs) != 2:
-        raise CaseError(f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two")
+        raise CaseError(
+            f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two"
+        )
     span = parse_range(overs[0])
     axis = second_axis(overs[1], span.key)
     for setting in settings:
@@ -92,7 +110,15 @@ def boundary_map(
             once(f"{axis.name} = {value}, {number} of {len(axis.values)}")
             own = [*settings, f"{axis.name}={value}"]
             try:
-                one = boundary(file, overs[0], own, folder / "boundaries" / f"{number:03d}", comm, say, made=made)
+                one = boundary(
+                    file,
+                    overs[0],
+                    own,
+                    folder / "boundaries" / f"{number:03d}",
+                    comm,
+                    say,
+                    made=made,
+                )
             except (Excluded, NoInstability, Stopped) as e:
                 without[value] = str(e)
                 once(f"{axis.name} = {value}: no boundary: {e}")
@@ -100,9 +126,14 @@ def boundary_map(
             except CaseError as e:
                 raise CaseError(str(e).replace(f"--set {own[-1]}", f"--over {own[-1]}")) from None
             lines[value] = one
-            rows += [{"second": axis.number(value), "amplitude": one.content["load"], **row} for row in one.rows]
+            rows += [
+                {"second": axis.number(value), "amplitude": one.content["load"], **row}
+                for row in one.rows
+            ]
         if not rows:
-            raise CaseError(f"--over {overs[1]}: the case has an instability at none of these values")
+            raise CaseError(
+                f"--over {overs[1]}: the case has an instability at none of these values"
+            )
         content = _content(file, settings, lines, without, axis)
         done = StabilityBoundary(rows, content)
         by_first(comm, lambda: _write(done, folder))
@@ -118,9 +149,20 @@ def _content(
     without: dict[str, str],
     axis: Axis,
 ) -> dict[str, Any]:
-    first, loads = next(iter(lines.values())).content, [line.content["load"] for line in lines.values()]
-    special = [{"second": axis.number(value), **each} for value, line in lines.items() for each in line.special]
-    said = [f"{axis.name} = {value}: {text}" for value, line in lines.items() for text in line.content["said"]]
+    first, loads = (
+        next(iter(lines.values())).content,
+        [line.content["load"] for line in lines.values()],
+    )
+    special = [
+        {"second": axis.number(value), **each}
+        for value, line in lines.items()
+        for each in line.special
+    ]
+    said = [
+        f"{axis.name} = {value}: {text}"
+        for value, line in lines.items()
+        for text in line.content["said"]
+    ]
     return {
         "case": Path(file).name,
         "settings": list(settings),
@@ -129,17 +171,28 @@ def _content(
         "range": [first["from"], first["to"]],
         "values": [axis.number(value) for value in axis.values],
         "load": max(loads, key=loads.count),
-        "kinds": {value: f"{line.content['kind']} {line.content['mode']}".strip() for value, line in lines.items()},
+        "kinds": {
+            value: f"{line.content['kind']} {line.content['mode']}".strip()
+            for value, line in lines.items()
+        },
         "special": special,
         "said": said + [f"{axis.name} = {value}: no boundary" for value in without],
         "without": without,
-        "stopped": [f"{axis.name} = {value}: {why}" for value, line in lines.items() for why in line.stopped],
+        "stopped": [
+            f"{axis.name} = {value}: {why}" for value, line in lines.items() for why in line.stopped
+        ],
     }
 
 
 def _write(done: StabilityBoundary, folder: Path) -> None:
-    more = dict.fromkeys(name for row in done.rows for name in row if name not in ("second", "amplitude", *COLUMNS))
+    more = dict.fromkeys(
+        name for row in done.rows for name in row if name not in ("second", "amplitude", *COLUMNS)
+    )
     columns = ("second", "amplitude", *COLUMNS, *more)
     write_object(folder / "map.json", done.content)
-    write_csv([{name: row.get(name, "") for name in columns} for row in done.rows], columns, folder / "boundary.csv")
+    write_csv(
+        [{name: row.get(name, "") for name in columns} for row in done.rows],
+        columns,
+        folder / "boundary.csv",
+    )
     draw_map(done.rows, done.content, folder / "boundary.png")

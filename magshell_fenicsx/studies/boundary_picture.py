@@ -18,8 +18,16 @@ WORDS = {
     "meeting": "second mode neutral",
     "crossing": "another mode comes first",
 }
-LEGEND: Mapping[str, Any] = {"frameon": False, "fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-NARROW, LOW = 0.25, 0.08  # of the width of the picture: a region that has no place for more than its mode, or for that
+LEGEND: Mapping[str, Any] = {
+    "frameon": False,
+    "fontsize": 8,
+    "loc": "upper left",
+    "bbox_to_anchor": (1.0, 1.0),
+}
+NARROW, LOW = (
+    0.25,
+    0.08,
+)  # of the width of the picture: a region that has no place for more than its mode, or for that
 Row = Mapping[str, Any]
 
 
@@ -40,7 +48,9 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     parts = [part for _, part in _by_mode(rows)]
     for smooth_part in parts:  # with a corner where two bifurcations cross
-        pairs = groupby(pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"]))
+        pairs = groupby(
+            pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])
+        )
         for unstable, group in pairs:
             joined = [*group]
             line = [joined[0][0], *(two for _, two in joined)]
@@ -52,7 +62,10 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     arms = _arms(rows)
     if arms:
         low, high = arms
-        x, y = (np.concatenate([one, two[::-1]]) for one, two in zip(_joined(low), _joined(high), strict=True))
+        x, y = (
+            np.concatenate([one, two[::-1]])
+            for one, two in zip(_joined(low), _joined(high), strict=True)
+        )
         plot.fill(x, y, color="C0", alpha=0.12, linewidth=0)
     plot.set(xlabel=key_label(content["key"], content["unit"]), ylabel=label, title=_title(content))
     if plot.get_legend_handles_labels()[1]:
@@ -62,7 +75,8 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
 
 
 def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:
-    """Draw the boundaries in their own key, one line a value of the second, and cusps in the plane of both keys.
+    """Draw the boundaries in their own key, one line a value of the second, and cusps in the plane
+    of both keys.
 
     Parameters
     ----------
@@ -79,9 +93,13 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     empty = sorted(set(content["values"]) - {row["second"] for row in rows})
     of_plane = bool(others or empty or any(row["kind"] in MARKS for row in rows))
     wide = 10.2 if of_plane else 6.4
-    figure, plots = plt.subplots(1, 1 + of_plane, figsize=(wide, 4.4), layout="constrained", squeeze=False)
+    figure, plots = plt.subplots(
+        1, 1 + of_plane, figsize=(wide, 4.4), layout="constrained", squeeze=False
+    )
     plot, plane = plots[0, 0], plots[0, -1]
-    names = [key_label(key, unit) for key, unit in zip(content["keys"], content["units"], strict=True)]
+    names = [
+        key_label(key, unit) for key, unit in zip(content["keys"], content["units"], strict=True)
+    ]
     shade = plt.Normalize(min(content["values"]), max(content["values"]))
     for value in sorted({row["second"] for row in rows}, reverse=True):
         line = [row for row in rows if row["second"] == value]
@@ -105,7 +123,9 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
     return [{**row, "load": row.get(of.name, row["load"])} for row in rows], of.label
 
 
-def _plane(plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]) -> None:
+def _plane(
+    plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
+) -> None:
     """Lines of both keys on which there is an instability, by which load, and where there is none."""
     named = set[str]()
 
@@ -133,10 +153,17 @@ def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
 
 def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) -> None:
     """A smooth line through the points of a boundary, with dots where one is to see them."""
-    x, y = _joined([(row["key"], row["load"]) for row in rows], [row["kind"] in MARKS for row in rows])
+    x, y = _joined(
+        [(row["key"], row["load"]) for row in rows], [row["kind"] in MARKS for row in rows]
+    )
     plot.plot(x, y, **style)
     if marked:
-        plot.plot(*zip(*[(row["key"], row["load"]) for row in rows], strict=True), ".", ms=4, color=style["color"])
+        plot.plot(
+            *zip(*[(row["key"], row["load"]) for row in rows], strict=True),
+            ".",
+            ms=4,
+            color=style["color"],
+        )
 
 
 def _joined(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
@@ -149,16 +176,22 @@ def _title(content: Mapping[str, Any]) -> str:
     return ", ".join([Path(content["case"]).stem.replace("_", " "), *content.get("settings", ())])
 
 
-def _arms(rows: Sequence[Row]) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:
+def _arms(
+    rows: Sequence[Row],
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:
     """The two folds of the first cusp, from it on; None without one."""
     at = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
     if at is None:
         return None
-    before, after = ([(row["key"], row["load"]) for row in part] for part in (rows[at::-1], rows[at:]))
+    before, after = (
+        [(row["key"], row["load"]) for row in part] for part in (rows[at::-1], rows[at:])
+    )
     return before, after
 
 
-def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
+def _regions(
+    rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
+) -> list[tuple[Any, ...]]:
     """Places and names of the regions; beyond a boundary of several modes each has its own.
 
     Where a bifurcation comes after other instabilities it divides nothing that is stable.
@@ -167,9 +200,14 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
     parts, whole = _by_mode(rows), _beside(rows, content, limits)
     if len(parts) < 2:
         return whole
-    extent, named = np.ptp([row["key"] for row in rows]), [each for each in whole if each[2] == "stable"]
+    extent, named = (
+        np.ptp([row["key"] for row in rows]),
+        [each for each in whole if each[2] == "stable"],
+    )
     for mode, part in parts:
-        kind = next((row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"])
+        kind = next(
+            (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
+        )
         for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
             width = np.ptp([row["key"] for row in part]) / extent
             outer = limits[1] if y > 0 else limits[0]
@@ -178,7 +216,9 @@ def _regions(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[floa
     return named
 
 
-def _beside(rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]) -> list[tuple[Any, ...]]:
+def _beside(
+    rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
+) -> list[tuple[Any, ...]]:
     """The same of a boundary with one mode."""
     lost = "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
@@ -205,7 +245,10 @@ def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     """The modes one after the other, each with its rows and the crossings at their ends."""
     ends = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
     parts = ([*rows[a : b + 1]] for a, b in pairwise([0, *ends, len(rows) - 1]))
-    named = ((next((row["mode"] for row in part if row["kind"] != "crossing"), None), part) for part in parts)
+    named = (
+        (next((row["mode"] for row in part if row["kind"] != "crossing"), None), part)
+        for part in parts
+    )
     return [(mode, part) for mode, part in named if mode is not None]
 
 

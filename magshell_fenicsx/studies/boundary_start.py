@@ -51,7 +51,9 @@ class Start:
         """
         if not self.text:
             return instability(records)
-        near = [r for r in records if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=SAME)]
+        near = [
+            r for r in records if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=SAME)
+        ]
         if self.complete(records) and records[self.point] in near:
             return records[self.point]
         if not near:
@@ -89,8 +91,12 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
         raise CaseError(f"--from {text}: {folder} has no run")
     located: dict[Any, Any] = {row["point"]: row for row in rows if row["label"] in LOCATED}
     if point not in located:
-        numbers = ", ".join(f"{number} ({row['label']})" for number, row in located.items()) or "none"
-        raise CaseError(f"--from {text}: is no fold or bifurcation of this run; these are {numbers}")
+        numbers = (
+            ", ".join(f"{number} ({row['label']})" for number, row in located.items()) or "none"
+        )
+        raise CaseError(
+            f"--from {text}: is no fold or bifurcation of this run; these are {numbers}"
+        )
     row = located[point]
     load = float(row[amplitude(row["amplitude"]).column])
     return Start(text, point, load), replace(source, data=data, places={})

@@ -27,9 +27,17 @@ from magshell_fenicsx.studies.study_report import estimated_error
 Errors = Mapping[str, Sequence[tuple[float, float]]]
 ModelName = Literal["shell", "solid"]
 MODELS: tuple[ModelName, ...] = ("shell", "solid")
-WITHOUT: dict[ModelName, list[str]] = {"shell": ["solid=null"], "solid": []}  # settings of a model alone
+WITHOUT: dict[ModelName, list[str]] = {
+    "shell": ["solid=null"],
+    "solid": [],
+}  # settings of a model alone
 UNCOMPARED = ("angle", "time")  # amplitudes over which curves are not compared
-FOLDER = Folder("a comparison", ("compare.json", "compare.csv", "compare.png"), ("difference", "runs"), points="")
+FOLDER = Folder(
+    "a comparison",
+    ("compare.json", "compare.csv", "compare.png"),
+    ("difference", "runs"),
+    points="",
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,12 @@ class Used:
 
 
 def run_model(
-    case: Path, settings: Sequence[str], model: ModelName, refinement: float, folder: Path, say: Say = print
+    case: Path,
+    settings: Sequence[str],
+    model: ModelName,
+    refinement: float,
+    folder: Path,
+    say: Say = print,
 ) -> ModelRun:
     """Run a case with one of the models, unless the folder has that run by the same sources.
 
@@ -82,7 +95,11 @@ def run_model(
         If there is nothing to compare.
     """
     chosen = [*settings, f"model={model}", f"mesh.refinement={refinement:g}", *WITHOUT[model]]
-    asked = {"case": case.read_text(encoding="utf-8"), "settings": chosen, "sources": code_version()}
+    asked = {
+        "case": case.read_text(encoding="utf-8"),
+        "settings": chosen,
+        "sources": code_version(),
+    }
     used, results, why = kept(folder / "usage.json", TypeAdapter(Used)), None, ""
     if used and used.asked == asked:
         try:
@@ -96,23 +113,33 @@ def run_model(
     if not (used and results):
         name = _case_in(folder)
         if name and Path(name).stem != case.stem:
-            raise CaseError(f"--out {folder.parent}: has a comparison of {name}, which is kept; give another folder")
+            raise CaseError(
+                f"--out {folder.parent}: has a comparison of {name}, which is kept; give another folder"
+            )
         sets = [part for setting in chosen for part in ("--set", setting)]
-        measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"])
+        measured = measure(
+            "magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"]
+        )
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
-            raise NothingLeft(f"model: {model}: {measured.last_error or f'exit code {measured.code}'}")
+            raise NothingLeft(
+                f"model: {model}: {measured.last_error or f'exit code {measured.code}'}"
+            )
         results = read_summary(folder), read_lines(folder / "path.csv")
         used = Used({**asked, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
         keep(folder / "usage.json", asdict(used))
     summary, rows = results
     compiling = float(summary["timing"]["jit_s"])
-    return ModelRun(model, refinement, summary, rows, used.cpu_s - compiling, used.wall_s - compiling)
+    return ModelRun(
+        model, refinement, summary, rows, used.cpu_s - compiling, used.wall_s - compiling
+    )
 
 
 def _case_in(folder: Path) -> str:
     """The name of the case file whose run is in a folder; empty without."""
     with suppress(OSError, Damaged):
-        return str((begun_with(folder / NAME) or read_object(folder / "summary.json")).get(FILE, ""))
+        return str(
+            (begun_with(folder / NAME) or read_object(folder / "summary.json")).get(FILE, "")
+        )
     return ""
 
 
@@ -145,16 +172,20 @@ def curve(run: ModelRun) -> tuple[list[float], list[float]]:
 
 
 def loaded(run: ModelRun) -> list[dict[str, str]]:
-    """The rows of the last part of the path and the row before it, with the displacement since that row.
+    """The rows of the last part of the path and the row before it, with the displacement since that
+    row.
 
-    The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also stretches the
-    thickness. The displacement since the end of the field excludes this.
+    The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also
+    stretches the thickness. The displacement since the end of the field excludes this.
     """
     varied = amplitude_of(run)
     x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # the same point in both models
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == varied)
     before = run.rows[max(first - 1, 0)]
-    part = [before, *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0")]
+    part = [
+        before,
+        *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0"),
+    ]
     return [{**row, W: repr(float(row[x]) - float(before[x]))} for row in part]
 
 
@@ -171,8 +202,14 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
     """The differences at the displacements that both runs reach."""
-    both = ((place, load_at(shell, place), load_at(solid, place)) for place in places([shell, solid]))
-    return [Difference(place, one, two) for place, one, two in both if one is not None and two is not None]
+    both = (
+        (place, load_at(shell, place), load_at(solid, place)) for place in places([shell, solid])
+    )
+    return [
+        Difference(place, one, two)
+        for place, one, two in both
+        if one is not None and two is not None
+    ]
 
 
 def load_at(run: ModelRun, w: float) -> float | None:
@@ -193,11 +230,14 @@ def judge(
         return scalar.name, lambda run: scalar.of(run.summary, run.rows)
     if at is None:
         return "nothing", lambda run: None
-    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", lambda run: load_at(run, at)
+    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", lambda run: load_at(
+        run, at
+    )
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
-    """Run time in seconds for an error, interpolated between runs (error, seconds); None outside their range.
+    """Run time in seconds for an error, interpolated between runs (error, seconds); None outside
+    their range.
 
     Examples
     --------
@@ -240,19 +280,22 @@ def compare(
     result: str | None = None,
     say: Say = print,
 ) -> Comparison:
-    """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder for each run.
+    """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder
+    for each run.
 
-    Every run is a separate process. Runs of the same case and sources that are in the folder are kept.
+    Every run is a separate process. Runs of the same case and sources that are in the folder are
+    kept.
 
     Parameters
     ----------
     refinements
-        Mesh refinements of each model. The finest runs are compared. Errors are relative to the limit that the
-        three finest runs extrapolate to.
+        Mesh refinements of each model. The finest runs are compared. Errors are relative to the
+        limit that the three finest runs extrapolate to.
     made
         Makes a case of its source.
     result
-        The number that is compared, as of `magshell study`; by default k_d, or the load at a displacement.
+        The number that is compared, as of `magshell study`; by default k_d, or the load at a
+        displacement.
 
     Raises
     ------
@@ -266,7 +309,9 @@ def compare(
         case = made(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     varied = case.programme[-1].name if case.programme else ""
     if not varied or varied in UNCOMPARED or (varied == "lambda_m" and case.loading is None):
-        raise CaseError("compare: needs a load whose curve can be compared: pressure, indentation or field")
+        raise CaseError(
+            "compare: needs a load whose curve can be compared: pressure, indentation or field"
+        )
     runs: dict[ModelName, list[ModelRun]] = {model: [] for model in MODELS}
 
     def computed(task: tuple[ModelName, float]) -> Iterator[str]:
@@ -275,21 +320,30 @@ def compare(
         runs[model].append(done)
         yield f"{model} at refinement {refinement:g}: {done.dofs} unknowns, {done.cpu_s:.1f} s CPU"
         if not amplitude_of(done):
-            raise NothingLeft(f"the {model} did not leave its undeformed state: {done.summary['stopped']}")
+            raise NothingLeft(
+                f"the {model} did not leave its undeformed state: {done.summary['stopped']}"
+            )
 
     with FOLDER.held(folder, MPI.COMM_SELF, file.name):
-        tasks = [(model, refinement) for model in MODELS for refinement in sorted(set(refinements[model]))]
+        tasks = [
+            (model, refinement)
+            for model in MODELS
+            for refinement in sorted(set(refinements[model]))
+        ]
         compute(tasks, computed, MPI.COMM_SELF, say)
         shell, solid = (runs[model][-1] for model in MODELS)
         if amplitude_of(shell) != amplitude_of(solid):
             ends = [amplitude_of(run) for run in (shell, solid)]
-            raise CaseError(f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did")
+            raise CaseError(
+                f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did"
+            )
         differing = differences(shell, solid)
         at = max(places([run for model in MODELS for run in runs[model]]), default=None)
         content = {"case": file.name, **_content(runs, at, differing, scalar)}
         by_first(MPI.COMM_SELF, lambda: _write(content, differing, folder))
         errors: Errors = {
-            model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]] for model in MODELS
+            model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]]
+            for model in MODELS
         }
         title = f"{file.name} {' '.join(settings)}".strip()
         draw_comparison(shell, solid, differing, errors, title, folder / "compare.png")
@@ -322,12 +376,17 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
         except ValueError:
             refinements[model] = []
         if not refinements[model] or not all(0.1 <= r <= 20 for r in refinements[model]):
-            raise CaseError(f"--{model} {text}: write refinements from 0.1 to 20, for example 0.5,0.7,1")
+            raise CaseError(
+                f"--{model} {text}: write refinements from 0.1 to 20, for example 0.5,0.7,1"
+            )
     return refinements
 
 
 def _content(
-    runs: dict[ModelName, list[ModelRun]], at: float | None, differing: Sequence[Difference], scalar: Scalar | None
+    runs: dict[ModelName, list[ModelRun]],
+    at: float | None,
+    differing: Sequence[Difference],
+    scalar: Scalar | None,
 ) -> dict[str, Any]:
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
@@ -380,39 +439,68 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
     if len(last) < 3:
         return None
     error, order = estimated_error([1 / r for r in refinements[-3:]], last)
-    return last[2] if error is None or order is None else last[2] + copysign(error, last[2] - last[1])
+    return (
+        last[2] if error is None or order is None else last[2] + copysign(error, last[2] - last[1])
+    )
 
 
 def draw_comparison(
-    shell: ModelRun, solid: ModelRun, differing: Sequence[Difference], errors: Errors, title: str, file: Path
+    shell: ModelRun,
+    solid: ModelRun,
+    differing: Sequence[Difference],
+    errors: Errors,
+    title: str,
+    file: Path,
 ) -> None:
     """Write the picture.
 
     Parameters
     ----------
     errors
-        Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left out.
+        Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left
+        out.
     """
     from matplotlib.figure import Figure
 
     panels = 1 + bool(differing) + any(errors.values())
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
     varied = amplitude(amplitude_of(shell))
-    x_label, y_label = f"{quantity('w_over_h').latex} {varied.place} since the field", quantity(varied.column).label
+    x_label, y_label = (
+        f"{quantity('w_over_h').latex} {varied.place} since the field",
+        quantity(varied.column).label,
+    )
     first, *others = figure.subplots(1, panels, squeeze=False)[0]
-    first.plot(*curve(shell), ".-", color="C0", markersize=4, linewidth=1, label=f"shell, {shell.dofs} unknowns")
-    first.plot(*curve(solid), "o", color="C3", markersize=4, fillstyle="none", label=f"solid, {solid.dofs} unknowns")
+    first.plot(
+        *curve(shell),
+        ".-",
+        color="C0",
+        markersize=4,
+        linewidth=1,
+        label=f"shell, {shell.dofs} unknowns",
+    )
+    first.plot(
+        *curve(solid),
+        "o",
+        color="C3",
+        markersize=4,
+        fillstyle="none",
+        label=f"solid, {solid.dofs} unknowns",
+    )
     first.set(xlabel=x_label, ylabel=y_label)
     first.legend(frameon=False, fontsize=8)
     if differing:
-        others[0].plot([d.w_over_h for d in differing], [100 * d.relative for d in differing], ".-", color="C3")
+        others[0].plot(
+            [d.w_over_h for d in differing], [100 * d.relative for d in differing], ".-", color="C3"
+        )
         others[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
         others[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
     if any(errors.values()):
         for (model, points), color in zip(errors.items(), ("C0", "C3"), strict=True):
             if ordered := sorted((s, e) for e, s in points):
                 others[-1].loglog(*zip(*ordered, strict=True), "o-", color=color, label=model)
-        others[-1].set(xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit")
+        others[-1].set(
+            xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit"
+        )
         others[-1].grid(which="both", color="0.92")
         others[-1].legend(frameon=False, fontsize=8)
     figure.suptitle(title, fontsize=9)

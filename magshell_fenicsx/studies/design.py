@@ -1,7 +1,8 @@
-"""A design: an optimiser of SciPy over the cases of its variables; every evaluation is kept, the best is verified.
+"""A design: an optimiser of SciPy over the cases of its variables; every evaluation is kept, the
+best is verified.
 
-Evaluations are known by their variables: a design that is started again takes those in its folder, walks the same way,
-and goes on where it was interrupted.
+Evaluations are known by their variables: a design that is started again takes those in its folder,
+walks the same way, and goes on where it was interrupted.
 """
 
 import hashlib
@@ -42,7 +43,9 @@ from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, heard, keep
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
-    "a design", ("summary.json", "design.csv", "best.yaml", "best.csv", "design.png"), ("objective", "best")
+    "a design",
+    ("summary.json", "design.csv", "best.yaml", "best.csv", "design.png"),
+    ("objective", "best"),
 )
 WAY = 4  # stages before the last have this part of the iterations
 NOTHING = 1e-10  # change of a result, relative, over the whole range of a variable
@@ -90,7 +93,9 @@ class Design:
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
-        evaluation = from_first(self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine))
+        evaluation = from_first(
+            self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine)
+        )
         if evaluation is None:
             begun = time.perf_counter()
             evaluation = self._new(x, vectors)
@@ -109,12 +114,16 @@ class Design:
     def _new(self, x: Array, vectors: Path) -> Evaluation:
         by_first(self.comm, lambda: self.variables.write(x, vectors))
         case, wanted = self.variables.case_of(x, vectors), self.wanted
-        evaluation = evaluate(case, x, self.variables, wanted.results, wanted.targets, self.comm, self._scene)
+        evaluation = evaluate(
+            case, x, self.variables, wanted.results, wanted.targets, self.comm, self._scene
+        )
         return Evaluation(**self.comm.bcast(asdict(evaluation)))
 
     @cached_property
     def _mine(self) -> dict[str, str]:
-        """What the evaluations of this design have in their files: a hash of what is designed, and the sources."""
+        """What the evaluations of this design have in their files: a hash of what is designed, and
+        the sources.
+        """
         asked = self.wanted.section.model_dump_json(exclude={"iterations", "verify"})
         designed = hashlib.sha256((identity(self.variables.case) + asked).encode()).hexdigest()[:16]
         return {"design": designed, "sources": code_version()}
@@ -136,18 +145,29 @@ class Design:
         }
         self.rows.append(row)
         by_first(self.comm, self._write)
-        values = ", ".join(f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items())
+        values = ", ".join(
+            f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items()
+        )
         note = f" ({evaluation.note})" if values and evaluation.note else evaluation.note
-        self.say(f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}{self._left}")
+        self.say(
+            f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}{self._left}"
+        )
 
     @property
     def _left(self) -> str:
         """How long the iterations that may follow take, if each is one evaluation."""
         ahead = self.wanted.section.iterations + 1 - len(self.rows)
-        return rest_said(float(np.mean(self.seconds)) * ahead, "at most about ") if self.seconds and ahead > 0 else ""
+        return (
+            rest_said(float(np.mean(self.seconds)) * ahead, "at most about ")
+            if self.seconds and ahead > 0
+            else ""
+        )
 
     def _write(self) -> None:
-        if not any(evaluation.values for _, evaluation in self.tried) and (self.folder / "design.csv").exists():
+        if (
+            not any(evaluation.values for _, evaluation in self.tried)
+            and (self.folder / "design.csv").exists()
+        ):
             return  # one that cannot start replaces nothing
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         write_csv(self.rows, columns, self.folder / "design.csv")
@@ -174,8 +194,9 @@ def design(
     Parameters
     ----------
     out
-        Folder of design.csv (all evaluations), best.yaml with best.csv (the best case and its remanence), design.png,
-        summary.json, verified/ (the run of the best case on a finer mesh) and points/.
+        Folder of design.csv (all evaluations), best.yaml with best.csv (the best case and its
+        remanence), design.png, summary.json, verified/ (the run of the best case on a finer mesh)
+        and points/.
     made
         Makes a case of its source, the same on all ranks.
     resume
@@ -186,7 +207,8 @@ def design(
     CaseError
         If the case has no design, or a variable or a result is none.
     Missed
-        After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
+        After everything is written: if a target is not reached, a constraint not kept, or no
+        optimum found.
     """
     source = from_first(comm, lambda: read_source(Path(file), settings))
     case, folder = made(source), given_folder(out)
@@ -212,7 +234,9 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
         before, best = best, made(x)
         if not best.values:
             raise Missed(f"with angles in {steps} steps of a turn there is no result: {best.note}")
-        made.say(f"angles rounded to {steps} steps of a turn: {wanted.words(before)} -> {wanted.words(best)}")
+        made.say(
+            f"angles rounded to {steps} steps of a turn: {wanted.words(before)} -> {wanted.words(best)}"
+        )
     by_first(comm, partial(_write_best, made, x, file))
     content: dict[str, Any] = {
         "case": file.name,
@@ -242,7 +266,9 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     return content
 
 
-def _draw_reached(drawn: Callable[[Reached | None], None], folder: Path, target: Target | None) -> None:
+def _draw_reached(
+    drawn: Callable[[Reached | None], None], folder: Path, target: Target | None
+) -> None:
     drawn(reached_shape(folder, target))
 
 
@@ -257,9 +283,13 @@ def _optimised(made: Design) -> tuple[Evaluation, Evaluation, Array, str]:
     wanted.begin(first)
     idle = _without_influence(vary, first)
     for name in idle:
-        made.say(f"warning: {name} has no influence on {', '.join(wanted.results)} where the design starts")
+        made.say(
+            f"warning: {name} has no influence on {', '.join(wanted.results)} where the design starts"
+        )
     if len(idle) == len(vary.blocks):
-        raise Missed(f"no variable has an influence on {', '.join(wanted.results)} where the design starts")
+        raise Missed(
+            f"no variable has an influence on {', '.join(wanted.results)} where the design starts"
+        )
     for stage in range(len(targets)):
         if stage:
             made.begin(stage, targets)
@@ -290,14 +320,20 @@ def _write_best(made: Design, x: Array, file: Path) -> None:
 
 def _from_here(part: Any, old: Path, new: Path) -> None:
     """Let the files that a case names be found from another folder."""
-    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
+    for key, value in (
+        part.items()
+        if isinstance(part, dict)
+        else enumerate(part if isinstance(part, list) else [])
+    ):
         if key == "file" and isinstance(value, str) and value != "best.csv":
             part[key] = os.path.relpath(old / value, new)
         _from_here(value, old, new)
 
 
 def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, Any]:
-    """The results of best.yaml by `run` into verified/, and what its excluded modes say; collective."""
+    """The results of best.yaml by `run` into verified/, and what its excluded modes say;
+    collective.
+    """
     wanted, say, file, settings = made.wanted, made.say, made.folder / "best.yaml", list[str]()
 
     def best_case() -> Case:
@@ -308,7 +344,9 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
         settings = [f"mesh.refinement={case.mesh.refinement * wanted.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"
-    result = run(case.problem(), made.folder / "verified", comm, overwrite=True)  # the folder is the design's
+    result = run(
+        case.problem(), made.folder / "verified", comm, overwrite=True
+    )  # the folder is the design's
     values = {name: _value(result, name) for name in wanted.results if name not in wanted.targets}
     seen = dict[str, float]()
     for target in wanted.targets.values():
@@ -319,14 +357,24 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
             say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
         elif designed is not None:
             away = value / designed - 1
-            say(f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {designed:.9g}")
+            say(
+                f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {designed:.9g}"
+            )
             if abs(away) > FAR:
-                say(f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria")
+                say(
+                    f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria"
+                )
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
     if modes and not any(name in FOLDS for name in wanted.results):
         say(f"warning: the run sees modes that the design did not: {', '.join(modes)}")
     excluded = int(result.rows[-1]["excluded_pivots"]) if result.rows else 0
-    return {"settings": settings, **values, **seen, "excluded_modes": modes, "excluded_pivots": excluded}
+    return {
+        "settings": settings,
+        **values,
+        **seen,
+        "excluded_modes": modes,
+        "excluded_pivots": excluded,
+    }
 
 
 def _value(result: Result, name: str) -> float | None:
@@ -334,7 +382,9 @@ def _value(result: Result, name: str) -> float | None:
     if name == MASS:
         return mass(result.scene).value
     if name in FOLDS:
-        points = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
+        points = (
+            p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"]
+        )
         size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0
         return next((size * float(p["value"]) for p in points), None)
     if name == BARRIER:

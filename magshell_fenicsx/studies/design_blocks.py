@@ -70,9 +70,13 @@ class Number(Bounded):
         section: Any = data
         *names, last = self.name.split(".")
         for name in names:
-            section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
+            section = (
+                section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
+            )
         value = float(self.values(x)[0])
-        section[int(last) if isinstance(section, list) else last] = f"{value:.15g} {self.unit}" if self.unit else value
+        section[int(last) if isinstance(section, list) else last] = (
+            f"{value:.15g} {self.unit}" if self.unit else value
+        )
 
 
 def by_components(scene: Scene, by: FieldGradient) -> Array:
@@ -81,15 +85,17 @@ def by_components(scene: Scene, by: FieldGradient) -> Array:
     magnetic = loads.magnetic or loads.remanence
     assert magnetic
     assert isinstance(magnetic.remanent, ByControls)
-    return np.asarray(by.field.function_space.mesh.comm.allreduce(magnetic.remanent.pulled(by.places, by.forces)))
+    return np.asarray(
+        by.field.function_space.mesh.comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
+    )
 
 
 @dataclass(frozen=True)
 class Vectors:
     """The remanence at points, of which each place has the mean.
 
-    Each vector has a polar angle, an azimuth where it is not kept in a plane, and its length where that varies, from 0
-    to 1 between its bounds.
+    Each vector has a polar angle, an azimuth where it is not kept in a plane, and its length where
+    that varies, from 0 to 1 between its bounds.
 
     Attributes
     ----------
@@ -127,7 +133,9 @@ class Vectors:
 
     @property
     def limits(self) -> list[Limits]:
-        return [(None, None)] * self.angles + [(0.0, 1.0)] * (len(self.start) if self.lengths else 0)
+        return [(None, None)] * self.angles + [(0.0, 1.0)] * (
+            len(self.start) if self.lengths else 0
+        )
 
     def vectors(self, x: Array) -> Array:
         """At the points, (n, 3) or (n, 2)."""
@@ -155,21 +163,30 @@ class Vectors:
         else:
             a, b = np.cos(more[0]), np.sin(more[0])
             unit = np.stack([s * a, s * b, c], axis=1)
-            ways = [one * np.stack([c * a, c * b, -s], axis=1), one * np.stack([-s * b, s * a, 0 * s], axis=1)]
+            ways = [
+                one * np.stack([c * a, c * b, -s], axis=1),
+                one * np.stack([-s * b, s * a, 0 * s], axis=1),
+            ]
         return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
         remanent = data["magnetic"].get("remanent") or {}
         kept = {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
-        data["magnetic"]["remanent"] = {"kind": "points", "file": "", "filter": self.controls.width, **kept}
+        data["magnetic"]["remanent"] = {
+            "kind": "points",
+            "file": "",
+            "filter": self.controls.width,
+            **kept,
+        }
 
 
 @dataclass(frozen=True)
 class Between(Bounded):
     """The values (n, components) of a scalar field at points, of which each place has the mean.
 
-    They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a field is a formula,
-    with the weights of `models.shell.controls`: it needs no file, and its symmetry is recognised by its values.
+    They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a
+    field is a formula, with the weights of `models.shell.controls`: it needs no file, and its
+    symmetry is recognised by its values.
 
     Attributes
     ----------
@@ -202,7 +219,10 @@ class Between(Bounded):
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
             return
         alone = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
-        of_several = {name: (data["shells"][name]["shell"], *self._own(*own)) for name, own in self.shells.items()}
+        of_several = {
+            name: (data["shells"][name]["shell"], *self._own(*own))
+            for name, own in self.shells.items()
+        }
         for shell, controls, ratio in (alone | of_several).values():
             if self.name == "thickness":
                 shell["thickness_factor"] = self._formula(values[0], controls)
@@ -219,7 +239,9 @@ class Between(Bounded):
         return Controls(own, self.controls.width / place.scale), ratio
 
     def _of_own(self, scene: Scene, shape: tuple[int, ...]) -> Array:
-        """What the thickness over h changes by (nodes of cells, 1) with the factor of each one's own shell."""
+        """What the thickness over h changes by (nodes of cells, 1) with the factor of each one's
+        own shell.
+        """
         surface = scene.model.meridian if scene.model.axisymmetric else scene.model.midsurface
         assert surface
         ratios = np.ones(shape)
@@ -238,4 +260,6 @@ class Between(Bounded):
 
     def _square(self, place: Array) -> str:
         names = ("sqrt(x**2 + y**2)", "z") if self.controls.around else ("x", "y", "z")
-        return " + ".join(f"({name} - {float(c)!r})**2" for name, c in zip(names, place, strict=True))
+        return " + ".join(
+            f"({name} - {float(c)!r})**2" for name, c in zip(names, place, strict=True)
+        )

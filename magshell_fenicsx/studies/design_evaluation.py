@@ -50,7 +50,8 @@ class Evaluation:
     values, gradients
         By result; empty if the path was lost.
     beside
-        Result -> values and gradients of the instabilities next to the lowest one, which is the result.
+        Result -> values and gradients of the instabilities next to the lowest one, which is the
+        result.
     seen
         Further numbers: the largest distance to a wanted shape.
     note
@@ -73,7 +74,10 @@ def evaluate(
     comm: MPI.Comm,
     standing: Standing,
 ) -> Evaluation:
-    """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
+    """Follow the path of a case, and differentiate its results; collective.
+
+    `known` is of the case before.
+    """
     lost, named = "", variables.case.design.named
     records, history, remarks = list[Record](), History(), list[str]()
     try:
@@ -102,19 +106,25 @@ def evaluate(
                 of_mass = mass(scene)
                 by = [name for name in variables.names if name in WITH_MASS or "shell." in name]
                 made.values[result] = of_mass.value
-                made.gradients[result] = slope({name: derivative(of_mass, name) for name in by if of_mass.forms})
+                made.gradients[result] = slope(
+                    {name: derivative(of_mass, name) for name in by if of_mass.forms}
+                )
                 continue
             if lost and result not in FOLDS:
                 return Evaluation(note=notes[0])
             if result in LOWEST:
                 adjoints = _lowest(scene, records, result, history.begins)
-                notes.append("lowest: " + ", ".join(f"{mode or 'mode'} at {each.shown:.6g}" for mode, each in adjoints))
+                notes.append(
+                    "lowest: "
+                    + ", ".join(f"{mode or 'mode'} at {each.shown:.6g}" for mode, each in adjoints)
+                )
             else:
                 refuse_moving(scene, records[-1], targets.get(result, result))
                 adjoints = [adjoint_at_end(scene, history, targets.get(result, result))]
                 notes += [f"{result}: {kind}" for kind, _ in adjoints if kind]
             (made.values[result], made.gradients[result]), *others = [
-                (each.shown, slope({name: derivative(each, name) for name in variables.names})) for _, each in adjoints
+                (each.shown, slope({name: derivative(each, name) for name in variables.names}))
+                for _, each in adjoints
             ]
             if result in LOWEST:
                 made.beside[result] = others
@@ -125,11 +135,15 @@ def evaluate(
     return replace(made, note="; ".join(notes))
 
 
-def _lowest(scene: Scene, records: Sequence[Record], result: str, begins: Begins) -> list[tuple[str, Adjoint]]:
+def _lowest(
+    scene: Scene, records: Sequence[Record], result: str, begins: Begins
+) -> list[tuple[str, Adjoint]]:
     """The lowest instabilities or vibrations, and what their derivatives are contracted with."""
     if result in FOLDS:
         return instabilities(scene, records, result, begins=begins)
-    return adjoints_of_vibrations(scene, records[-1], result, beside=BESIDE, most=MOST, begins=begins)
+    return adjoints_of_vibrations(
+        scene, records[-1], result, beside=BESIDE, most=MOST, begins=begins
+    )
 
 
 def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:

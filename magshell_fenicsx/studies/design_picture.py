@@ -1,4 +1,6 @@
-"""design.png: the results over the evaluations, the wanted shape, the remanence, and the fields that vary."""
+"""design.png: the results over the evaluations, the wanted shape, the remanence, and the fields
+that vary.
+"""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +33,8 @@ MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 @dataclass(frozen=True)
 class Reached:
-    """The one that is reached, and if there is one the wanted: places (n, 3) along the middle of the shell.
+    """The one that is reached, and if there is one the wanted: places (n, 3) along the middle of
+    the shell.
 
     `edges`: those of the undeformed shell (m, 3), with nan between them.
     """
@@ -43,15 +46,22 @@ class Reached:
 
 
 def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reached | None:
-    """The shape at a run's last point, along the shell's nodes in the plane y = 0; None without any point."""
-    numbers = sorted(int(file.stem.removeprefix("point_")) for file in (folder / "fields").glob("point_*.vtu"))
+    """The shape at a run's last point, along the shell's nodes in the plane y = 0; None without any
+    point.
+    """
+    numbers = sorted(
+        int(file.stem.removeprefix("point_")) for file in (folder / "fields").glob("point_*.vtu")
+    )
     if not numbers:
         return None
     surface, _ = read_point(folder / "fields", numbers[-1])
     off = np.abs(surface.r0[:, 1])
     at = np.flatnonzero(off <= off.min() + IN_PLANE)
     at = at[np.argsort(surface.r0[at, 0], kind="stable")]
-    wanted, edges = target(surface.r0[at]) if target else None, rims(replace(surface, u=0 * surface.u))
+    wanted, edges = (
+        target(surface.r0[at]) if target else None,
+        rims(replace(surface, u=0 * surface.u)),
+    )
     return Reached(wanted, (surface.r0 + surface.u)[at], surface.r0[at], edges)
 
 
@@ -76,13 +86,22 @@ def draw_design(
     from matplotlib.figure import Figure
 
     units = dict.fromkeys(map(_unit, results))
-    panels = 1 + (shape is not None and shape.wanted is not None) + (vary.controls is not None) + len(vary.fields)
-    figure = Figure(figsize=(4.0 * panels, max(3.6, 2.1 * len(units))), dpi=160, layout="constrained")
+    panels = (
+        1
+        + (shape is not None and shape.wanted is not None)
+        + (vary.controls is not None)
+        + len(vary.fields)
+    )
+    figure = Figure(
+        figsize=(4.0 * panels, max(3.6, 2.1 * len(units))), dpi=160, layout="constrained"
+    )
     grid = figure.add_gridspec(len(units), panels)
     above: Any = None
     for i, unit in enumerate(units):
         above = figure.add_subplot(grid[i, 0], sharex=above)
-        _draw_history(above, rows, [result for result in results if _unit(result) == unit], unit, asked or {})
+        _draw_history(
+            above, rows, [result for result in results if _unit(result) == unit], unit, asked or {}
+        )
         above.tick_params(labelbottom=i == len(units) - 1)
     above.set_xlabel("evaluation (line: the best so far)")
     above.xaxis.get_major_locator().set_params(integer=True)
@@ -97,20 +116,40 @@ def draw_design(
 
 
 def _draw_history(
-    axes: Any, rows: Sequence[dict[str, Any]], results: Sequence[str], unit: str, asked: Mapping[str, float]
+    axes: Any,
+    rows: Sequence[dict[str, Any]],
+    results: Sequence[str],
+    unit: str,
+    asked: Mapping[str, float],
 ) -> None:
-    """Results of one unit over the evaluations: all that were tried as faint dots, the best so far as a line."""
+    """Results of one unit over the evaluations: all that were tried as faint dots, the best so far
+    as a line.
+    """
     number, best = (
-        np.array([row[key] for row in rows], dtype=kind) for key, kind in (("evaluation", int), ("best", bool))
+        np.array([row[key] for row in rows], dtype=kind)
+        for key, kind in (("evaluation", int), ("best", bool))
     )
     axes.xaxis.get_major_locator().set_params(integer=True)
     for i, result in enumerate(results):
-        values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
-        colour, wide = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)  # lines that lie on each other are all seen
+        values = np.array(
+            [np.nan if row[result] is None else row[result] for row in rows], dtype=float
+        )
+        colour, wide = (
+            f"C{i}",
+            1.6 + 1.6 * (len(results) - 1 - i),
+        )  # lines that lie on each other are all seen
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         until = np.append(number[best], number[-1:] if best.any() else [])
         reached = np.append(values[best], values[best][-1:])
-        axes.plot(until, reached, "-", drawstyle="steps-post", color=colour, linewidth=wide, label=result_words(result))
+        axes.plot(
+            until,
+            reached,
+            "-",
+            drawstyle="steps-post",
+            color=colour,
+            linewidth=wide,
+            label=result_words(result),
+        )
         if result in asked:
             axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
@@ -119,7 +158,11 @@ def _draw_history(
         axes.yaxis.set_major_formatter(number_format())
     shown = unit if unit in {"Hz", *endings().values()} else ""
     several = shown or _common([result_words(result) for result in results])
-    axes.set_ylabel(result_words(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else several)
+    axes.set_ylabel(
+        result_words(results[0]) + (f"  ({shown})" if shown else "")
+        if len(results) == 1
+        else several
+    )
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
 
@@ -162,7 +205,9 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: Reached | None)
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
     size = ARROW * float(np.ptp(places, axis=0).max()) / longest
     right, above = size * vectors[:, first], size * vectors[:, second]
-    axes.quiver(across, up, right, above, color="C3", width=0.006, angles="xy", scale_units="xy", scale=1)
+    axes.quiver(
+        across, up, right, above, color="C3", width=0.006, angles="xy", scale_units="xy", scale=1
+    )
     axes.update_datalim(np.column_stack([across + right, up + above]))
     axes.set(xlabel=f"${names[first]}/R$", ylabel=f"${names[second]}/R$")
     axes.set_title(r"remanence over $|B^\mathrm{r}|$, undeformed")
@@ -183,7 +228,11 @@ def _unit(result: str) -> str:
         return {"omega2": "omega2", "hertz": "Hz"}[matched[1]]
     if given := split_unit(result):
         return given[1]
-    own = {"critical_field": quantity("lambda_m").scale, "barrier": quantity("energy").scale, "shape": "shape"}
+    own = {
+        "critical_field": quantity("lambda_m").scale,
+        "barrier": quantity("energy").scale,
+        "shape": "shape",
+    }
     return own.get(result) or quantity(result).scale
 
 
@@ -193,13 +242,24 @@ def _draw_field(axes: Any, field: Between, values: Array) -> None:
     if field.controls.around or not places[:, 1:].any():
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
         for number, (line, marker) in enumerate(zip(values.T, ("o-", "s--"), strict=False), 1):
-            axes.plot(along, line, marker, markersize=3, linewidth=1, label=rf"$\kappa_{{{number}{number}}}$")
+            axes.plot(
+                along,
+                line,
+                marker,
+                markersize=3,
+                linewidth=1,
+                label=rf"$\kappa_{{{number}{number}}}$",
+            )
         axes.set(
-            xlabel="arc length over $R$", ylabel=title, ylim=[v + w for v, w in zip(field.bounds, MARGINS, strict=True)]
+            xlabel="arc length over $R$",
+            ylabel=title,
+            ylim=[v + w for v, w in zip(field.bounds, MARGINS, strict=True)],
         )
         if values.shape[1] > 1:
             axes.legend(frameon=False, fontsize=8)
     else:
-        shown = axes.scatter(*places[:, :2].T, c=values[:, 0], vmin=field.bounds[0], vmax=field.bounds[1], s=14)
+        shown = axes.scatter(
+            *places[:, :2].T, c=values[:, 0], vmin=field.bounds[0], vmax=field.bounds[1], s=14
+        )
         axes.figure.colorbar(shown, ax=axes, label=title)
         axes.set(xlabel="$x/R$", ylabel="$y/R$", aspect="equal")

@@ -34,8 +34,9 @@ Array = NDArray[np.float64]
 class Variables:
     """What varies, as one vector: numbers, then the remanence, then scalar fields.
 
-    Every part has a name, its variables at the start (`first`) and their bounds (`limits`); it takes its gradient from
-    those of `simulate.gradients` (`gradient`) and gives plain data of the case what variables stand for (`put`).
+    Every part has a name, its variables at the start (`first`) and their bounds (`limits`); it
+    takes its gradient from those of `simulate.gradients` (`gradient`) and gives plain data of the
+    case what variables stand for (`put`).
 
     Attributes
     ----------
@@ -81,8 +82,14 @@ class Variables:
 
     @property
     def smooth(self) -> list[str]:
-        """Keys whose formulas are means over the distance of points: there is nothing between samples to look for."""
-        wide = [name for name, of in (self.case.design.fields.items() if self.case.design else ()) if of.filter is None]
+        """Keys whose formulas are means over the distance of points: there is nothing between
+        samples to look for.
+        """
+        wide = [
+            name
+            for name, of in (self.case.design.fields.items() if self.case.design else ())
+            if of.filter is None
+        ]
         keys = {"thickness": THICKNESS, "curvature": "natural.curvature"}
         return [keys[name] for name in wide if name in keys]
 
@@ -93,7 +100,9 @@ class Variables:
 
     def numbers(self, x: Array) -> dict[str, float]:
         """Key, with its unit if it has one -> value."""
-        return {part.label: float(part.values(x[i : i + 1])[0]) for i, part in enumerate(self.scalars)}
+        return {
+            part.label: float(part.values(x[i : i + 1])[0]) for i, part in enumerate(self.scalars)
+        }
 
     def vectors(self, x: Array) -> Array:
         """The remanence at its points, (n, 3) or (n, 2)."""
@@ -101,9 +110,13 @@ class Variables:
         return self.remanence.vectors(x[self.blocks["remanence"]])
 
     def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
-        """A gradient by the vector from those of `simulate.gradients`; by what is not among them it is zero."""
+        """A gradient by the vector from those of `simulate.gradients`; by what is not among them it
+        is zero.
+        """
         blocks = self.blocks
-        return np.concatenate([part.gradient(x[blocks[part.name]], scene, gradients) for part in self.parts])
+        return np.concatenate(
+            [part.gradient(x[blocks[part.name]], scene, gradients) for part in self.parts]
+        )
 
     def rounded(self, x: Array, steps: int) -> Array:
         """The vector with angles of the remanence at the nearest of so many steps of a turn."""
@@ -172,12 +185,18 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
             try:
                 value = in_unit(written, unit)
             except ValueError:
-                said = f"design.numbers: {key}: the case gives {written}: its bounds need such a unit"
+                said = (
+                    f"design.numbers: {key}: the case gives {written}: its bounds need such a unit"
+                )
                 raise CaseError(said) from None
         elif unit:
-            raise CaseError(f"design.numbers: {key}: is a number without a unit in the case: so are its bounds")
+            raise CaseError(
+                f"design.numbers: {key}: is a number without a unit in the case: so are its bounds"
+            )
         if not low <= value <= high:
-            raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
+            raise CaseError(
+                f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}"
+            )
         numbers.append(Number(key, np.array([start]), (low, high), unit))
     return tuple(numbers)
 
@@ -185,12 +204,22 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
 def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
     """The scalar fields with their points and values at the start."""
     fields, problem, several = [], case.problem(), case.several
-    shells = {part.name: (several.place(part), several.ratio(part)) for part in several.parts} if several else {}
+    shells = (
+        {part.name: (several.place(part), several.ratio(part)) for part in several.parts}
+        if several
+        else {}
+    )
     for name, section in design.fields.items():
         places, width = _spread(case, problem, section.points, section.filter)
-        varies = [part.name for part in several.parts if part.case.thickness_factor is not None] if several else []
+        varies = (
+            [part.name for part in several.parts if part.case.thickness_factor is not None]
+            if several
+            else []
+        )
         if name == "thickness" and varies:
-            raise CaseError(f"design.thickness: starts even: leave out shells.{varies[0]}.shell.thickness_factor")
+            raise CaseError(
+                f"design.thickness: starts even: leave out shells.{varies[0]}.shell.thickness_factor"
+            )
         start: Array
         if name == "thickness":  # that of several shells is 1 but for their patches
             start = (problem.thickness or Thickness()).at(places)[:, None]
@@ -205,7 +234,16 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
                 f"{high:g}"
             )
         at = places[:, [0, 2]] if problem.meridian else places
-        fields.append(Between(name, np.asarray(start), (low, high), Controls(at, width), case.shell.reference, shells))
+        fields.append(
+            Between(
+                name,
+                np.asarray(start),
+                (low, high),
+                Controls(at, width),
+                case.shell.reference,
+                shells,
+            )
+        )
     return tuple(fields)
 
 
@@ -213,7 +251,9 @@ def _curvatures(problem: Problem, places: Array) -> Array:
     """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
     drawn = problem.loads.natural.curvature if problem.loads.natural else None
     if isinstance(drawn, Mapping | GivenField):
-        raise CaseError("design.curvature: natural.curvature starts by patches: start from numbers or formulas")
+        raise CaseError(
+            "design.curvature: natural.curvature starts by patches: start from numbers or formulas"
+        )
     if callable(drawn):
         return np.asarray(drawn(places[:, None], places[:, None])[:, 0, :2])
     return np.tile(np.zeros(2) if drawn is None else drawn[:2], (len(places), 1))
@@ -240,13 +280,16 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     return Vectors(controls, start, (low, high))
 
 
-def controls_of(case: Case, count: int | None, width: float | None, where: str) -> tuple[Controls, Array]:
+def controls_of(
+    case: Case, count: int | None, width: float | None, where: str
+) -> tuple[Controls, Array]:
     """The points of the remanence, and its vectors there as the case has them.
 
     Raises
     ------
     CaseError
-        If there is no remanence, or none at points where no number of points is given; it begins with the key `where`.
+        If there is no remanence, or none at points where no number of points is given; it begins
+        with the key `where`.
     """
     magnetic = case.magnetic
     read = case.sensors or (magnetic and magnetic.interaction != "none")
@@ -258,13 +301,17 @@ def controls_of(case: Case, count: int | None, width: float | None, where: str) 
     if count is None:
         if not (magnetic.remanent and magnetic.remanent.file):
             raise CaseError(f"{where}: give points, or magnetic.remanent of kind: points")
-        places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files)
+        places, vectors = read_vectors(
+            magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files
+        )
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
     problem = case.problem()
     places, width = _spread(case, problem, count, width)
     field = magnetisation(magnetic, case.context, 0.0, problem.within)
     if field.patches is not None:
-        raise CaseError(f"{where}.points: the remanence starts by patches of a mesh: start from another kind")
+        raise CaseError(
+            f"{where}.points: the remanence starts by patches of a mesh: start from another kind"
+        )
     if callable(field.remanent):
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
@@ -279,7 +326,9 @@ def _places(case: Case, problem: Problem, count: int) -> Array:
     """Points (n, 3) along a meridian or a strip, or far from each other on the surface."""
     if problem.meridian:
         sample = problem.meridian.sample()
-        return np.asarray(sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0])
+        return np.asarray(
+            sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0]
+        )
     if case.shell.geometry == "strip":
         along = np.linspace(0.0, 1.0, count)
         return np.column_stack([along, 0 * along, 0 * along])

@@ -1,4 +1,6 @@
-"""What a design wants: an objective that is least, constraints that are not negative; and SciPy's optimisers."""
+"""What a design wants: an objective that is least, constraints that are not negative; and SciPy's
+optimisers.
+"""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -62,7 +64,9 @@ def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
     limits = [Limit(section.of, sign, bound) for bound, sign in sides if bound is not None]
     if section.same_as:
         margin = EQUAL * max(scale.get(of, 0.0) for of in (section.of, section.same_as))
-        limits += [Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)]
+        limits += [
+            Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)
+        ]
     return limits
 
 
@@ -88,7 +92,9 @@ def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
 
 
 class Curve:
-    """The spline through points, of length one; the strip's places keep their distance to its middle line along y."""
+    """The spline through points, of length one; the strip's places keep their distance to its
+    middle line along y.
+    """
 
     def __init__(self, points: Array, bent: float = 1.0) -> None:
         chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -103,17 +109,24 @@ class Curve:
 
 
 def _bent(points: Array, part: float) -> Array:
-    """The curve with the same first tangent and lengths, and a part of its curvature, in a frame without twist."""
+    """The curve with the same first tangent and lengths, and a part of its curvature, in a frame
+    without twist.
+    """
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    directions, turned = [tangents[0]], np.eye(3)  # from the frame of the curve to that of the bent one
+    directions, turned = (
+        [tangents[0]],
+        np.eye(3),
+    )  # from the frame of the curve to that of the bent one
     for before, after in itertools.pairwise(tangents):
         turn = np.cross(before, after)
         angle = np.arctan2(np.linalg.norm(turn), before @ after)
         axis = turn * (angle / max(float(np.linalg.norm(turn)), 1e-300))
         back = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
-        turned = turned @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix() @ back
+        turned = (
+            turned @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix() @ back
+        )
         directions.append(turned @ after)
     return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(directions), axis=0)])
 
@@ -151,7 +164,9 @@ class Wanted:
 
     def slope(self, evaluation: Evaluation) -> Array:
         """Its gradient."""
-        return self._objective(evaluation)[1] * np.array(evaluation.gradients[self.section.objective.result])
+        return self._objective(evaluation)[1] * np.array(
+            evaluation.gradients[self.section.objective.result]
+        )
 
     def _objective(self, evaluation: Evaluation) -> tuple[float, float]:
         wanted = self.section.objective
@@ -166,11 +181,15 @@ class Wanted:
     @property
     def _scale(self) -> float:
         """The largest of the objective's results at the start."""
-        return max((self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0)
+        return max(
+            (self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0
+        )
 
     @property
     def lowest(self) -> bool:
-        """Whether the lowest of several values is to be raised: of results, instabilities or frequencies."""
+        """Whether the lowest of several values is to be raised: of results, instabilities or
+        frequencies.
+        """
         wanted = self.section.objective
         return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
 
@@ -181,30 +200,50 @@ class Wanted:
 
     def lowest_values(self, evaluation: Evaluation) -> Array:
         """All of them over the scale, always as many: where fewer are near, what is surely above."""
-        every = [_several(evaluation.values[of], evaluation.beside.get(of)) for of in self.section.objective.results]
-        return np.asarray(np.concatenate([[value for value, _ in several] for several in every]) / self._scale)
+        every = [
+            _several(evaluation.values[of], evaluation.beside.get(of))
+            for of in self.section.objective.results
+        ]
+        return np.asarray(
+            np.concatenate([[value for value, _ in several] for several in every]) / self._scale
+        )
 
     def lowest_slopes(self, evaluation: Evaluation) -> Array:
         """(values, variables)."""
         results = self.section.objective.results
-        every = [_several(evaluation.values[of], evaluation.beside.get(of), evaluation.gradients[of]) for of in results]
-        return np.asarray(np.concatenate([[slope for _, slope in several] for several in every]) / self._scale)
+        every = [
+            _several(evaluation.values[of], evaluation.beside.get(of), evaluation.gradients[of])
+            for of in results
+        ]
+        return np.asarray(
+            np.concatenate([[slope for _, slope in several] for several in every]) / self._scale
+        )
 
     def constraints(self, evaluation: Evaluation) -> Array:
         """Not negative where all are kept."""
-        return np.array([limit.left(evaluation.values) / self._size(limit) for limit in self._limits])
+        return np.array(
+            [limit.left(evaluation.values) / self._size(limit) for limit in self._limits]
+        )
 
     def constraint_slopes(self, evaluation: Evaluation) -> Array:
         """(constraints, variables)."""
-        return np.array([limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits])
+        return np.array(
+            [limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits]
+        )
 
     @property
     def _limits(self) -> list[Limit]:
         """Of all constraints."""
-        return [each for section in self.section.constraints for each in limits_of(section, self.scale)]
+        return [
+            each for section in self.section.constraints for each in limits_of(section, self.scale)
+        ]
 
     def _size(self, limit: Limit) -> float:
-        return abs(limit.bound) or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other)) or 1.0
+        return (
+            abs(limit.bound)
+            or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other))
+            or 1.0
+        )
 
     def violation(self, evaluation: Evaluation) -> float:
         """By how much the constraints are not kept, relative."""
@@ -217,7 +256,9 @@ class Wanted:
 
     def words(self, evaluation: Evaluation) -> str:
         """The results of an evaluation."""
-        return ", ".join(f"{key} = {value:.6g}" for key, value in (evaluation.values | evaluation.seen).items())
+        return ", ".join(
+            f"{key} = {value:.6g}" for key, value in (evaluation.values | evaluation.seen).items()
+        )
 
     def missed(self, evaluation: Evaluation) -> str:
         """What is not as wanted; empty if all is."""
@@ -229,7 +270,9 @@ class Wanted:
                 said.append(f"{asked}: the nearest found is {value:.6g}")
         for limit in self._limits:
             if limit.left(evaluation.values) < -KEPT * self._size(limit):
-                said.append(f"{limit.words} is not kept: the nearest found is {evaluation.values[limit.of]:.6g}")
+                said.append(
+                    f"{limit.words} is not kept: the nearest found is {evaluation.values[limit.of]:.6g}"
+                )
         return "; ".join(said)
 
 
@@ -254,7 +297,11 @@ def wanted_of(case: Case, section: DesignSection) -> Wanted:
 
 
 def searched(
-    evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
+    evaluated: Callable[[Array], Evaluation],
+    goal: Wanted,
+    vary: Variables,
+    first: Array,
+    iterations: int,
 ) -> str:
     """Look for the best variables from the first on; why the optimiser ended."""
     if goal.crossed:
@@ -282,14 +329,24 @@ def searched(
     last, how = _last_known(evaluated), dict[str, Any]()
     if goal.section.constraints:
         how = {"method": "SLSQP", "constraints": {"type": "ineq", "fun": kept, "jac": kept_slopes}}
-    options = {"maxiter": iterations, "ftol": 1e-9} if how else {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
+    options = (
+        {"maxiter": iterations, "ftol": 1e-9}
+        if how
+        else {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
+    )
     how = how or {"method": "L-BFGS-B"}
-    ended = scipy.optimize.minimize(objective, first, jac=True, bounds=vary.limits, options=options, **how)
+    ended = scipy.optimize.minimize(
+        objective, first, jac=True, bounds=vary.limits, options=options, **how
+    )
     return str(ended.message)
 
 
 def _raised(
-    evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
+    evaluated: Callable[[Array], Evaluation],
+    goal: Wanted,
+    vary: Variables,
+    first: Array,
+    iterations: int,
 ) -> str:
     """Raise the lowest of several results: the largest t with all of them above t, for (x, t).
 
@@ -299,13 +356,17 @@ def _raised(
 
     def above(z: Array) -> Array:
         evaluation, converged = last(z[:-1])
-        values: Array = np.concatenate([goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)])
+        values: Array = np.concatenate(
+            [goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)]
+        )
         return values if converged else np.full_like(values, -WORSE)
 
     def slopes(z: Array) -> Array:
         evaluation, _ = last(z[:-1])
         parts = ((goal.lowest_slopes(evaluation), -1.0), (goal.constraint_slopes(evaluation), 0.0))
-        return np.vstack([np.column_stack([part, np.full(len(part), by_t)]) for part, by_t in parts if len(part)])
+        return np.vstack(
+            [np.column_stack([part, np.full(len(part), by_t)]) for part, by_t in parts if len(part)]
+        )
 
     start = np.append(first, goal.lowest_values(evaluated(first)).min())
     down = np.append(0 * first, -1.0)
@@ -321,7 +382,9 @@ def _raised(
     return str(ended.message)
 
 
-def _last_known(evaluated: Callable[[Array], Evaluation]) -> Callable[[Array], tuple[Evaluation, bool]]:
+def _last_known(
+    evaluated: Callable[[Array], Evaluation],
+) -> Callable[[Array], tuple[Evaluation, bool]]:
     """What evaluates a vector; of a lost path the last one that is known, and False."""
     last: list[Evaluation] = []
 

@@ -1,9 +1,9 @@
 """Random samples of a case; the ranks share them, existing ones are kept.
 
-A sample takes the cheapest way that leads to its result. A knockdown is the fold of the nearest known sample on the
-same mesh, continued; else the fold that Newton's method finds from one of the first points of the path; else the fold
-at its end. Each ends in Newton's method for the fold, so that a knockdown is the same to 1e-9 by all ways. Every other
-result needs the path.
+A sample takes the cheapest way that leads to its result. A knockdown is the fold of the nearest
+known sample on the same mesh, continued; else the fold that Newton's method finds from one of the
+first points of the path; else the fold at its end. Each ends in Newton's method for the fold, so
+that a knockdown is the same to 1e-9 by all ways. Every other result needs the path.
 """
 
 import time
@@ -45,7 +45,14 @@ from magshell_fenicsx.studies.runner import (
     part_of,
 )
 from magshell_fenicsx.studies.samples import Sample, make_samples
-from magshell_fenicsx.studies.statistics import WITHOUT, Row, make_row, report, statistics, write_samples
+from magshell_fenicsx.studies.statistics import (
+    WITHOUT,
+    Row,
+    make_row,
+    report,
+    statistics,
+    write_samples,
+)
 
 MOST_SAMPLES = 100_000
 MOST_TRIES = 2  # points of the path from which the fold ahead is tried
@@ -87,12 +94,14 @@ def ensemble(
     made
         Makes a case of its source.
     result
-        As of `magshell study`: knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end.
+        As of `magshell study`: knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or
+        COLUMN@end.
     out
-        Folder of samples.csv, summary.json, ensemble.png, report.md and points/; samples that are there are kept
-        if these sources computed them.
+        Folder of samples.csv, summary.json, ensemble.png, report.md and points/; samples that are
+        there are kept if these sources computed them.
     part
-        "i/n": compute only every n-th sample, from the i-th; the files are then samples_i_of_n.csv and so on.
+        "i/n": compute only every n-th sample, from the i-th; the files are then samples_i_of_n.csv
+        and so on.
     merge
         Folders of parts: take their samples, compute none.
     delete_weakest
@@ -105,7 +114,8 @@ def ensemble(
     Raises
     ------
     CaseError
-        Before the first sample: if one is no valid case, an argument is wrong, or `out` cannot be written.
+        Before the first sample: if one is no valid case, an argument is wrong, or `out` cannot be
+        written.
     DiskError
         If the tables cannot be written.
     """
@@ -114,7 +124,9 @@ def ensemble(
 
     def drawn() -> list[list[Sample]]:
         source = read_source(Path(file), settings)
-        return [make_samples(source, seed, numbers, made, less) for less in sorted({0, delete_weakest})]
+        return [
+            make_samples(source, seed, numbers, made, less) for less in sorted({0, delete_weakest})
+        ]
 
     variants = from_first(comm, drawn)
     every = {sample.key: sample for variant in variants for sample in variant}
@@ -122,11 +134,20 @@ def ensemble(
     parts = [Path(place) for place in merge]
     if resume or merge:
         by_first(comm, lambda: _refuse_strange(parts or [folder], every, merge=bool(merge)))
-    tables = (f"summary{ending}.json", f"samples{ending}.csv", f"ensemble{ending}.png", f"report{ending}.md")
+    tables = (
+        f"summary{ending}.json",
+        f"samples{ending}.csv",
+        f"ensemble{ending}.png",
+        f"report{ending}.md",
+    )
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
         by_first(comm, lambda: _copy(every, parts, folder))
-    missing = [] if merge else by_first(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
+    missing = (
+        []
+        if merge
+        else by_first(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
+    )
     if comm.rank == 0:
         ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
         say(f"{len(every)} samples, {len(missing)} to compute on {ranks}")
@@ -137,7 +158,11 @@ def ensemble(
         outcome = solve(sample, scalar, folds)
         keep_outcome(outcome, sample.case, _file(folder, key))
         value = outcome.value(scalar)
-        said = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
+        said = (
+            f"no {scalar.name}"
+            if value is None
+            else f"{scalar.name} = {value:.9g} ({outcome.found})"
+        )
         why = f", {outcome.stopped}" if outcome.stopped else ""
         place = f"{missing.index(key) + 1:5d}/{len(missing)}"
         yield f"{place}  sample {sample.number}: {said}{why}, {outcome.cpu_s:.1f} s CPU"
@@ -174,13 +199,19 @@ def _file(folder: Path, key: str) -> Path:
 
 
 def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
-    """Whether the folder has a usable outcome; an error may have been of the machine, and is tried again."""
+    """Whether the folder has a usable outcome; an error may have been of the machine, and is tried
+    again.
+    """
     outcome = kept_outcome(_file(folder, key))
-    return bool(outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED))
+    return bool(
+        outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED)
+    )
 
 
 def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge: bool) -> None:
-    """See that each place has a sample of this ensemble; one that was killed before its first sample begins again."""
+    """See that each place has a sample of this ensemble; one that was killed before its first
+    sample begins again.
+    """
     for place in places:
         points = place / "points"
         begun = not merge and points.is_dir() and not any(points.glob("*.json"))
@@ -198,13 +229,20 @@ def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> N
 
 
 def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
-    """The row of a sample; with a second variant, the one without its weakest defects, also the result of that."""
-    rows = [make_row(sample, kept_outcome(_file(folder, sample.key)), scalar) for sample in variants]
+    """The row of a sample; with a second variant, the one without its weakest defects, also the
+    result of that.
+    """
+    rows = [
+        make_row(sample, kept_outcome(_file(folder, sample.key)), scalar) for sample in variants
+    ]
     row = rows[0]
     if len(rows) > 1:
         row[WITHOUT] = rows[1]["result"]
         if row["status"] == "found" and row[WITHOUT] is None:
-            row |= {"status": rows[1]["status"], "why": f"without the weakest defects: {rows[1]['why']}"}
+            row |= {
+                "status": rows[1]["status"],
+                "why": f"without the weakest defects: {rows[1]['why']}",
+            }
     return row
 
 
@@ -264,7 +302,9 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
 
 
 def _of_fold(scene: Scene, fold: Fold) -> Outcome:
-    return outcome_of(Result(scene, fold.state, [fold_row(scene, fold)]), "fold", scene.newton.factorisation.count)
+    return outcome_of(
+        Result(scene, fold.state, [fold_row(scene, fold)]), "fold", scene.newton.factorisation.count
+    )
 
 
 def _outcome(result: Result) -> Outcome:

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.statistics import RESULT, WITHOUT, Row, Weibull, correlations, fit, results
+from magshell_fenicsx.studies.statistics import (
+    RESULT,
+    WITHOUT,
+    Row,
+    Weibull,
+    correlations,
+    fit,
+    results,
+)
 
 Array = NDArray[np.float64]
 KNOCKDOWN = r"knockdown factor  $k_\mathrm{d}$"
@@ -26,7 +34,9 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     from matplotlib.figure import Figure
 
     values, label = results(rows), KNOCKDOWN if name == "knockdown" else name
-    strongest = max(correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None)
+    strongest = max(
+        correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None
+    )
     fitted = fit(values) if len(values) else None
     with_density = fitted is not None or len(values) >= FEW  # marks alone have none
     panels = 1 + with_density + (strongest is not None)
@@ -56,8 +66,18 @@ def _places(values: Array, fitted: Weibull) -> Array:
 def _draw_density(density: Any, values: Array, fitted: Weibull | None) -> None:
     """The histogram, a mark for each sample, and Weibull's distribution."""
     if len(values) >= FEW:
-        density.hist(values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4)
-    density.plot(values, np.zeros(len(values)), "|", color="C0", markersize=14, clip_on=False, label="samples")
+        density.hist(
+            values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4
+        )
+    density.plot(
+        values,
+        np.zeros(len(values)),
+        "|",
+        color="C0",
+        markersize=14,
+        clip_on=False,
+        label="samples",
+    )
     if fitted:
         x = _places(values, fitted)
         density.plot(x, fitted.density(x), color="C3")
@@ -68,10 +88,18 @@ def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull
     """The distribution function of the samples and of Weibull's distribution."""
     ordered = np.sort(values)
     part = np.arange(len(values) + 1) / len(values)
-    function.step(np.append(ordered[:1], ordered), part, where="post", color="C0", label=f"{len(values)} samples")
+    function.step(
+        np.append(ordered[:1], ordered),
+        part,
+        where="post",
+        color="C0",
+        label=f"{len(values)} samples",
+    )
     if len(less := np.sort(without)):
         part = np.arange(1, len(less) + 1) / len(less)
-        function.step(less, part, where="post", color="C2", linewidth=1, label="without the weakest defects")
+        function.step(
+            less, part, where="post", color="C2", linewidth=1, label="without the weakest defects"
+        )
     if fitted:
         x = _places(values, fitted)
         function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
@@ -80,7 +108,13 @@ def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull
 
 def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
     """The result over a column, with Spearman's correlation and how likely one as large is by chance."""
-    pairs = np.array([(row[key], row[RESULT]) for row in rows if row[RESULT] is not None and row.get(key) is not None])
+    pairs = np.array(
+        [
+            (row[key], row[RESULT])
+            for row in rows
+            if row[RESULT] is not None and row.get(key) is not None
+        ]
+    )
     rho, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
     likely = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
@@ -107,7 +141,9 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     def together(values: Array, axis: int = -1) -> Array:
         return np.asarray(np.sum(values * other, axis=axis))
 
-    tried = permutation_test((ranks,), together, permutation_type="pairings", vectorized=True, random_state=1)
+    tried = permutation_test(
+        (ranks,), together, permutation_type="pairings", vectorized=True, random_state=1
+    )
     return float(rho), float(tried.pvalue)
 
 
@@ -123,7 +159,11 @@ def words(key: str) -> str:
     """
     of, _, last = key.rpartition(".")
     name, _, ending = last.rpartition("_")
-    name, unit = (name, "mm") if ending == "mm" else (last, "degrees" if last in ("polar", "azimuth") else "")
+    name, unit = (
+        (name, "mm")
+        if ending == "mm"
+        else (last, "degrees" if last in ("polar", "azimuth") else "")
+    )
     name = "amplitude over $h$" if name == "amplitude" and not unit else name.replace("_", " ")
     whose = " of the most severe defect" if of.startswith("severest") else ""
     return f"{name}{whose}" + (f"  ({unit})" if unit else "")

@@ -1,4 +1,6 @@
-"""Folds of the pressure, followed from case to case: along a parameter, or from the nearest case that is known."""
+"""Folds of the pressure, followed from case to case: along a parameter, or from the nearest case
+that is known.
+"""
 
 import json
 from copy import copy
@@ -27,12 +29,15 @@ LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a j
 def has_knockdown(case: Case) -> bool:
     """Whether its result is a fold of the pressure that can be followed to another case."""
     loading = case.loading
-    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are transferred
+    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are
+    # transferred
     by_one_mesh = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     if getattr(loading, "kind", "") != "pressure":
         return False
     # where the way ends before a fold, none is to be followed there
-    return by_one_mesh and loading.until == "limit" and not loading.branches and loading.bound is None
+    return (
+        by_one_mesh and loading.until == "limit" and not loading.branches and loading.bound is None
+    )
 
 
 def fold_row(scene: Scene, fold: Fold) -> Row:
@@ -43,7 +48,8 @@ def fold_row(scene: Scene, fold: Fold) -> Row:
 
 
 def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
-    """Reject a fold that is not the first instability under growing pressure, as far as this state shows.
+    """Reject a fold that is not the first instability under growing pressure, as far as this state
+    shows.
 
     Parameters
     ----------
@@ -53,7 +59,8 @@ def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
     Raises
     ------
     FoldLost
-        If its null vector is another, it is no maximum, or the shell is unstable there in another direction.
+        If its null vector is another, it is no maximum, or the shell is unstable there in another
+        direction.
     """
     comm, a, b = scene.newton.system.comm, fold.phi, expected
     if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
@@ -74,7 +81,8 @@ def _held(scene: Scene) -> dict[str, float]:
 class Continuation:
     """Follows a fold of the pressure through a parameter p of the case.
 
-    All scenes have the same kind of model. The known folds are stored in the unknowns of the last scene.
+    All scenes have the same kind of model. The known folds are stored in the unknowns of the last
+    scene.
 
     Parameters
     ----------
@@ -115,7 +123,10 @@ class Continuation:
 
     def has_mesh_of(self, scene: Scene) -> bool:
         """Whether a scene has the mesh of the last one."""
-        alike = type(scene.model) is type(self._scene.model) and scene.problem.half == self._scene.problem.half
+        alike = (
+            type(scene.model) is type(self._scene.model)
+            and scene.problem.half == self._scene.problem.half
+        )
         return alike and same_mesh(self._scene, scene)
 
     def _moved(self, fold: Fold, scene: Scene) -> Fold:
@@ -125,7 +136,9 @@ class Continuation:
 
 @dataclass(frozen=True)
 class _Known:
-    """A fold without its scene: the drawn values, the nodes in the chart, displacement, pressure and null vector."""
+    """A fold without its scene: the drawn values, the nodes in the chart, displacement, pressure
+    and null vector.
+    """
 
     values: Values
     nodes: Array
@@ -135,16 +148,21 @@ class _Known:
 
 
 class KnownFolds:
-    """Folds of the pressure of earlier samples on this rank, from which those of others on the same mesh are found."""
+    """Folds of the pressure of earlier samples on this rank, from which those of others on the same
+    mesh are found.
+    """
 
     def __init__(self) -> None:
         self._known: list[_Known] = []
 
-    def polished(self, values: Values, scene: Scene, guess: Guess, expected: Vector | None = None) -> Fold:
+    def polished(
+        self, values: Values, scene: Scene, guess: Guess, expected: Vector | None = None
+    ) -> Fold:
         """The fold near a guess, to 1e-9; it is kept.
 
-        A guess from another sample has the null vector that the fold must resemble. One from the path of this sample
-        has a soft mode, which may be a mixture of the modes of several defects: there the inertia decides.
+        A guess from another sample has the null vector that the fold must resemble. One from the
+        path of this sample has a soft mode, which may be a mixture of the modes of several defects:
+        there the inertia decides.
 
         Raises
         ------
@@ -153,7 +171,10 @@ class KnownFolds:
         """
         fold = find_fold(scene.newton, guess, "pressure")
         refuse_later(scene, fold, fold.phi if expected is None else expected)
-        self._known = [*self._known, _Known(values, chart(scene), fold.state.u, fold.value, fold.phi)][-MOST_FOLDS:]
+        self._known = [
+            *self._known,
+            _Known(values, chart(scene), fold.state.u, fold.value, fold.phi),
+        ][-MOST_FOLDS:]
         return fold
 
     def follow(self, values: Values, scene: Scene) -> Fold:
@@ -173,7 +194,9 @@ class KnownFolds:
             if order is None:
                 continue
             u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (near.u, near.phi))
-            return self.polished(values, scene, Guess(State(u, held | {"pressure": near.pressure}), phi), phi)
+            return self.polished(
+                values, scene, Guess(State(u, held | {"pressure": near.pressure}), phi), phi
+            )
         raise FoldLost("no fold is known on this mesh")
 
     def _distance(self, a: Values, b: Values) -> float:
@@ -185,7 +208,11 @@ class KnownFolds:
                 continue
             if not isinstance(x, float | int) or not isinstance(y, float | int):
                 return np.inf
-            numbers = [v for located in self._known if isinstance(v := located.values.get(key), float | int)]
+            numbers = [
+                v
+                for located in self._known
+                if isinstance(v := located.values.get(key), float | int)
+            ]
             total += ((x - y) / (float(np.std([*numbers, x])) or 1.0)) ** 2
         return total
 
@@ -214,7 +241,10 @@ class Scenes:
         else:
             scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene
-        while sum(each.newton.system.size for each in self._kept.values()) > MOST_UNKNOWNS and len(self._kept) > 1:
+        while (
+            sum(each.newton.system.size for each in self._kept.values()) > MOST_UNKNOWNS
+            and len(self._kept) > 1
+        ):
             self._kept.pop(next(iter(self._kept)))
         return scene
 
@@ -223,7 +253,9 @@ def _apart_from_strength(case: Case) -> str:
     """What determines all of a scene but the size of lambda_m, which is an amplitude."""
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
-        both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None  # then their ratio counts
+        both = (
+            magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
+        )  # then their ratio counts
         magnetic.pop("lambda_m", None)
         if magnetic["remanent"] and not both:
             magnetic["remanent"].pop("flux_density", None)

@@ -1,6 +1,7 @@
 """Parameters of a case from measured data: the fit, its posterior, and what to measure next.
 
-Every evaluation is kept: an identification that is started again takes those in its folder and goes on.
+Every evaluation is kept: an identification that is started again takes those in its folder and goes
+on.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +39,15 @@ from magshell_fenicsx.studies.identify_predicted import Predictor, varied
 from magshell_fenicsx.studies.identify_programmes import Programme, programme
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.laplace import (
+    NORMAL,
+    Fit,
+    Measured,
+    NoNoise,
+    NotSeen,
+    fitted,
+    nonlinearity,
+)
 from magshell_fenicsx.studies.points import identity, short
 from magshell_fenicsx.studies.runner import Folder, Made, Say
 
@@ -73,7 +82,9 @@ class Identified:
 
     @property
     def remanence(self) -> dict[str, Any] | None:
-        """Of the field that was looked for: places over R, values over |B^r|, deviations and bands, and its prior."""
+        """Of the field that was looked for: places over R, values over |B^r|, deviations and bands,
+        and its prior.
+        """
         field: dict[str, Any] | None = self.content["remanence"]
         return field
 
@@ -95,16 +106,16 @@ def identify(
     data
         A CSV file; see `IdentifySection`.
     out
-        Folder of identify.json, identify.csv (data, predictions and bands), identify.png and points/; of a field also
-        remanence.csv, its vectors.
+        Folder of identify.json, identify.csv (data, predictions and bands), identify.png and
+        points/; of a field also remanence.csv, its vectors.
     made
         Makes a case of its source, the same on all ranks.
 
     Raises
     ------
     CaseError
-        If the case looks for nothing, the data are none of its results or outside its path, a parameter has no
-        influence, or data and priors do not determine all of them.
+        If the case looks for nothing, the data are none of its results or outside its path, a
+        parameter has no influence, or data and priors do not determine all of them.
     Stopped
         If the path of the case is lost.
     """
@@ -120,7 +131,10 @@ def identify(
         case = made(wider)
         table = from_first(comm, lambda: table_of(Path(data), case, section, rows, shape))
         names = Names(case)
-        others = [candidate(names, each, f"identify.candidates.{i}") for i, each in enumerate(section.candidates)]
+        others = [
+            candidate(names, each, f"identify.candidates.{i}")
+            for i, each in enumerate(section.candidates)
+        ]
         _refuse_few(table, parameters)
         _refuse_priors(wider, parameters, made)
         programmes = [
@@ -129,8 +143,12 @@ def identify(
         ]
         with FOLDER.held(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
-            mark = identity(made(_without_predictions(wider))) + repr([each.key for each in parameters])
-            predictor = Predictor(wider, made, parameters, dict(table.readings), folder, mark, comm, field, table.rows)
+            mark = identity(made(_without_predictions(wider))) + repr(
+                [each.key for each in parameters]
+            )
+            predictor = Predictor(
+                wider, made, parameters, dict(table.readings), folder, mark, comm, field, table.rows
+            )
             done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
             for each in programmes:
@@ -173,7 +191,8 @@ def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
 
 
 def _refuse_priors(source: Source, parameters: Sequence[Parameter], made: Made) -> None:
-    """See that a case may have the mean of each prior: its keys have bounds, and so have parameters.
+    """See that a case may have the mean of each prior: its keys have bounds, and so have
+    parameters.
 
     Raises
     ------
@@ -210,13 +229,17 @@ def _identified(
     mean = np.array([*(each.mean for each in parameters), *numbers])
     deviation = np.array([*(each.deviation for each in parameters), *np.full(numbers.size, np.inf)])
     noise = np.array([column.noise for column in table.columns])
-    measured = Measured(table.data, table.column, noise, mean, deviation, field.smooth if field else None)
+    measured = Measured(
+        table.data, table.column, noise, mean, deviation, field.smooth if field else None
+    )
     finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
     size = np.where(finite > 0, finite, 1.0)
     size[len(parameters) :] = 1.0
     first = predictor(start)
     if first.note:
-        raise (CaseError if first.invalid else Stopped)(f"the case itself does not predict the data: {first.note}")
+        raise (CaseError if first.invalid else Stopped)(
+            f"the case itself does not predict the data: {first.note}"
+        )
     _refuse_idle(np.array(first.slopes), np.array(first.values), size, parameters)
 
     def model(x: Array, *, slopes: bool = True) -> tuple[Array, Array] | None:
@@ -251,13 +274,17 @@ def _identified(
 
 
 def _said(parameters: Sequence[Parameter], x: Array) -> str:
-    said = [f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=False)]
+    said = [
+        f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=False)
+    ]
     if len(x) > len(parameters):
         said.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
     return ", ".join(said)
 
 
-def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]) -> None:
+def _refuse_idle(
+    slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]
+) -> None:
     """See that every parameter changes something.
 
     Raises
@@ -267,10 +294,15 @@ def _refuse_idle(slopes: Array, values: Array, size: Array, parameters: Sequence
     """
     strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
     of_field = strongest[len(parameters) :]
-    changes = [*zip([p.key for p in parameters], strongest, strict=False), (NAME, of_field.max(initial=np.inf))]
+    changes = [
+        *zip([p.key for p in parameters], strongest, strict=False),
+        (NAME, of_field.max(initial=np.inf)),
+    ]
     changes = changes if of_field.size else changes[:-1]
     if idle := [key for key, change in changes if change < NOTHING]:
-        raise CaseError(f"identify.parameters: {', '.join(idle)}: has no influence on these data where the case starts")
+        raise CaseError(
+            f"identify.parameters: {', '.join(idle)}: has no influence on these data where the case starts"
+        )
 
 
 def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
@@ -337,7 +369,10 @@ def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
 
 
 def _others(
-    predictor: Predictor, section: IdentifySection, fit: Fit, others: Sequence[tuple[Reading, str, float]]
+    predictor: Predictor,
+    section: IdentifySection,
+    fit: Fit,
+    others: Sequence[tuple[Reading, str, float]],
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
     """The candidates with their bands, and which of them narrows a parameter most."""
     if not others:
@@ -368,10 +403,22 @@ def _others(
             rows.append({**row, "note": seen.note})
             continue
         slope = np.array(seen.slopes[0])
-        value, half = seen.values[0], float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0])
+        value, half = (
+            seen.values[0],
+            float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0]),
+        )
         narrowed = _named(keys, fit.narrowed(slope, noise))
         low, high = value - half, value + half
-        rows.append({**row, "value": value, "low": low, "high": high, "noise": noise, "deviations_then": narrowed})
+        rows.append(
+            {
+                **row,
+                "value": value,
+                "low": low,
+                "high": high,
+                "noise": noise,
+                "deviations_then": narrowed,
+            }
+        )
     there = [each for each in rows if "value" in each]
     if not there:
         return rows, None
@@ -393,8 +440,16 @@ def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tupl
     for of, curve in seen.curves.items():
         if of.startswith(OF_POINTS):
             continue
-        places = [r.at for each in table.readings.values() for r in each if r.of == of and r.at is not None]
-        upto = next((i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))), len(curve) - 1)
+        places = [
+            r.at
+            for each in table.readings.values()
+            for r in each
+            if r.of == of and r.at is not None
+        ]
+        upto = next(
+            (i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))),
+            len(curve) - 1,
+        )
         curves[of] = curve[: upto + 1]
     return curves
 

@@ -1,4 +1,6 @@
-"""What `magshell identify` is given: measured columns as readings of a case, and numbers of it with their priors."""
+"""What `magshell identify` is given: measured columns as readings of a case, and numbers of it with
+their priors.
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +28,10 @@ from magshell_fenicsx.studies.runner import Case
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*([\w.]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 MOST_READINGS = 10_000
-SHAPE, MOVED = ("x", "y", "z"), ("ux", "uy", "uz")  # columns of a shape: places, and what they are displaced by
+SHAPE, MOVED = (
+    ("x", "y", "z"),
+    ("ux", "uy", "uz"),
+)  # columns of a shape: places, and what they are displaced by
 OF_POINTS = "measured_"  # names of these places in the case
 
 
@@ -88,7 +93,8 @@ class Table:
     places
         The column of the places; "" without.
     shape
-        Name of a place of the shape -> where it is on the undeformed shell, in the unit of its displacements.
+        Name of a place of the shape -> where it is on the undeformed shell, in the unit of its
+        displacements.
     missing
         Name of a column -> in how many rows it has no number.
     rows
@@ -132,7 +138,8 @@ class Names:
                 (
                     of
                     for of, (base, si) in shown.items()
-                    if (base == name and of.startswith(f"{name}_")) or (strange and of == f"{name}_{si}")
+                    if (base == name and of.startswith(f"{name}_"))
+                    or (strange and of == f"{name}_{si}")
                 ),
                 None,
             )
@@ -142,7 +149,11 @@ class Names:
             result = name
             factor = 1.0
         else:
-            fitting = [of for of in shown if of == name or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", of)]
+            fitting = [
+                of
+                for of in shown
+                if of == name or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", of)
+            ]
             if not fitting:
                 raise CaseError(
                     f"{where}: {name}: has the unit {unit}, but no result of this name has one in this case"
@@ -163,7 +174,10 @@ class Names:
     def _bare(self) -> list[str]:
         scene = self.scene
         own = [self.places.bare] if self.places else []
-        return [*own, *(name for name in differentiable(scene, scene.unloaded()) if name not in own)]
+        return [
+            *own,
+            *(name for name in differentiable(scene, scene.unloaded()) if name not in own),
+        ]
 
     def refuse_strange(self, name: str, where: str) -> None:
         """See that a column of data may have a name, with or without its unit.
@@ -174,9 +188,17 @@ class Names:
             If no result has it.
         """
         units = [q.name for of in self._bare if (q := self.scene.sizes.column(of))]
-        names = [*self._bare, *units, *FOLDS, *(of.rpartition("_")[0] for of in FOLDS if of in SCALES), *MOVED]
+        names = [
+            *self._bare,
+            *units,
+            *FOLDS,
+            *(of.rpartition("_")[0] for of in FOLDS if of in SCALES),
+            *MOVED,
+        ]
         if name not in names and not NAMES.fullmatch(name):
-            raise CaseError(f"{where}: {name}: the case has no such result; allowed are {', '.join(names)}")
+            raise CaseError(
+                f"{where}: {name}: the case has no such result; allowed are {', '.join(names)}"
+            )
 
     def amount(self, amount: Amount, of: str, where: str) -> float:
         """A number for a result, in its unit of the case.
@@ -189,7 +211,9 @@ class Names:
         number, unit = number_and_unit(str(amount))
         _, own, factor = self.of(of, None, where) if not unit else self._of_unit(of, unit, where)
         if own and not unit and float(number):
-            raise CaseError(f"{where}: {_text(amount)}: needs a unit, such as {_text(amount)} {own}")
+            raise CaseError(
+                f"{where}: {_text(amount)}: needs a unit, such as {_text(amount)} {own}"
+            )
         return float(number) * factor
 
     def _of_unit(self, of: str, unit: str, where: str) -> tuple[str, str, float]:
@@ -217,7 +241,9 @@ def refuse_size(deviation: float, given: Amount, where: str) -> None:
     if not deviation > 0:
         raise CaseError(f"{where}: must be positive, here {_text(given)}")
     if not 1 / GREATEST <= deviation <= GREATEST:
-        raise CaseError(f"{where}: {_text(given)}: allowed are numbers from {1 / GREATEST:g} to {GREATEST:g}")
+        raise CaseError(
+            f"{where}: {_text(given)}: allowed are numbers from {1 / GREATEST:g} to {GREATEST:g}"
+        )
 
 
 def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple[Parameter, ...]:
@@ -234,7 +260,9 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
         try:
             number_of(case.context, key)
             start, unit = _written(source, case, key)
-            mean, deviation = (_in_unit_of(unit, amount, key) for amount in (given.prior, given.deviation))
+            mean, deviation = (
+                _in_unit_of(unit, amount, key) for amount in (given.prior, given.deviation)
+            )
         except CaseError as e:
             raise CaseError(f"{where}: {e}") from None
         if given.deviation is not None:
@@ -260,7 +288,9 @@ def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
         return in_unit(str(amount), unit)
     except ValueError:
         what = f"the unit {unit}" if unit else "no unit"
-        raise CaseError(f"{_text(amount)}: the case gives {key} with {what}: so has its prior") from None
+        raise CaseError(
+            f"{_text(amount)}: the case gives {key} with {what}: so has its prior"
+        ) from None
 
 
 def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str, list[float]]]:
@@ -281,14 +311,20 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     if not there:
         return source, [], {}
     if len(there) < len(SHAPE) or not any(name in columns for name in MOVED):
-        raise CaseError(f"{where}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} one or more")
-    rows: list[list[float]] = [list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])]
+        raise CaseError(
+            f"{where}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} one or more"
+        )
+    rows: list[list[float]] = [
+        list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])
+    ]
     for axis in SHAPE:
         _refuse_missing(axis, columns[axis], table.lines, where)
     chosen = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {chosen[tuple(row)]: row for row in rows}
     texts = {
-        name: [f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)]
+        name: [
+            f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)
+        ]
         for name, row in shape.items()
     }
     data = {**source.data, "points": {**(source.data.get("points") or {}), **texts}}
@@ -319,7 +355,9 @@ def refuse_twice(header: str, of: str, before: Mapping[str, str], where: str) ->
     """
     alike = next((name for name in before if name == of or _one_fold(name, of)), None)
     if alike is not None:
-        raise CaseError(f"{where}: {before[alike]} and {header} are one measurement in two columns: leave one out")
+        raise CaseError(
+            f"{where}: {before[alike]} and {header} are one measurement in two columns: leave one out"
+        )
 
 
 def _one_fold(of: str, other: str) -> bool:
@@ -375,9 +413,17 @@ def table_of(
         raise CaseError(f"{where}: has no column with a result of this case")
     _refuse_unknown(section, [each for each, _ in results], where)
     table = _listed(results, keys, at, places, section, where, rows, rows_of_file.lines)
-    sizes = [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE] if shape else []
+    sizes = (
+        [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE]
+        if shape
+        else []
+    )
     return replace(
-        table, shape={name: [a * b for a, b in zip(at, sizes, strict=True)] for name, at in (shape or {}).items()}
+        table,
+        shape={
+            name: [a * b for a, b in zip(at, sizes, strict=True)]
+            for name, at in (shape or {}).items()
+        },
     )
 
 
@@ -385,7 +431,9 @@ def _refuse_unknown(section: IdentifySection, columns: Iterable[Column], where: 
     there = {name for each in columns for name in (each.header, each.of)}
     for key, named in (("noise", section.noise), ("changes", section.changes)):
         if strange := next((name for name in named if name not in there), None):
-            raise CaseError(f"identify.{key}: {strange}: {where} has no such column, only {', '.join(sorted(there))}")
+            raise CaseError(
+                f"identify.{key}: {strange}: {where} has no such column, only {', '.join(sorted(there))}"
+            )
 
 
 def _listed(
@@ -405,13 +453,20 @@ def _listed(
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
     for row in range(len(results[0][1])):
-        settings = tuple(f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items())
+        settings = tuple(
+            f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items()
+        )
         place = float(at[row]) if places else None
         for number, (own, values) in enumerate(results):
             value = float(values[row])
             if np.isnan(value):
                 continue
-            bound = place is not None and own.of not in FOLDS and not NAMES.fullmatch(own.of) and own.of != "barrier"
+            bound = (
+                place is not None
+                and own.of not in FOLDS
+                and not NAMES.fullmatch(own.of)
+                and own.of != "barrier"
+            )
             change = own.of in section.changes or own.header in section.changes
             of = f"{points[row]}{own.of}" if own.of.startswith("_") else own.of
             readings.setdefault(settings, []).append(Reading(of, place if bound else None, change))
@@ -420,15 +475,26 @@ def _listed(
             rows.setdefault(settings, []).append(f"{where}: line {lines[row]}")
     flat = np.array([value for each in data.values() for value in each])
     if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
-        raise CaseError(f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite")
+        raise CaseError(
+            f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite"
+        )
     numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
     empty = {own.header: int(np.isnan(values).sum()) for own, values in results}
     missing = {header: count for header, count in empty.items() if count}
-    return Table(tuple(own for own, _ in results), readings, flat, numbers, places, missing=missing, rows=rows)
+    return Table(
+        tuple(own for own, _ in results),
+        readings,
+        flat,
+        numbers,
+        places,
+        missing=missing,
+        rows=rows,
+    )
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:
-    """See what can be seen of a section without data: that parameters are numbers and that results are there.
+    """See what can be seen of a section without data: that parameters are numbers and that results
+    are there.
 
     Raises
     ------
@@ -458,5 +524,7 @@ def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Readin
     if section.at is None:
         return Reading(of), unit, noise
     if names.places is None:
-        raise CaseError(f"{key}.at: the case has no last step that prescribes a load or a displacement")
+        raise CaseError(
+            f"{key}.at: the case has no last step that prescribes a load or a displacement"
+        )
     return Reading(of, names.amount(section.at, names.places.column, f"{key}.at")), unit, noise

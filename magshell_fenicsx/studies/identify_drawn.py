@@ -1,4 +1,7 @@
-"""Parameters drawn from a posterior, and the band of what is computed with each of them. Knows no shell."""
+"""Parameters drawn from a posterior, and the band of what is computed with each of them.
+
+Knows no shell.
+"""
 
 import numpy as np
 import scipy
@@ -12,22 +15,32 @@ NORMAL = float(scipy.stats.norm.ppf((1 + RIGHT) / 2))
 
 
 def drawn(fit: Fit, count: int) -> Array:
-    """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the bands are."""
+    """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the
+    bands are.
+    """
     size = fit.deviation
     spread, axes = np.linalg.eigh(fit.correlation)
     spread = np.maximum(spread, 0.0)
     rng = np.random.default_rng(0)
-    even = [(rng.permutation(count) + 0.5) / count for _ in size]  # Latin hypercube: each axis has its quantiles
+    even = [
+        (rng.permutation(count) + 0.5) / count for _ in size
+    ]  # Latin hypercube: each axis has its quantiles
     normal = _apart(scipy.stats.norm.ppf(np.transpose(even)), np.argsort(-spread))
-    wider = fit.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)) / NORMAL
+    wider = (
+        fit.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)) / NORMAL
+    )
     return np.asarray(fit.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
 
 
 def _apart(normal: Array, longest: NDArray[np.int64]) -> Array:
-    """Normal numbers (count, p) without correlations among as many of their longest axes as they can say."""
+    """Normal numbers (count, p) without correlations among as many of their longest axes as they
+    can say.
+    """
     axes = longest[: len(normal) // 2]
     deviation = normal[:, axes].std(axis=0)
-    own, turned = np.linalg.eigh(np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes)))
+    own, turned = np.linalg.eigh(
+        np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
+    )
     apart = np.array(normal)
     apart[:, axes] = normal[:, axes] / deviation @ (turned / np.sqrt(own)) @ turned.T * deviation
     return apart

@@ -1,4 +1,6 @@
-"""The remanence as a field that is looked for: its numbers among the parameters, and what is found of it."""
+"""The remanence as a field that is looked for: its numbers among the parameters, and what is found
+of it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -98,7 +100,8 @@ class RemanenceField:
 def field_of(
     source: Source, case: Case, section: RemanenceSection | None, first: int
 ) -> tuple[RemanenceField | None, Source]:
-    """The remanence that is looked for, as parameters from `first` on, and the case whose model has room for it.
+    """The remanence that is looked for, as parameters from `first` on, and the case whose model has
+    room for it.
 
     Raises
     ------
@@ -111,16 +114,28 @@ def field_of(
     in_plane = controls.around or case.shell.geometry == "strip"
     free = (0, 1) if controls.around else (0, 2) if in_plane else (0, 1, 2)
     if len(start) * len(free) > MOST:
-        raise CaseError(f"{WHERE}: {len(start)} points with {len(free)} components each; allowed are {MOST} numbers")
+        raise CaseError(
+            f"{WHERE}: {len(start)} points with {len(free)} components each; allowed are {MOST} numbers"
+        )
     if len(start) < 2:
-        raise CaseError(f"{WHERE}: a single point is no field: look for numbers of magnetic.remanent instead")
+        raise CaseError(
+            f"{WHERE}: a single point is no field: look for numbers of magnetic.remanent instead"
+        )
     distances = scipy.spatial.distance.cdist(controls.places, controls.places)
     apart = distances[np.triu_indices(len(distances), 1)].min()
     if apart <= 1e-9:
         raise CaseError(f"{WHERE}: two of its points are at the same place")
-    smooth = Smooth(first, distances, len(free), section.deviation or np.nan, section.length or np.nan)
+    smooth = Smooth(
+        first, distances, len(free), section.deviation or np.nan, section.length or np.nan
+    )
     if not in_plane:
-        source = Source(source.name, {**source.data, "symmetry": "none"}, source.places, source.folder, source.files)
+        source = Source(
+            source.name,
+            {**source.data, "symmetry": "none"},
+            source.places,
+            source.folder,
+            source.files,
+        )
     return RemanenceField(controls, start, free, smooth), source
 
 
@@ -134,7 +149,9 @@ def without_room(other: Mapping[str, Any], data: Mapping[str, Any]) -> str:
 
 def flux_density(case: Case) -> tuple[float, str]:
     """|B^r| in mT; without units (1, "")."""
-    given = case.magnetic.remanent.flux_density if case.magnetic and case.magnetic.remanent else None
+    given = (
+        case.magnetic.remanent.flux_density if case.magnetic and case.magnetic.remanent else None
+    )
     return (1e3 * abs(given), "mT") if given else (1.0, "")
 
 

@@ -1,4 +1,6 @@
-"""The picture of an identification: data and prediction with their bands, and what is known of the parameters."""
+"""The picture of an identification: data and prediction with their bands, and what is known of the
+parameters.
+"""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +24,8 @@ AXES = {"bx": "x", "by": "y", "bz": "z", "b_rho": r"\rho", "b_z": "z"}
 def draw_identified(
     content: Mapping[str, Any], curves: Mapping[str, Sequence[tuple[float, float]]], file: Path
 ) -> None:
-    """Draw each column of the data over its places, a shape from the side, a field with its bands, and the parameters
-    before and after.
+    """Draw each column of the data over its places, a shape from the side, a field with its bands,
+    and the parameters before and after.
 
     Parameters
     ----------
@@ -52,7 +54,9 @@ def draw_identified(
         panels += [partial(_field, field=field, number=i) for i in range(len(field["components"]))]
     if content["parameters"]:
         panels.append(partial(_parameters, parameters=content["parameters"]))
-    figure, plots = plt.subplots(1, len(panels), figsize=(4.2 * len(panels), 3.6), layout="constrained", squeeze=False)
+    figure, plots = plt.subplots(
+        1, len(panels), figsize=(4.2 * len(panels), 3.6), layout="constrained", squeeze=False
+    )
     for plot, panel in zip(plots[0], panels, strict=True):
         panel(plot)
     figure.suptitle(content["case"])
@@ -76,7 +80,9 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
             u = [[moved[axis][name][kind] for name in points] for axis in both]
             label = "" if labelled else "fitted" if kind == "predicted" else kind
             line = style if _in_line(at) else "."
-            plot.plot(*(np.array(at) + np.array(u)), line, color=colour, label=label, zorder=4, lw=1.2)
+            plot.plot(
+                *(np.array(at) + np.array(u)), line, color=colour, label=label, zorder=4, lw=1.2
+            )
         labelled = True
     plot.plot(*at, "--" if _in_line(at) else ".", color="0.6", lw=0.8, label="undeformed", zorder=1)
     unit = split_unit(rows[0]["result"])
@@ -95,10 +101,13 @@ def _in_line(at: Sequence[Sequence[float]]) -> bool:
 
 
 def _field(plot: Any, field: Row, number: int) -> None:
-    """A component of the field over the arc length with its band; on a surface its colours, rings for deviations."""
+    """A component of the field over the arc length with its band; on a surface its colours, rings
+    for deviations.
+    """
     over, places = field["over"], np.array(field["places"])
     value, deviation, low, high, mean = (
-        over["value"] * np.array(field[name])[:, number] for name in ("value", "deviation", "low", "high", "mean")
+        over["value"] * np.array(field[name])[:, number]
+        for name in ("value", "deviation", "low", "high", "mean")
     )
     symbol = rf"$B^\mathrm{{r}}_{{{AXES[field['components'][number]]}}}$"
     label = f"{symbol}  ({over['unit']})" if over["unit"] else rf"{symbol} over $|B^\mathrm{{r}}|$"
@@ -109,17 +118,25 @@ def _field(plot: Any, field: Row, number: int) -> None:
         plot.fill_between(along, low, high, color="C0", alpha=0.3, lw=0, label="95 %")
         plot.plot(along, value, "o-", color="C0", ms=3, lw=1.2, label="fitted")
         room = 0.3 * float(np.ptp([low, high]))
-        plot.set(xlabel="arc length over $R$", ylabel=label, ylim=(low.min() - room, high.max() + room))
+        plot.set(
+            xlabel="arc length over $R$", ylabel=label, ylim=(low.min() - room, high.max() + room)
+        )
         plot.legend(frameon=False, fontsize=8)
         return
     first, second = sorted(int(i) for i in np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])
-    shown = plot.scatter(places[:, first], places[:, second], c=value, s=10 + 240 * deviation / deviation.max())
+    shown = plot.scatter(
+        places[:, first], places[:, second], c=value, s=10 + 240 * deviation / deviation.max()
+    )
     plot.figure.colorbar(shown, ax=plot, label=label)
     title = f"standard deviation: area, to {deviation.max():.3g} {over['unit']}".rstrip()
-    plot.set(xlabel=f"${'xyz'[first]}/R$", ylabel=f"${'xyz'[second]}/R$", aspect="equal", title=title)
+    plot.set(
+        xlabel=f"${'xyz'[first]}/R$", ylabel=f"${'xyz'[second]}/R$", aspect="equal", title=title
+    )
 
 
-def _data(plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row) -> None:
+def _data(
+    plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row
+) -> None:
     placed = all(row["at"] != "end" for row in rows)
     rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if placed else rows
     x = np.array([row["at"] for row in rows]) if placed else np.arange(1.0, len(rows) + 1)
@@ -130,9 +147,17 @@ def _data(plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, 
 
     if alone:
         plot.fill_between(
-            x, get("low_measured"), get("high_measured"), color="C0", alpha=0.12, lw=0, label="95 %, data"
+            x,
+            get("low_measured"),
+            get("high_measured"),
+            color="C0",
+            alpha=0.12,
+            lw=0,
+            label="95 %, data",
         )
-        plot.fill_between(x, get("low"), get("high"), color="C0", alpha=0.35, lw=0, label="95 %, curve")
+        plot.fill_between(
+            x, get("low"), get("high"), color="C0", alpha=0.35, lw=0, label="95 %, curve"
+        )
         line = [(a, b) for a, b in curve if min(x) <= a <= max(x)]
         line = sorted([*line, *zip(x, get("predicted"), strict=True)])
         plot.plot(*zip(*line, strict=True), color="C0", lw=1.2, label="fitted")
@@ -140,7 +165,9 @@ def _data(plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, 
         half = [get("predicted") - get("low_measured"), get("high_measured") - get("predicted")]
         plot.errorbar(x, get("predicted"), half, fmt="_", color="C0", label="fitted, 95 %")
     plot.plot(x, get("measured"), ".", color="C1", label="measured", zorder=5)
-    plot.set(xlabel=result_label(content["places"]) if placed else "number", ylabel=result_label(of))
+    plot.set(
+        xlabel=result_label(content["places"]) if placed else "number", ylabel=result_label(of)
+    )
     plot.legend(frameon=False, fontsize=8)
 
 
@@ -151,20 +178,29 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
         size = abs(each["value"]) or 1.0
         prior = each["prior"]
         if prior:
-            middle, half = prior["mean"] / size - np.sign(each["value"]), 1.96 * prior["deviation"] / size
+            middle, half = (
+                prior["mean"] / size - np.sign(each["value"]),
+                1.96 * prior["deviation"] / size,
+            )
             plot.barh(i, 200 * half, left=100 * (middle - half), height=0.5, color="0.85")
             widest = max(widest, abs(middle) + half)
         low, high = ((each[name] - each["value"]) / size for name in ("low", "high"))
         plot.barh(i, 100 * (high - low), left=100 * low, height=0.25, color="C0")
         widest = max(widest, high)
-    names = [f"{key_words(key, p['unit'])}\n{p['value']:.4g} {p['unit']}".rstrip() for key, p in parameters.items()]
+    names = [
+        f"{key_words(key, p['unit'])}\n{p['value']:.4g} {p['unit']}".rstrip()
+        for key, p in parameters.items()
+    ]
     plot.set_yticks(range(len(names)), names, fontsize=8)
-    plot.set(xlabel="95 % bands: data (blue), prior (grey), in %", xlim=(-120 * widest, 120 * widest))
+    plot.set(
+        xlabel="95 % bands: data (blue), prior (grey), in %", xlim=(-120 * widest, 120 * widest)
+    )
     plot.axvline(0.0, color="0.4", lw=0.6)
 
 
 def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> None:
-    """Draw what is predicted of another history with its bands, and what was measured of it; a panel for each column.
+    """Draw what is predicted of another history with its bands, and what was measured of it; a
+    panel for each column.
 
     Parameters
     ----------
@@ -186,7 +222,9 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
         labels = {"95 %, data", "95 %, curve", "predicted", "measured"}  # each once
         own = [row for row in rows if row["result"] == column]
         for _, of_step in groupby(own, key=lambda row: int(row["step"])):
-            _programme_of_step(plot, sorted(of_step, key=lambda row: float(row[place])), place, labels)
+            _programme_of_step(
+                plot, sorted(of_step, key=lambda row: float(row[place])), place, labels
+            )
         plot.set(xlabel=result_label(place), ylabel=result_label(column))
         plot.legend(frameon=False, fontsize=8)
     figure.suptitle(name.replace("_", " "))
@@ -203,7 +241,13 @@ def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[s
     def get(of: str) -> Array:
         return np.array([np.nan if row[of] == "" else row[of] for row in rows], dtype=float)
 
-    x, bands = get(place), (("low_measured", "high_measured", 0.12, "95 %, data"), ("low", "high", 0.35, "95 %, curve"))
+    x, bands = (
+        get(place),
+        (
+            ("low_measured", "high_measured", 0.12, "95 %, data"),
+            ("low", "high", 0.35, "95 %, curve"),
+        ),
+    )
     for low, high, alpha, text in bands:
         plot.fill_between(x, get(low), get(high), color="C0", alpha=alpha, lw=0, label=label(text))
     plot.plot(x, get("predicted"), color="C0", lw=1.2, label=label("predicted"))

@@ -79,17 +79,25 @@ class Predictor:
     def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
         """What is predicted, known or new."""
         x = np.array(self.comm.bcast(x))
-        listed = json.dumps([[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()])
+        listed = json.dumps(
+            [[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()]
+        )
         text = f"{self.mark} {listed} {slopes}".encode()
-        file = self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
-        seen = from_first(self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version()))
+        file = (
+            self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
+        )
+        seen = from_first(
+            self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version())
+        )
         if seen is None:
             vectors = file.with_suffix(".csv")
             if self.field:
                 by_first(self.comm, lambda: self.write(x, vectors))
             seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
             self.count += 1
-            from_first(self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)}))
+            from_first(
+                self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)})
+            )
         return seen
 
     def write(self, x: Array, vectors: Path) -> None:
@@ -111,7 +119,9 @@ class Predictor:
                 note = ": ".join(filter(None, about))
                 return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
             seen.values += [float(v) for v in readings.values]
-            sizes = [float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters]  # type: ignore[arg-type]
+            sizes = [
+                float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters
+            ]  # type: ignore[arg-type]
             sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
             seen.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
             seen.curves = seen.curves or readings.curves

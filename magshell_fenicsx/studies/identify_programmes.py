@@ -1,7 +1,9 @@
-"""Another history of the sample, predicted with what an identification has found: runs of the posterior, as bands.
+"""Another history of the sample, predicted with what an identification has found: runs of the
+posterior, as bands.
 
-The case is run at the fit, and for parameters drawn from the posterior. Between the quantiles of these runs lie 95 % of
-them; so a snap that comes earlier in some of them makes a wide band there, where slopes would say nothing.
+The case is run at the fit, and for parameters drawn from the posterior. Between the quantiles of
+these runs lie 95 % of them; so a snap that comes earlier in some of them makes a wide band there,
+where slopes would say nothing.
 """
 
 import copy
@@ -49,7 +51,9 @@ ALWAYS = ("step", "branch", "mode", "amplitude")
 
 @dataclass(frozen=True)
 class Column:
-    """A result along a step: its name in the data, its column of path.csv, and the data in the unit of that."""
+    """A result along a step: its name in the data, its column of path.csv, and the data in the unit
+    of that.
+    """
 
     header: str
     of: str
@@ -70,7 +74,9 @@ class Found:
         """Write table and picture."""
         if self.rows:
             write_csv(self.rows, list(self.rows[0]), folder / f"identify_{self.name}.csv")
-            draw_programme(self.rows, self.name, self.content["places"], folder / f"identify_{self.name}.png")
+            draw_programme(
+                self.rows, self.name, self.content["places"], folder / f"identify_{self.name}.png"
+            )
 
 
 @dataclass
@@ -82,8 +88,8 @@ class Programme:
     source
         The case, with its own settings.
     places, steps
-        Column of path.csv, what it is at each place of the data, and the steps of these; without data these are all
-        points of the last step.
+        Column of path.csv, what it is at each place of the data, and the steps of these; without
+        data these are all points of the last step.
     keys
         Of the runs, that of the fit first; "" where drawn parameters make no case.
     """
@@ -101,7 +107,9 @@ class Programme:
     keys: list[str] = field(default_factory=list)
 
     def compute(self, predictor: Predictor, fit: Fit, say: Say) -> None:
-        """Run the case at the fit and for drawn parameters; collective, and every rank computes runs of its own."""
+        """Run the case at the fit and for drawn parameters; collective, and every rank computes
+        runs of its own.
+        """
         cases = dict[str, Case]()
         for number, x in enumerate([fit.x, *drawn(fit, self.samples)]):
             vectors = predictor.folder / "points" / f"{self.name}_{number}.csv"
@@ -138,8 +146,12 @@ class Programme:
         begun = time.perf_counter()
         try:
             result = run(case.problem(), comm=MPI.COMM_SELF)
-            outcome = outcome_of(result, "path", result.scene.newton.factorisation.count, columns=COLUMNS)
-        except Exception as e:  # whatever it is, the other runs go on, and the table has no band if many fail
+            outcome = outcome_of(
+                result, "path", result.scene.newton.factorisation.count, columns=COLUMNS
+            )
+        except (
+            Exception
+        ) as e:  # whatever it is, the other runs go on, and the table has no band if many fail
             outcome = Outcome.failed(" ".join(f"{FAILED}{type(e).__name__}: {e}".split()))
         curve = [{name: row[name] for name in self._needed if name in row} for row in outcome.curve]
         return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - begun, 3))
@@ -170,7 +182,9 @@ class Programme:
         first, drawn_ones = outcomes[0], outcomes[1:]
         assert first
         if not first.curve:
-            raise CaseError(f"identify.predict.{self.name}: nothing is predicted at the fit: {first.stopped}")
+            raise CaseError(
+                f"identify.predict.{self.name}: nothing is predicted at the fit: {first.stopped}"
+            )
         runs = [each for each in drawn_ones if each and each.curve]
         curves = [_Path(each.curve, self.place) for each in (first, *runs)]
         places, steps = self.places, self.steps
@@ -180,11 +194,17 @@ class Programme:
         rows = [
             row
             for column in self.columns
-            for row in self._rows(column, places, steps, curves, self._noise(column, noise), len(drawn_ones))
+            for row in self._rows(
+                column, places, steps, curves, self._noise(column, noise), len(drawn_ones)
+            )
         ]
-        numbers = {each.name: self._number(each, first, runs, len(drawn_ones)) for each in self.scalars}
+        numbers = {
+            each.name: self._number(each, first, runs, len(drawn_ones)) for each in self.scalars
+        }
         measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
-        inside = int(sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured))
+        inside = int(
+            sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured)
+        )
         stopped = [each.stopped for each in runs if each.stopped]
         lost = len(drawn_ones) - len(runs)
         content = {
@@ -202,20 +222,37 @@ class Programme:
     def _said(self, content: Mapping[str, Any]) -> list[str]:
         said = []
         if content["measured"]:
-            said.append(f"{self.name}: {content['inside']} of {content['measured']} data within their predicted bands")
+            said.append(
+                f"{self.name}: {content['inside']} of {content['measured']} data within their predicted bands"
+            )
         for name, each in content["numbers"].items():
             value = "nothing" if each["value"] is None else f"{each['value']:.6g}"
-            band = f", 95 % between {each['low']:.6g} and {each['high']:.6g}" if each["low"] is not None else ""
+            band = (
+                f", 95 % between {each['low']:.6g} and {each['high']:.6g}"
+                if each["low"] is not None
+                else ""
+            )
             said.append(f"{self.name}: {name} = {value} predicted{band}, from {each['runs']} runs")
         if content["stopped"]:
-            said.append(f"warning: {self.name}: at the fit the run stopped early: {content['stopped']}")
+            said.append(
+                f"warning: {self.name}: at the fit the run stopped early: {content['stopped']}"
+            )
         if count := content["without_path"] + content["stopped_early"]:
-            said.append(f"warning: {self.name}: {count} of {content['samples']} runs are lost or stopped early")
+            said.append(
+                f"warning: {self.name}: {count} of {content['samples']} runs are lost or stopped early"
+            )
         return said
 
     def _noise(self, column: Column, noise: Mapping[str, Mapping[str, Any]]) -> float:
         """The standard deviation of such a measurement, where the identification knows it."""
-        return next((float(noise[name]["deviation"]) for name in (column.header, column.of) if name in noise), 0.0)
+        return next(
+            (
+                float(noise[name]["deviation"])
+                for name in (column.header, column.of)
+                if name in noise
+            ),
+            0.0,
+        )
 
     def _rows(
         self,
@@ -238,17 +275,31 @@ class Programme:
                 "predicted": float(value),
                 "low": low,
                 "high": high,
-                "low_measured": value - np.hypot(value - min(low, value), NORMAL * noise) if band else np.nan,
-                "high_measured": value + np.hypot(max(high, value) - value, NORMAL * noise) if band else np.nan,
+                "low_measured": value - np.hypot(value - min(low, value), NORMAL * noise)
+                if band
+                else np.nan,
+                "high_measured": value + np.hypot(max(high, value) - value, NORMAL * noise)
+                if band
+                else np.nan,
             }
-            yield {name: "" if isinstance(v, float) and not np.isfinite(v) else v for name, v in row.items()}
+            yield {
+                name: "" if isinstance(v, float) and not np.isfinite(v) else v
+                for name, v in row.items()
+            }
 
     @staticmethod
-    def _number(scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int) -> dict[str, Any]:
+    def _number(
+        scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int
+    ) -> dict[str, Any]:
         values = np.array([np.nan if (v := each.value(scalar)) is None else v for each in runs])
         band = band_of(values, samples)
         low, high = band or (None, None)
-        return {"value": first.value(scalar), "low": low, "high": high, "runs": int(np.isfinite(values).sum())}
+        return {
+            "value": first.value(scalar),
+            "low": low,
+            "high": high,
+            "runs": int(np.isfinite(values).sum()),
+        }
 
 
 class _Path:
@@ -262,7 +313,9 @@ class _Path:
         """Places and values of a column in a step, from the point where it begins."""
         own = [i for i, row in enumerate(self._rows) if row["step"] == step]
         rows = self._rows[max(own[0] - 1, 0) : own[-1] + 1] if own else []
-        return [float(row[self._place]) for row in rows], [float(row[column or self._place]) for row in rows]
+        return [float(row[self._place]) for row in rows], [
+            float(row[column or self._place]) for row in rows
+        ]
 
     def at(self, column: Column, places: Array, steps: NDArray[np.int64]) -> Array:
         """A column at places, where the path first passes each in its step; nan where it does not."""
@@ -275,10 +328,14 @@ class _Path:
             slack = 1e-9 * np.ptp(x)
             for i in np.flatnonzero(steps == step):
                 low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
-                passed = np.flatnonzero((low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1]))
+                passed = np.flatnonzero(
+                    (low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1])
+                )
                 if passed.size:
                     k = passed[0]
-                    values[i] = y[k] + (y[k + 1] - y[k]) * np.clip((places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1)
+                    values[i] = y[k] + (y[k + 1] - y[k]) * np.clip(
+                        (places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1
+                    )
         return values
 
 
@@ -295,7 +352,8 @@ def programme(
     *,
     with_field: bool = False,
 ) -> Programme:
-    """What a section asks for; collective. Where a field is looked for, the case has room for its points.
+    """What a section asks for; collective. Where a field is looked for, the case has room for its
+    points.
 
     Raises
     ------
@@ -311,7 +369,9 @@ def programme(
             override(base, setting)
         for each in ("identify", "ensemble", "design"):
             base.data.pop(each, None)
-        if lacking := next((p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None):
+        if lacking := next(
+            (p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None
+        ):
             raise CaseError(f"{section.case or 'the case'} has no {lacking}, which is looked for")
         if with_field and (strange := without_room(base.data, source.data)):
             raise CaseError(f"{section.case or 'the case'}: {strange}")
@@ -325,7 +385,9 @@ def programme(
     places: Array | None = None
     steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     if section.data:
-        place, places, steps, columns = _measured(source.folder / section.data, names, last, f"{where}.data")
+        place, places, steps, columns = _measured(
+            source.folder / section.data, names, last, f"{where}.data"
+        )
     measured = {each.of for each in columns}
     for of in section.of:
         if "@" not in of and of in names.all:
@@ -333,15 +395,25 @@ def programme(
             columns += [] if shown in measured else [Column(of, shown, np.zeros(0), change=False)]
     scalars = [_scalar(of, where) for of in section.of if "@" in of or of not in names.all]
     if columns and not place:
-        raise CaseError(f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown")
+        raise CaseError(
+            f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown"
+        )
     predicted = {text for each in columns for text in (each.header, each.of)}
     if unknown := next((of for of in section.changes if of not in predicted), None):
-        raise CaseError(f"{where}.changes: {unknown}: is no column that is predicted; these are {', '.join(predicted)}")
-    columns = [replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns]
-    return Programme(name, base, section.samples, made, last, place, places, steps, columns, scalars)
+        raise CaseError(
+            f"{where}.changes: {unknown}: is no column that is predicted; these are {', '.join(predicted)}"
+        )
+    columns = [
+        replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns
+    ]
+    return Programme(
+        name, base, section.samples, made, last, place, places, steps, columns, scalars
+    )
 
 
-def refuse_unfit_programmes(source: Source, case: Case, section: IdentifySection, made: Made) -> None:
+def refuse_unfit_programmes(
+    source: Source, case: Case, section: IdentifySection, made: Made
+) -> None:
     """See that what is to be predicted is there; collective.
 
     Raises
@@ -395,10 +467,14 @@ class _Names:
                 return of, column_size(name, unit, in_units[of])
             except TableError as e:
                 raise CaseError(f"{where}: {e}") from None
-        raise CaseError(f"{where}: {name}: has the unit {unit}, but no column of this name has one in this case")
+        raise CaseError(
+            f"{where}: {name}: has the unit {unit}, but no column of this name has one in this case"
+        )
 
 
-def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Array, NDArray[np.int64], list[Column]]:
+def _measured(
+    file: Path, names: _Names, last: int, where: str
+) -> tuple[str, Array, NDArray[np.int64], list[Column]]:
     """The place, what it is in each row, the rows' steps, and the columns."""
     try:
         rows = read_rows(file, Files())
@@ -407,8 +483,13 @@ def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Ar
     columns, units, where = rows.columns, rows.units, f"{where}: {file.name}"
     given = {header: values for header, values in columns.items() if header != "step"}
     if len(given) < 2:
-        raise CaseError(f"{where}: needs two columns or more: the place first, then what was measured there")
-    measured = [(header, *names.of(header, units[header], where), values) for header, values in given.items()]
+        raise CaseError(
+            f"{where}: needs two columns or more: the place first, then what was measured there"
+        )
+    measured = [
+        (header, *names.of(header, units[header], where), values)
+        for header, values in given.items()
+    ]
     taken = dict[str, str]()
     for header, of, _, _ in measured:
         refuse_twice(header, of, taken, where)
@@ -416,5 +497,12 @@ def _measured(file: Path, names: _Names, last: int, where: str) -> tuple[str, Ar
     (_, place, factor, at), *others = measured
     steps = np.asarray(columns.get("step", np.full(at.size, last)))
     for row in np.flatnonzero(np.isnan(at) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
-        raise CaseError(f"{where}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}")
-    return place, at * factor, steps.astype(np.int64), [Column(h, of, v * f, change=False) for h, of, f, v in others]
+        raise CaseError(
+            f"{where}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}"
+        )
+    return (
+        place,
+        at * factor,
+        steps.astype(np.int64),
+        [Column(h, of, v * f, change=False) for h, of, f, v in others],
+    )

@@ -1,4 +1,6 @@
-"""The section `identify` of a case: which numbers are looked for, what is known of them, what else may be measured."""
+"""The section `identify` of a case: which numbers are looked for, what is known of them, what else
+may be measured.
+"""
 
 import re
 from typing import Annotated, Self
@@ -12,7 +14,9 @@ Amount = float | TextWithUnit
 
 
 class ParameterSection(Section):
-    """What is known of a number before anything is measured: nothing, or its prior, a normal distribution."""
+    """What is known of a number before anything is measured: nothing, or its prior, a normal
+    distribution.
+    """
 
     prior: Amount | None = None
     """Its mean, in the unit of the key"""
@@ -27,11 +31,13 @@ class ParameterSection(Section):
 
 
 class RemanenceSection(Section):
-    """The remanence as a field of numbers: components of vectors at points, of which each place has a mean.
+    """The remanence as a field of numbers: components of vectors at points, of which each place has
+    a mean.
 
-    Points and components are those of a design: along a meridian, or along a strip in the plane of x and z, elsewhere
-    spread over the surface, all of which is modelled. The prior has the case's own remanence as its mean and is smooth;
-    what is not given of it is chosen by the data, so that these are most likely.
+    Points and components are those of a design: along a meridian, or along a strip in the plane of
+    x and z, elsewhere spread over the surface, all of which is modelled. The prior has the case's
+    own remanence as its mean and is smooth; what is not given of it is chosen by the data, so that
+    these are most likely.
     """
 
     points: Annotated[int, Field(ge=2, le=1000)] | None = None
@@ -45,7 +51,9 @@ class RemanenceSection(Section):
 
 
 class CandidateSection(Section):
-    """A further result: it is predicted with its 95 % band, and as a measurement compared with the others."""
+    """A further result: it is predicted with its 95 % band, and as a measurement compared with the
+    others.
+    """
 
     of: str
     """A result: a column of path.csv, knockdown, critical_field_mT, omega2_1, hertz_1, barrier, ..."""
@@ -56,10 +64,12 @@ class CandidateSection(Section):
 
 
 class ProgrammeSection(Section):
-    """A case that is predicted with the parameters found: this one with other settings, or another case file.
+    """A case that is predicted with the parameters found: this one with other settings, or another
+    case file.
 
-    It is run at the fit and for parameters drawn from the posterior; between the quantiles of these runs lie 95 % of
-    them. Motions, snaps and several steps are predicted too, as a run follows them.
+    It is run at the fit and for parameters drawn from the posterior; between the quantiles of these
+    runs lie 95 % of them. Motions, snaps and several steps are predicted too, as a run follows
+    them.
     """
 
     case: str | None = None
@@ -87,10 +97,11 @@ class ProgrammeSection(Section):
 class IdentifySection(Section):
     """What `magshell identify` looks for; every other command takes the case without it.
 
-    Each column of the data is a result of the case with its unit: `middle_uz [mm]` or `middle_uz_mm`. One column is
-    what the last step prescribes, its load or displacement (`applied [mT]`, `w [mm]`); without it all is read where the
-    path ends. Columns with the name of a key (`magnetic.applied.flux_density [mT]`) change the case from row to row.
-    A shape has the columns `x`, `y`, `z`, places on the undeformed shell, and `ux`, `uy`, `uz`, their displacements.
+    Each column of the data is a result of the case with its unit: `middle_uz [mm]` or
+    `middle_uz_mm`. One column is what the last step prescribes, its load or displacement (`applied
+    [mT]`, `w [mm]`); without it all is read where the path ends. Columns with the name of a key
+    (`magnetic.applied.flux_density [mT]`) change the case from row to row. A shape has the columns
+    `x`, `y`, `z`, places on the undeformed shell, and `ux`, `uy`, `uz`, their displacements.
     """
 
     parameters: dict[str, ParameterSection] = Field(default_factory=dict)
@@ -121,12 +132,16 @@ class IdentifySection(Section):
     @model_validator(mode="after")
     def _names_are_words(self) -> Self:
         if strange := next((name for name in self.predict if not re.fullmatch(r"\w+", name)), None):
-            raise ValueError(f"predict: {strange}: a name has letters, digits and _ alone, as files have it")
+            raise ValueError(
+                f"predict: {strange}: a name has letters, digits and _ alone, as files have it"
+            )
         return self
 
     @model_validator(mode="after")
     def _narrowed_one_is_looked_for(self) -> Self:
         allowed = [*self.parameters, *(["remanence"] if self.remanence else [])]
         if self.narrow is not None and self.narrow not in allowed:
-            raise ValueError(f"narrow: {self.narrow}: is none of the parameters: {', '.join(allowed)}")
+            raise ValueError(
+                f"narrow: {self.narrow}: is none of the parameters: {', '.join(allowed)}"
+            )
         return self

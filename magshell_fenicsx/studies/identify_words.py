@@ -20,17 +20,23 @@ def sentences(content: dict[str, Any], fit: Fit, table: Table) -> list[str]:
     said, keys = list[str](), list(content["parameters"])
     for key, each in content["parameters"].items():
         unit = f" {each['unit']}" if each["unit"] else ""
-        said.append(f"{key} = {each['value']:.6g}{unit}, 95 % between {each['low']:.6g} and {each['high']:.6g}{unit}")
+        said.append(
+            f"{key} = {each['value']:.6g}{unit}, 95 % between {each['low']:.6g} and {each['high']:.6g}{unit}"
+        )
         if each["prior"] and each["deviation"] > PRIOR * each["prior"]["deviation"]:
             said.append(f"{key}: the data add little to its prior")
     if content["remanence"]:
         said += words(content["remanence"])
     for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
         if abs(c := float(fit.correlation[i, j])) > ALIKE:
-            said.append(f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation {c:+.4f}")
+            said.append(
+                f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation {c:+.4f}"
+            )
     for header, each in content["noise"].items():
         how = "estimated" if each["estimated"] else "given"
-        said.append(f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}")
+        said.append(
+            f"noise of {header}: {each['deviation']:.4g} {each['unit']}".rstrip() + f", {how}"
+        )
     for header, count in table.missing.items():
         said.append(f"{header}: rows without a number, left out: {count}")
     if not np.isnan(measured.noise).any():

@@ -1,14 +1,15 @@
-"""Parameters from measured numbers: Gauss-Newton on exact slopes, the posterior by Laplace, what to measure next.
+"""Parameters from measured numbers: Gauss-Newton on exact slopes, the posterior by Laplace, what to
+measure next.
 
 With data d, their noise s and priors m +- t, the fit is least in
 
     F(x) = sum ((d - y(x))/s)^2 + sum ((x - m)/t)^2,
 
-and the posterior near it is normal with the covariance C = (J^T J/s^2 + 1/t^2)^-1, J = dy/dx (A. Tarantola, Inverse
-Problem Theory, SIAM 2005, section 3.2). Where s is estimated, from the residuals of a column over its degrees of
-freedom f, quantiles are those of Student's t. A variance V that is the sum of parts V_c, one of the noise of each
-column and one of priors, has the degrees of freedom V^2/sum (V_c^2/f_c) (F. E. Satterthwaite, Biometrics Bulletin 2,
-110, 1946). Knows no shell.
+and the posterior near it is normal with the covariance C = (J^T J/s^2 + 1/t^2)^-1, J = dy/dx (A.
+Tarantola, Inverse Problem Theory, SIAM 2005, section 3.2). Where s is estimated, from the residuals
+of a column over its degrees of freedom f, quantiles are those of Student's t. A variance V that is
+the sum of parts V_c, one of the noise of each column and one of priors, has the degrees of freedom
+V^2/sum (V_c^2/f_c) (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946). Knows no shell.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
-Model = Callable[[Array], tuple[Array, Array] | None]  # x (p,) -> y (n,) and J (n, p); None where there is none
+Model = Callable[
+    [Array], tuple[Array, Array] | None
+]  # x (p,) -> y (n,) and J (n, p); None where there is none
 
 CONVERGED = 1e-3  # a step below this part of a standard deviation is the last one
 HALVINGS = 10
@@ -32,9 +35,15 @@ LEAST = 1.0  # degree of freedom
 SAID = 0.5  # of a degree: with less, data do not say their noise
 EXACT = 1e-12  # no estimated noise is less than this part of the data
 ASIDE = 0.05  # differences of logarithms of strengths
-SAMPLES, WIDER, SUREST = 64, 1.3, 0.5  # of their posterior, wider than a normal one, whose logarithms are sure to 1.4
+SAMPLES, WIDER, SUREST = (
+    64,
+    1.3,
+    0.5,
+)  # of their posterior, wider than a normal one, whose logarithms are sure to 1.4
 MOST_AXES = 8  # of the posterior, the longest ones, along which it is looked at
-NORMAL = 0.25  # difference of the misfit from its parabola up to which the posterior counts as normal
+NORMAL = (
+    0.25  # difference of the misfit from its parabola up to which the posterior counts as normal
+)
 
 
 class NotSeen(ValueError):
@@ -80,7 +89,9 @@ class Measured:
 
     @property
     def prior(self) -> Array:
-        """(p, p) W, whose product with mean - x is normal with deviations of one; zero rows without a prior."""
+        """(p, p) W, whose product with mean - x is normal with deviations of one; zero rows without
+        a prior.
+        """
         W = np.diag(1 / self.deviation)
         if self.field:
             W[self.field.block, self.field.block] = self.field.rows
@@ -104,7 +115,8 @@ class Fit:
     group
         (n,) number of the column of each.
     noise, freedom
-        Of each column: standard deviation, and degrees of freedom that it is estimated from (infinite if it is given).
+        Of each column: standard deviation, and degrees of freedom that it is estimated from
+        (infinite if it is given).
     covariance
         (p, p) of the posterior.
     steps
@@ -137,7 +149,9 @@ class Fit:
         """(p, p) covariance for noise and strengths of a field as they are at the fit."""
         if not self.known.field:
             return self.covariance
-        return _covariance(self.known.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation)
+        return _covariance(
+            self.known.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation
+        )
 
     @property
     def correlation(self) -> Array:
@@ -145,7 +159,8 @@ class Fit:
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
 
     def quantiles(self, slopes: Array, column: NDArray[np.int64] | None = None) -> Array:
-        """(k,) half the widths of 95 % bands over standard deviations, of numbers with these slopes (k, p).
+        """(k,) half the widths of 95 % bands over standard deviations, of numbers with these slopes
+        (k, p).
 
         Parameters
         ----------
@@ -175,14 +190,23 @@ class Fit:
         return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", slopes, self.covariance, slopes)))
 
     def narrowed(self, slope: Array, noise: float) -> Array:
-        """(p,) standard deviations after one more measurement of a number with this slope (p,) and noise."""
+        """(p,) standard deviations after one more measurement of a number with this slope (p,) and
+        noise.
+        """
         g = self.covariance @ slope
         gain = noise**2 + slope @ g
-        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance) - (g**2 / gain if gain > 0 else 0.0), 0.0)))
+        return np.asarray(
+            np.sqrt(np.maximum(np.diag(self.covariance) - (g**2 / gain if gain > 0 else 0.0), 0.0))
+        )
 
 
 def fitted(
-    model: Model, measured: Measured, start: Array, size: Array, most: int, told: Callable[[int, Array, float], None]
+    model: Model,
+    measured: Measured,
+    start: Array,
+    size: Array,
+    most: int,
+    told: Callable[[int, Array, float], None],
 ) -> Fit:
     """The fit by Gauss-Newton; steps are halved until the misfit falls.
 
@@ -237,7 +261,19 @@ def fitted(
     covariance = _covariance(measured.rows(y, J, x, noise)[1], size)
     if measured.field:
         covariance = _Strength(given, measured, x, y, J, noise, size).covariance()
-    return Fit(x, y, J, measured.group, noise, np.maximum(freedom, LEAST), covariance, misfit, step, ended, measured)
+    return Fit(
+        x,
+        y,
+        J,
+        measured.group,
+        noise,
+        np.maximum(freedom, LEAST),
+        covariance,
+        misfit,
+        step,
+        ended,
+        measured,
+    )
 
 
 def _covariance(A: Array, size: Array) -> Array:
@@ -267,7 +303,9 @@ def _guessed(measured: Measured, y: Array) -> Array:
 def _weighed(
     given: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
-    """What is known, with the prior of the field as the data choose it; the noise, and its degrees of freedom."""
+    """What is known, with the prior of the field as the data choose it; the noise, and its degrees
+    of freedom.
+    """
     if measured.field:
         measured, noise = _Strength(given, measured, x, y, J, noise, size).best()
         return measured, noise, _estimated(measured, y, J, noise, size)[1]
@@ -276,9 +314,11 @@ def _weighed(
 
 @dataclass(frozen=True)
 class _Strength:
-    """Deviation and length of a field's prior and the noise of columns, where they are not given; z: their logarithms.
+    """Deviation and length of a field's prior and the noise of columns, where they are not given;
+    z: their logarithms.
 
-    `given` is what is known at first, `known` and `noise` where the search begins; see the module `smooth`.
+    `given` is what is known at first, `known` and `noise` where the search begins; see the module
+    `smooth`.
     """
 
     given: Measured
@@ -313,7 +353,10 @@ class _Strength:
         """What is known then, and the noise."""
         first, _ = self.own
         values, noise = np.array([first.deviation, first.length]), np.array(self.noise)
-        values[self.free], noise[self.unknown] = np.exp(z[: len(self.free)]), np.exp(z[len(self.free) :])
+        values[self.free], noise[self.unknown] = (
+            np.exp(z[: len(self.free)]),
+            np.exp(z[len(self.free) :]),
+        )
         return replace(self.known, field=first.with_(float(values[0]), float(values[1]))), noise
 
     def surprise(self, z: Array) -> float:
@@ -323,7 +366,9 @@ class _Strength:
         Q, R = np.linalg.qr(A * self.size)
         least = rest @ rest - np.sum((Q.T @ rest) ** 2)
         of_noise = 2 * np.log(noise[measured.group]).sum()
-        return float(of_noise - measured.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least)
+        return float(
+            of_noise - measured.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least
+        )
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
         measured, noise = self.weighed(z)
@@ -339,8 +384,15 @@ class _Strength:
             bounds += [(least, 1e3 * float(self.noise[i])) for i in self.unknown]
             limits = np.log(bounds)
             steps = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
-            options = {"initial_simplex": steps, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 400 * len(z)}
-            z = scipy.optimize.minimize(self.surprise, z, method="Nelder-Mead", bounds=limits, options=options).x
+            options = {
+                "initial_simplex": steps,
+                "xatol": 1e-4,
+                "fatol": 1e-6,
+                "maxiter": 400 * len(z),
+            }
+            z = scipy.optimize.minimize(
+                self.surprise, z, method="Nelder-Mead", bounds=limits, options=options
+            ).x
         return self.weighed(z)
 
     def covariance(self) -> Array:
@@ -352,15 +404,21 @@ class _Strength:
             return _covariance(self._rows(z)[1], self.size)
 
         def mixed(a: Array, b: Array) -> float:
-            around = [sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)]
+            around = [
+                sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
+            ]
             return sum(around) / (8 * ASIDE**2)
 
         step = ASIDE * np.eye(count)
         sure, axes = np.linalg.eigh([[mixed(a, b) for b in step] for a in step])
         wide = axes * WIDER / np.sqrt(np.maximum(sure, SUREST))
-        drawn = scipy.stats.norm.ppf(scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:])
+        drawn = scipy.stats.norm.ppf(
+            scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:]
+        )
         samples = z + drawn @ wide.T
-        logarithms = np.array([-self.surprise(each) / 2 for each in samples]) + (drawn**2).sum(axis=1) / 2
+        logarithms = (
+            np.array([-self.surprise(each) / 2 for each in samples]) + (drawn**2).sum(axis=1) / 2
+        )
         weights = np.exp(logarithms - logarithms.max())
         total = np.zeros((len(self.x), len(self.x)))
         for weight, each in zip(weights / weights.sum(), samples, strict=True):
@@ -370,12 +428,18 @@ class _Strength:
         return total
 
 
-def _estimated(measured: Measured, y: Array, J: Array, noise: Array, size: Array) -> tuple[Array, Array]:
+def _estimated(
+    measured: Measured, y: Array, J: Array, noise: Array, size: Array
+) -> tuple[Array, Array]:
     """The noise of the columns, and the degrees of freedom of those that are estimated.
 
     A number takes as many degrees as its share in the parameters, the diagonal of J C J^T/s^2.
     """
-    estimated, freedom, s = np.array(measured.noise), np.full(len(noise), np.inf), noise[measured.group]
+    estimated, freedom, s = (
+        np.array(measured.noise),
+        np.full(len(noise), np.inf),
+        noise[measured.group],
+    )
     C = _covariance(np.vstack([J / s[:, None], measured.prior]), size)
     share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
     for column in np.flatnonzero(np.isnan(measured.noise)):
@@ -389,7 +453,8 @@ def _estimated(measured: Measured, y: Array, J: Array, noise: Array, size: Array
 
 
 def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:
-    """The largest relative difference of the misfit from its parabola, at the ends of bands along the longest axes.
+    """The largest relative difference of the misfit from its parabola, at the ends of bands along
+    the longest axes.
 
     Returns
     -------

@@ -50,32 +50,47 @@ class Timings:
         return median(values) if values else None
 
 
-Origin = Mapping[str, str | None]  # the sources and the mesh file: keys of summary.json and their values
+Origin = Mapping[
+    str, str | None
+]  # the sources and the mesh file: keys of summary.json and their values
 
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
     """The usable measurements of an earlier study on this machine; empty without any."""
     content = _read(file)
-    usable = content and content.machine == machine and not content.failure and _is_of(origin, content.summary)
+    usable = (
+        content
+        and content.machine == machine
+        and not content.failure
+        and _is_of(origin, content.summary)
+    )
     return content if content and usable else Timings(machine)
 
 
 def of_others(file: Path, origin: Origin) -> bool:
     """Whether the file has measurements of other sources, which cannot be used."""
     content = _read(file)
-    return content is not None and content.summary is not None and not _is_of(origin, content.summary)
+    return (
+        content is not None and content.summary is not None and not _is_of(origin, content.summary)
+    )
 
 
 def _read(file: Path) -> Timings | None:
     timings = kept(file, TypeAdapter(Timings))
-    return timings if timings and all(sample.keys() >= set(TIMES) for sample in timings.samples) else None
+    return (
+        timings
+        if timings and all(sample.keys() >= set(TIMES) for sample in timings.samples)
+        else None
+    )
 
 
 def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:
     return summary is not None and all(summary.get(key) == value for key, value in origin.items())
 
 
-def complete(measured: Timings, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin) -> None:
+def complete(
+    measured: Timings, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin
+) -> None:
     """Run until there are `repeat` samples; every run is on disk before the next.
 
     Parameters

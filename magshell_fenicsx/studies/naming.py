@@ -69,11 +69,15 @@ def load_said(row: Mapping[str, Any], name: str) -> str:
     ('p/pc = 0.5', 'p = 61.25 Pa')
     """
     of = shown(amplitude(name).column, row)
-    return f"{of.plain} = {row.get(of.name, row['load']):.9g}" + (f" {of.si}" if of.name in row else "")
+    return f"{of.plain} = {row.get(of.name, row['load']):.9g}" + (
+        f" {of.si}" if of.name in row else ""
+    )
 
 
 def split_unit(result: str) -> tuple[str, str] | None:
-    """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
+    """The name of a result in a unit without its ending, and the unit; the longest ending first:
+    N_m before m.
+    """
     units = endings()
     for ending in sorted(units, key=len, reverse=True):
         if result.endswith(f"_{ending}"):
@@ -117,5 +121,7 @@ def result_label(result: str) -> str:
         for column in (each, *each.in_units):
             if column.name == result:
                 return column.label
-    unit = "Hz" if result.startswith("hertz_") else given[1] if (given := split_unit(result)) else ""
+    unit = (
+        "Hz" if result.startswith("hertz_") else given[1] if (given := split_unit(result)) else ""
+    )
     return result_words(result) + (f"  ({unit})" if unit else "")

@@ -79,7 +79,9 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     keys = [key for axis in axes for key in axis.keys]
     for key in keys:
         if keys.count(key) > 1:
-            raise CaseError(f"--over: {key} is swept twice; keys that vary together are tied with +")
+            raise CaseError(
+                f"--over: {key} is swept twice; keys that vary together are tied with +"
+            )
     return axes
 
 
@@ -103,7 +105,9 @@ def parse_axis(text: str) -> Axis:
 
 
 def _range(text: str, values: str) -> tuple[str, ...]:
-    """start:stop:count, equidistant with both ends; the values are in the unit of the first end that has one."""
+    """start:stop:count, equidistant with both ends; the values are in the unit of the first end
+    that has one.
+    """
     try:
         first, last, number = values.split(":")
         unit = number_and_unit(first)[1] or number_and_unit(last)[1]
@@ -125,7 +129,9 @@ def _list(text: str, values: str) -> tuple[str, ...]:
     if not all(items):
         raise CaseError(f"--over {text}: a value is missing; {FORMS}")
     if re.search(r"[\[\]{}]", values):
-        raise CaseError(f"--over {text}: only numbers and words can be swept, not sections or lists")
+        raise CaseError(
+            f"--over {text}: only numbers and words can be swept, not sections or lists"
+        )
     return items
 
 
@@ -162,7 +168,10 @@ def make_points(source: Source, axes: Sequence[Axis], made: Made) -> list[SweepP
     count = prod(len(axis.values) for axis in axes)
     if count > MOST_POINTS:
         raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
-    return [make_point(source, axes, values, made) for values in product(*(axis.values for axis in axes))]
+    return [
+        make_point(source, axes, values, made)
+        for values in product(*(axis.values for axis in axes))
+    ]
 
 
 def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> Source:
@@ -181,7 +190,9 @@ def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> S
     return source
 
 
-def make_point(source: Source, axes: Sequence[Axis], values: Sequence[str], made: Made) -> SweepPoint:
+def make_point(
+    source: Source, axes: Sequence[Axis], values: Sequence[str], made: Made
+) -> SweepPoint:
     """The point with one value for each axis."""
     varied = copy.deepcopy(source)
     chosen = {key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys}
@@ -203,7 +214,12 @@ def identity(case: Case) -> str:
     """Hash of the problem: the resolved case, without a zero field, and its mesh file."""
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
-    if not (case.lambda_m or case.sensors or case.field_maps or (magnetic and magnetic.interaction != "none")):
+    if not (
+        case.lambda_m
+        or case.sensors
+        or case.field_maps
+        or (magnetic and magnetic.interaction != "none")
+    ):
         del data["magnetic"]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -1,9 +1,11 @@
-"""The lowest of instabilities or frequencies raised as far as it goes, by all that is known of each.
+"""The lowest of instabilities or frequencies raised as far as it goes, by all that is known of
+each.
 
-Their minimum has corners where two cross, and which are the lowest changes from place to place: an optimiser of smooth
-functions leaps there, or stops. Here every value that was seen is a plane, by its slope where it was seen. The highest
-place under the planes is tried next, in a box about the best place so far: a bundle method with a trust region
-(Schramm and Zowe, SIAM J. Optim. 2, 121-152, 1992). SciPy's linear programming finds it.
+Their minimum has corners where two cross, and which are the lowest changes from place to place: an
+optimiser of smooth functions leaps there, or stops. Here every value that was seen is a plane, by
+its slope where it was seen. The highest place under the planes is tried next, in a box about the
+best place so far: a bundle method with a trust region (Schramm and Zowe, SIAM J. Optim. 2, 121-152,
+1992). SciPy's linear programming finds it.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,17 +20,27 @@ from magshell_fenicsx.studies.design_evaluation import Evaluation
 
 Array = NDArray[np.float64]
 
-FIRST, LARGEST = 0.25, 1.0  # half the side of the box, over the half ranges of variables, or in radians
-BENT = 0.3  # an old plane is at least so many squares of the distance above the best place, over its value at the start
+FIRST, LARGEST = (
+    0.25,
+    1.0,
+)  # half the side of the box, over the half ranges of variables, or in radians
+# an old plane is at least so many squares of the distance above the best place, over its value at
+# the start
+BENT = 0.3
 REMEMBERED = 60  # places whose planes count
-BROKEN = 10.0, 1e6  # times what a constraint is broken by counts, beside the values; as often as it must, up to this
+BROKEN = (
+    10.0,
+    1e6,
+)  # times what a constraint is broken by counts, beside the values; as often as it must, up to this
 KEPT = 1e-9  # a constraint that is broken by less is kept
 TAKEN, GOOD = 0.05, 0.7  # of the gain that was foreseen: a place is taken, the box grows
 ENOUGH = 1e-5  # a gain, over the value at the start
 
 
 class Raised(Protocol):
-    """What is raised, of an evaluation, and what must not become negative; over their sizes at the start."""
+    """What is raised, of an evaluation, and what must not become negative; over their sizes at the
+    start.
+    """
 
     def lowest_values(self, evaluation: Evaluation) -> Array: ...
     def lowest_slopes(self, evaluation: Evaluation) -> Array: ...
@@ -38,7 +50,9 @@ class Raised(Protocol):
 
 @dataclass(frozen=True)
 class _Place:
-    """Values (n,) and constraints (m,) at a place, and their slopes by the variables over their spans."""
+    """Values (n,) and constraints (m,) at a place, and their slopes by the variables over their
+    spans.
+    """
 
     y: Array
     values: Array
@@ -80,7 +94,9 @@ def raise_lowest(
         if not evaluation.values:
             return None
         kept = goal.constraints(evaluation)
-        kept_slopes = span * goal.constraint_slopes(evaluation) if len(kept) else np.zeros((0, len(x)))
+        kept_slopes = (
+            span * goal.constraint_slopes(evaluation) if len(kept) else np.zeros((0, len(x)))
+        )
         values, slopes = goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation)
         return _Place(x / span, values, slopes, kept, kept_slopes)
 
@@ -97,7 +113,9 @@ def raise_lowest(
             broken, (step, gain, left) = 10 * broken, further
         if gain < ENOUGH:
             near = f"within {size:.2g} of the variables' ranges"
-            return f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained {near}"
+            return (
+                f"no more than {ENOUGH:g} of the value at the start is foreseen to be gained {near}"
+            )
         tried = place(np.clip(span * (best.y + step), low, high))
         part = (tried.height(broken) - best.height(broken)) / gain if tried else -np.inf
         if part > TAKEN:
@@ -114,20 +132,26 @@ def raise_lowest(
 def _foreseen(
     best: _Place, others: Sequence[_Place], box: tuple[Array, Array], broken: float
 ) -> tuple[Array, float, float]:
-    """The step to the highest place under all planes, see `_Place.height`; the gain; what constraints are broken by."""
+    """The step to the highest place under all planes, see `_Place.height`; the gain; what
+    constraints are broken by.
+    """
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         away = best.y - other.y
-        lowest = best.values.min() + BENT * away @ away  # values bend: a plane from afar may be below what is known
+        lowest = (
+            best.values.min() + BENT * away @ away
+        )  # values bend: a plane from afar may be below what is known
         planes.append(np.maximum(other.values + other.slopes @ away, lowest))
         slopes.append(other.slopes)
     n, of_values, of_kept = len(best.y), sum(map(len, planes)), len(best.kept)
     under = np.column_stack([-np.vstack(slopes), np.ones(of_values), np.zeros(of_values)])
     within = np.column_stack([-best.kept_slopes, np.zeros(of_kept), -np.ones(of_kept)])
-    program = scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
-        np.concatenate([np.zeros(n), [-1.0, broken]]),
-        A_ub=np.vstack([under, within]),
-        b_ub=np.concatenate([*planes, best.kept]),
-        bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
+    program = (
+        scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
+            np.concatenate([np.zeros(n), [-1.0, broken]]),
+            A_ub=np.vstack([under, within]),
+            b_ub=np.concatenate([*planes, best.kept]),
+            bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
+        )
     )
     return program.x[:n], float(-program.fun - best.height(broken)), float(program.x[-1])

@@ -17,7 +17,9 @@ BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q i
 NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
-FORMS = f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+FORMS = (
+    f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+)
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class Scalar:
     name
         The text of `--result`.
     column, at, value
-        For a number of the path: its column, and the column and value at which it is taken, or "end".
+        For a number of the path: its column, and the column and value at which it is taken, or
+        "end".
     """
 
     name: str
@@ -48,7 +51,11 @@ class Scalar:
         if self.name in ("knockdown", "barrier"):
             return _number(summary[self.name])
         if self.name == "critical_field":
-            points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
+            points = (
+                point["value"]
+                for point in summary["limit_points"]
+                if point["amplitude"] == "lambda_m"
+            )
             return _number(next(points, None))
         if self.name in OF_SNAPS:
             first: Mapping[str, float] = next(iter(summary.get("snaps", ())), {})
@@ -87,7 +94,9 @@ def parse_scalar(text: str) -> Scalar:
         )
     for name in (column, at) if place != "end" else (column,):
         if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
-            raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")
+            raise CaseError(
+                f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}"
+            )
     if place == "end":
         return Scalar(text, column, "end")
     try:
@@ -99,16 +108,27 @@ def parse_scalar(text: str) -> Scalar:
     return Scalar(text, column, at, value)
 
 
-def _crossing(path: Sequence[Mapping[str, str]], column: str, at: str, value: float) -> float | None:
+def _crossing(
+    path: Sequence[Mapping[str, str]], column: str, at: str, value: float
+) -> float | None:
     """A column at the first point where the column `at` has a value, by cubic interpolation.
 
-    The interpolation uses points of one load, because the curve has a corner at the end of the field. At a requested
-    point of the path the result is the number in its row.
+    The interpolation uses points of one load, because the curve has a corner at the end of the
+    field. At a requested point of the path the result is the number in its row.
     """
     x = [float(row[at]) for row in path]
-    i = next((i for i in range(len(x) - 1) if (x[i] - value) * (x[i + 1] - value) <= 0 and x[i] != x[i + 1]), None)
+    i = next(
+        (
+            i
+            for i in range(len(x) - 1)
+            if (x[i] - value) * (x[i + 1] - value) <= 0 and x[i] != x[i + 1]
+        ),
+        None,
+    )
     if i is None:
-        met = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)  # a target is reached within the solver's tolerance
+        met = bool(x) and math.isclose(
+            x[-1], value, rel_tol=1e-9
+        )  # a target is reached within the solver's tolerance
         return float(path[-1][column]) if met else None
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
@@ -118,7 +138,9 @@ def _crossing(path: Sequence[Mapping[str, str]], column: str, at: str, value: fl
     window = slice(first, last + 1)
     if not _monotone(x[window]):
         window = slice(i, i + 2)
-    return float(barycentric_interpolate(x[window], [float(row[column]) for row in path[window]], value))
+    return float(
+        barycentric_interpolate(x[window], [float(row[column]) for row in path[window]], value)
+    )
 
 
 def _monotone(x: Sequence[float]) -> bool:

@@ -1,7 +1,8 @@
 """One runner for many runs: cases in, outcomes and a table out.
 
-A study says which runs there are. The runner opens its folder, keeps every outcome in a file as soon as it is there,
-deals the missing runs to the ranks, and says how far it is. What these sources have kept is not computed again.
+A study says which runs there are. The runner opens its folder, keeps every outcome in a file as
+soon as it is there, deals the missing runs to the ranks, and says how far it is. What these sources
+have kept is not computed again.
 """
 
 import json
@@ -22,7 +23,12 @@ from pydantic import TypeAdapter
 
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import DiskError, held_folder, prepare_folder, refuse_others
+from magshell_fenicsx.output.store.folder import (
+    DiskError,
+    held_folder,
+    prepare_folder,
+    refuse_others,
+)
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.environment import code_version
@@ -30,7 +36,9 @@ from magshell_fenicsx.runs.status import clock
 from magshell_fenicsx.runs.summary import Result, in_units, snaps
 from magshell_fenicsx.studies.results import Scalar
 
-Case = Any  # what the front end makes of a source; `problem()` makes its problem: a study does not know its class
+# what the front end makes of a source; `problem()` makes its problem: a study does not know its
+# class
+Case = Any
 Made = Callable[[Source], Case]
 Say = Callable[[str], None]
 Kept = TypeVar("Kept")
@@ -56,7 +64,8 @@ class Folder:
     points
         The folder within, of the outcomes.
     first
-        A table that is there from the start, empty, so that a folder which cannot be written is refused.
+        A table that is there from the start, empty, so that a folder which cannot be written is
+        refused.
     """
 
     what: str
@@ -66,7 +75,10 @@ class Folder:
     first: str = ""
 
     def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
-        """Make it, unless it has files of others, or tables of another case file; several jobs may. Collective."""
+        """Make it, unless it has files of others, or tables of another case file; several jobs may.
+
+        Collective.
+        """
 
         def make(folder: Path) -> None:
             refuse_others(folder, self.tables, self.keys, self.what, case)
@@ -86,7 +98,8 @@ class Folder:
 
 
 def keep(file: Path, content: Mapping[str, Any]) -> None:
-    """Write an outcome; a killed study leaves the complete file or none, and two may write the same one.
+    """Write an outcome; a killed study leaves the complete file or none, and two may write the same
+    one.
 
     Raises
     ------
@@ -124,13 +137,23 @@ def part_of(part: str | None, count: int, of: str) -> tuple[int, int]:
     ((2, 3), (1, 1))
     """
     first, slash, number = (part or "1/1").partition("/")
-    if not (slash and first.isdecimal() and number.isdecimal() and 1 <= int(first) <= int(number) <= count):
-        raise CaseError(f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {of}")
+    if not (
+        slash
+        and first.isdecimal()
+        and number.isdecimal()
+        and 1 <= int(first) <= int(number) <= count
+    ):
+        raise CaseError(
+            f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {of}"
+        )
     return int(first), int(number)
 
 
 def compute(
-    tasks: Sequence[Task], do: Callable[[Task], Iterable[str]], comm: MPI.Intracomm, say: Say = lambda line: None
+    tasks: Sequence[Task],
+    do: Callable[[Task], Iterable[str]],
+    comm: MPI.Intracomm,
+    say: Say = lambda line: None,
 ) -> None:
     """Deal tasks to the ranks; collective.
 
@@ -204,7 +227,9 @@ def rest_said(left: float, about: str = "about ") -> str:
     """
     if left < LEAST_LEFT:
         return ""
-    size, unit = next((size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size)
+    size, unit = next(
+        (size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size
+    )
     return f", {about}{left / size:.0f} {unit} left"
 
 
@@ -245,14 +270,20 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
 
 @contextmanager
 def _together(comm: MPI.Intracomm) -> Iterator[None]:
-    """Wait at the end for all ranks; an error on one of several ends all, which would wait for it for ever."""
+    """Wait at the end for all ranks; an error on one of several ends all, which would wait for it
+    for ever.
+    """
     try:
         yield
     except BaseException as e:
         if comm.size == 1:
             raise
         code = 2 if isinstance(e, CaseError) else 3 if isinstance(e, DiskError) else 1
-        print(f"rank {comm.rank}: {e if code > 1 else traceback.format_exc()}", file=sys.stderr, flush=True)
+        print(
+            f"rank {comm.rank}: {e if code > 1 else traceback.format_exc()}",
+            file=sys.stderr,
+            flush=True,
+        )
         comm.Abort(code)
     comm.Barrier()
 
@@ -268,16 +299,18 @@ class Outcome:
     barrier
         The energy barrier over E h R²; None if the case does not ask for one.
     limit
-        The first limit point (the one of k_d) as in summary.json, or the event that ends a motion; None without.
+        The first limit point (the one of k_d) as in summary.json, or the event that ends a motion;
+        None without.
     stopped
         Why the run ended before its target; None if it reached it.
     curve
         Every accepted point, with the columns of path.csv.
     found
-        "path": the full path was computed; "fold": the fold of another run was followed, and the curve has only this
-        point.
+        "path": the full path was computed; "fold": the fold of another run was followed, and the
+        curve has only this point.
     factorisations
-        Factorisations of the model's tangent, including failed attempts; without those for excluded modes.
+        Factorisations of the model's tangent, including failed attempts; without those for excluded
+        modes.
     cpu_s
         CPU time of a sample of an ensemble.
     in_units
@@ -309,7 +342,12 @@ class Outcome:
         if not self.curve:
             return None
         limits = [self.limit] if self.limit else []
-        summary = {"knockdown": self.knockdown, "barrier": self.barrier, "limit_points": limits, "snaps": self.snaps}
+        summary = {
+            "knockdown": self.knockdown,
+            "barrier": self.barrier,
+            "limit_points": limits,
+            "snaps": self.snaps,
+        }
         return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
 
     def serves(self, scalar: Scalar) -> bool:
@@ -323,10 +361,19 @@ OUTCOME = TypeAdapter(Outcome)
 
 
 def outcome_of(
-    result: Result, found: Found, factorisations: int, wall_s: float = 0.0, columns: Sequence[str] = COLUMNS
+    result: Result,
+    found: Found,
+    factorisations: int,
+    wall_s: float = 0.0,
+    columns: Sequence[str] = COLUMNS,
 ) -> Outcome:
-    """The outcome of a run, or of a fold in the form of a run; its curve has some columns of every run, and its own."""
-    limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
+    """The outcome of a run, or of a fold in the form of a run; its curve has some columns of every
+    run, and its own.
+    """
+    limits = sorted(
+        result.limit_points,
+        key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
+    )
     chosen = dict.fromkeys((*columns, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
@@ -335,7 +382,11 @@ def outcome_of(
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
         curve=[
-            {key: v if isinstance(v := row[key], str | int) else float(v) for key in chosen if key in row}
+            {
+                key: v if isinstance(v := row[key], str | int) else float(v)
+                for key in chosen
+                if key in row
+            }
             for row in result.rows
         ],
         found=found,
@@ -347,7 +398,9 @@ def outcome_of(
 
 
 def _event(result: Result) -> dict[str, Any] | None:
-    """The point at which a motion has ended by an event or an instability, in the form of a limit point."""
+    """The point at which a motion has ended by an event or an instability, in the form of a limit
+    point.
+    """
     last, steps = result.rows[-1], result.scene.problem.programme
     until = getattr(steps[-1].load, "until", "") if steps else ""
     if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
@@ -358,7 +411,11 @@ def _event(result: Result) -> dict[str, Any] | None:
 
 def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
     """Write the outcome of a case."""
-    origin = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": code_version()}
+    origin = {
+        "case": case.model_dump(mode="json", exclude_none=True),
+        **case.outside,
+        "sources": code_version(),
+    }
     keep(file, {**origin, "outcome": asdict(outcome)})
 
 

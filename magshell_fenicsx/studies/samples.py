@@ -39,7 +39,9 @@ class Sample:
     key: str
 
 
-def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, deleted: int = 0) -> list[Sample]:
+def make_samples(
+    source: Source, seed: int, numbers: Sequence[int], made: Made, deleted: int = 0
+) -> list[Sample]:
     """Draw samples; each is a valid case.
 
     Parameters
@@ -52,7 +54,8 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, 
     Raises
     ------
     CaseError
-        If the case has no section `ensemble`, or a sample is no valid case; nothing has been computed then.
+        If the case has no section `ensemble`, or a sample is no valid case; nothing has been
+        computed then.
     """
     section = made(source).ensemble
     if section is None:
@@ -70,29 +73,45 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], made: Made, 
             drawn = section.settings(seed, number, shells)
             samples.append(_sample(source, number, drawn, made, deleted))
         except (CaseError, NoRoom) as e:
-            message = in_the_file(str(e), source, {key: text for key, text in drawn.items() if key in section.keys})
-            raise CaseError(f"{message}\nin sample {number} of seed {seed}; bounds keep a distribution in") from None
+            message = in_the_file(
+                str(e), source, {key: text for key, text in drawn.items() if key in section.keys}
+            )
+            raise CaseError(
+                f"{message}\nin sample {number} of seed {seed}; bounds keep a distribution in"
+            ) from None
     return samples
 
 
-def _sample(source: Source, number: int, drawn: Mapping[str, str], made: Made, deleted: int) -> Sample:
+def _sample(
+    source: Source, number: int, drawn: Mapping[str, str], made: Made, deleted: int
+) -> Sample:
     drawn_source = copy.deepcopy(source)
     del drawn_source.data["ensemble"]
     for key, text in drawn.items():
         override(drawn_source, f"{key}={text}")
-    values = {path: value for key in drawn for path, value in _flat(key, value_at(drawn_source.data, key.split(".")))}
+    values = {
+        path: value
+        for key in drawn
+        for path, value in _flat(key, value_at(drawn_source.data, key.split(".")))
+    }
     case = made(drawn_source)
     ranked = _defects(drawn_source.data, case)
     if deleted:
         if len(ranked) <= deleted:
-            raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects")
+            raise CaseError(
+                f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects"
+            )
         gone = {id(defect) for defect in ranked[:deleted]}
         for shell, _ in _shells(drawn_source.data, case):
             if "imperfections" in shell:
-                shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]
+                shell["imperfections"] = [
+                    item for item in shell["imperfections"] if id(item) not in gone
+                ]
         case = made(drawn_source)
     case.problem()
-    return Sample(number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case))
+    return Sample(
+        number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case)
+    )
 
 
 def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
@@ -106,14 +125,18 @@ def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
-    """The defects with an amplitude as the case has them, the weakest first; amplitudes with units count over h."""
+    """The defects with an amplitude as the case has them, the weakest first; amplitudes with units
+    count over h.
+    """
     sized = list[tuple[float, dict[str, Any]]]()
     for shell, section in _shells(data, case):
         listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
         single = getattr(section, "defect", None)
         sections = section.imperfections or ([single] if single else [])
         sizes = [getattr(each, "amplitude", None) for each in sections]
-        sized += [(abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None]
+        sized += [
+            (abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None
+        ]
     return [item for _, item in sorted(sized, key=lambda pair: pair[0])]
 
 
@@ -129,14 +152,18 @@ OF_KEYS = ("extra_forbidden", "model_type", "model_attributes_type", "list_type"
 
 
 def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) -> None:
-    """Refuse random keys that the case cannot have, whatever their values: before any sample is drawn.
+    """Refuse random keys that the case cannot have, whatever their values: before any sample is
+    drawn.
 
     Raises
     ------
     CaseError
         One message with every such key.
     """
-    middle, refused = {key: json.dumps(each.at(0.5)) for key, each in section.keys.items()}, list[str]()
+    middle, refused = (
+        {key: json.dumps(each.at(0.5)) for key, each in section.keys.items()},
+        list[str](),
+    )
     changed = copy.deepcopy(source)
     del changed.data["ensemble"]
     for key, text in middle.items():

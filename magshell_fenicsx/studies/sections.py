@@ -1,4 +1,6 @@
-"""The sections of studies in a case: what a design varies and wants, and what is random in an ensemble."""
+"""The sections of studies in a case: what a design varies and wants, and what is random in an
+ensemble.
+"""
 
 import json
 from collections.abc import Collection
@@ -17,7 +19,9 @@ Amounts = Annotated[list[float | TextWithUnit], Field(min_length=2, max_length=2
 
 
 class ShapeSection(Section):
-    """Where each place should be at the end of the path: the mean square distance over the area is least there."""
+    """Where each place should be at the end of the path: the mean square distance over the area is
+    least there.
+    """
 
     components: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
     """The wanted place as formulas of the undeformed x, y, z over R [R]"""
@@ -65,7 +69,9 @@ class ObjectiveSection(Section):
     def _one_of_them(self) -> Self:
         given = [key for key in WANTED if getattr(self, key) is not None]
         if len(given) != 1:
-            raise ValueError(f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}")
+            raise ValueError(
+                f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}"
+            )
         if (self.reach is None) != (self.value is None):
             raise ValueError("reach and value belong together")
         return self
@@ -108,10 +114,12 @@ class LimitSection(Section):
 
 
 class RemanenceVariables(Section):
-    """The vectors of the remanence at points, of which each place has a mean; see `kind: points` of the remanence.
+    """The vectors of the remanence at points, of which each place has a mean; see `kind: points` of
+    the remanence.
 
-    Their directions are free. On a meridian the points lie along it; on a strip along its middle, and vectors stay in
-    the plane of x and z; elsewhere they are spread over the surface, and all of it is modelled.
+    Their directions are free. On a meridian the points lie along it; on a strip along its middle,
+    and vectors stay in the plane of x and z; elsewhere they are spread over the surface, and all of
+    it is modelled.
     """
 
     points: Annotated[int, Field(ge=2, le=20_000)] | None = None
@@ -131,7 +139,8 @@ class RemanenceVariables(Section):
 
 
 class FieldVariables(Section):
-    """The values of a field at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
+    """The values of a field at points, of which each place has the mean, weighted by
+    exp(-(distance/filter)²).
 
     In the best case the field is a formula of x, y, z.
     """
@@ -176,7 +185,9 @@ class DesignSection(Section):
     @model_validator(mode="after")
     def _something_varies(self) -> Self:
         if not self.numbers and self.remanence is None and not self.fields:
-            raise ValueError("needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies")
+            raise ValueError(
+                "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies"
+            )
         if self.thickness and self.thickness.values[0] <= 0:
             raise ValueError("thickness: values: must be positive")
         for key, written in self.numbers.items():
@@ -186,7 +197,9 @@ class DesignSection(Section):
                 raise ValueError(f"numbers: {key}: {e}") from None
             if not least < most:
                 places = ", ".join(map(str, written))
-                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {places}")
+                raise ValueError(
+                    f"numbers: {key}: the first bound must be less than the second, here {places}"
+                )
         return self
 
     def bounds(self, key: str) -> tuple[float, float, str]:
@@ -207,23 +220,35 @@ class DesignSection(Section):
     @property
     def fields(self) -> dict[str, FieldVariables]:
         """The scalar fields that vary."""
-        fields_that_vary = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
+        fields_that_vary = {
+            "thickness": self.thickness,
+            "curvature": self.curvature,
+            "deviation": self.deviation,
+        }
         return {name: section for name, section in fields_that_vary.items() if section}
 
     def key_of(self, result: str) -> str:
         """The first key below `design` that names a result."""
         if result in self.objective.results:
-            return next(f"objective.{key}" for key in WANTED if getattr(self.objective, key) is not None)
+            return next(
+                f"objective.{key}" for key in WANTED if getattr(self.objective, key) is not None
+            )
         named = ((f"constraints.{i}", limit) for i, limit in enumerate(self.constraints))
         return next(
-            f"{key}.{'of' if limit.of == result else 'same_as'}" for key, limit in named if result in limit.names
+            f"{key}.{'of' if limit.of == result else 'same_as'}"
+            for key, limit in named
+            if result in limit.names
         )
 
     @property
     def named(self) -> dict[str, str]:
         """Results but a wanted shape -> the keys that name them."""
         shape = ["shape"] if self.objective.shape else []
-        return {result: f"design.{self.key_of(result)}" for result in self.results if result not in shape}
+        return {
+            result: f"design.{self.key_of(result)}"
+            for result in self.results
+            if result not in shape
+        }
 
     @property
     def results(self) -> list[str]:
@@ -233,7 +258,9 @@ class DesignSection(Section):
 
 
 class PlacedDefectsSection(DefectsSection):
-    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in area."""
+    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in
+    area.
+    """
 
     on: str | None = None
     """Name of one of several shells, over whose thickness they are; by default each has as many of its own"""
@@ -243,7 +270,9 @@ IMPERFECTIONS = "shell.imperfections"
 
 
 class EnsembleSection(Section):
-    """What is random in the samples of `magshell ensemble`; every other command takes the case without it."""
+    """What is random in the samples of `magshell ensemble`; every other command takes the case
+    without it.
+    """
 
     keys: dict[str, Distribution] = Field(default_factory=dict)
     """Key of the case, with dots (`magnetic.lambda_m`, `shell.imperfections.0.amplitude`) -> its distribution"""
@@ -269,7 +298,13 @@ class EnsembleSection(Section):
 
     @property
     def _listed(self) -> list[PlacedDefectsSection]:
-        return self.defects if isinstance(self.defects, list) else [self.defects] if self.defects else []
+        return (
+            self.defects
+            if isinstance(self.defects, list)
+            else [self.defects]
+            if self.defects
+            else []
+        )
 
     @property
     def _on(self) -> list[str | None]:
@@ -281,13 +316,16 @@ class EnsembleSection(Section):
             if name and not shells:
                 raise ValueError("ensemble.defects.on: names one of several shells: leave it out")
             if name and name not in shells:
-                raise ValueError(f"ensemble.defects.on: {name}: there is no such shell, only {', '.join(shells)}")
+                raise ValueError(
+                    f"ensemble.defects.on: {name}: there is no such shell, only {', '.join(shells)}"
+                )
 
     def settings(self, seed: int, number: int, shells: Collection[str] = ()) -> dict[str, str]:
-        """The keys of a sample and their values, as in `--set`; they depend on seed and number alone.
+        """The keys of a sample and their values, as in `--set`; they depend on seed and number
+        alone.
 
-        Every key has random numbers of its own: another key more does not change the others. The first shell with
-        defects has those that it has alone.
+        Every key has random numbers of its own: another key more does not change the others. The
+        first shell with defects has those that it has alone.
 
         Parameters
         ----------
@@ -300,10 +338,15 @@ class EnsembleSection(Section):
             If no places were found for the defects.
         """
         drawn: dict[str, Value | list[Any]] = {
-            key: distribution.draw(generator(seed, number, key)) for key, distribution in self.keys.items()
+            key: distribution.draw(generator(seed, number, key))
+            for key, distribution in self.keys.items()
         }
         defects = dict[str, list[Any]]()
-        named = [(each, name) for each in self._listed for name in ([each.on] if each.on else [*shells] or [""])]
+        named = [
+            (each, name)
+            for each in self._listed
+            for name in ([each.on] if each.on else [*shells] or [""])
+        ]
         for i, (each, name) in enumerate(named):
             key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
             before = sum(other == name for _, other in named[:i])

@@ -1,17 +1,20 @@
-"""A field among the parameters: a prior under which it is smooth, as strong as the data make most likely.
+"""A field among the parameters: a prior under which it is smooth, as strong as the data make most
+likely.
 
-The numbers B (n, c) of a field at n places are normal about their mean, c components alike and apart, with
+The numbers B (n, c) of a field at n places are normal about their mean, c components alike and
+apart, with
 
     cov(B(x), B(y)) = s^2 k(|x - y|/l),    k(r) = (1 + sqrt(3) r) exp(-sqrt(3) r)
 
-(C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eq. 4.17). The
-deviation s, the length l and the noise of columns are those under which the data d are most likely (there, eq. 5.8):
-with the model linear about x, rows r of residuals over their deviations and their slopes A, those of priors too,
+(C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eq.
+4.17). The deviation s, the length l and the noise of columns are those under which the data d are
+most likely (there, eq. 5.8): with the model linear about x, rows r of residuals over their
+deviations and their slopes A, those of priors too,
 
     -2 ln p(d) = sum ln noise^2 - ln det Q + ln det A^T A + min |r - A dx|^2 + constant,
 
-Q being the inverse covariance of the field. A parameter without prior is integrated over too (D. A. Harville, J.
-Am. Stat. Assoc. 72, 320, 1977). Knows no shell.
+Q being the inverse covariance of the field. A parameter without prior is integrated over too (D. A.
+Harville, J. Am. Stat. Assoc. 72, 320, 1977). Knows no shell.
 """
 
 from dataclasses import dataclass, replace
@@ -63,7 +66,10 @@ class Smooth:
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Least and largest s and l that are looked at; l from the distance of neighbours on."""
         apart = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
-        return (WEAKEST, STRONGEST), (float(np.median(apart.min(axis=1))), LONGEST * float(self.distances.max()))
+        return (WEAKEST, STRONGEST), (
+            float(np.median(apart.min(axis=1))),
+            LONGEST * float(self.distances.max()),
+        )
 
     @cached_property
     def _factor(self) -> tuple[Array, float]:
@@ -71,7 +77,9 @@ class Smooth:
         r = np.sqrt(3) * self.distances / self.length
         K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
         L = self.deviation * np.linalg.cholesky(K)
-        return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True), -2 * float(np.log(np.diag(L)).sum())
+        return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True), -2 * float(
+            np.log(np.diag(L)).sum()
+        )
 
     @property
     def rows(self) -> Array:
@@ -102,6 +110,10 @@ class Smooth:
         if np.isfinite(self.deviation):
             return [(self.deviation, self.length)]
         (_, _), (near, far) = self.bounds
-        deviations = np.geomspace(0.03, 3.0, LOOKED) if np.isnan(given.deviation) else [given.deviation]
-        lengths = np.geomspace(2 * near, far / 2, LOOKED) if np.isnan(given.length) else [given.length]
+        deviations = (
+            np.geomspace(0.03, 3.0, LOOKED) if np.isnan(given.deviation) else [given.deviation]
+        )
+        lengths = (
+            np.geomspace(2 * near, far / 2, LOOKED) if np.isnan(given.length) else [given.length]
+        )
         return [(float(s), float(ell)) for s in deviations for ell in lengths]

@@ -1,9 +1,10 @@
 """The rows of samples.csv, their statistics in words and numbers, and the picture of an ensemble.
 
-The statistics are moments, correlations and the three-parameter Weibull distribution,
-P(x) = 1 - exp(-((x - location)/scale)^shape) for x > location, fitted by maximum likelihood. At a given location the
-shape is the root of one equation and the scale follows from it, so that the likelihood is maximised over the location
-alone (profile likelihood). It has no maximum where the shape is below one: such shapes are left out.
+The statistics are moments, correlations and the three-parameter Weibull distribution, P(x) = 1 -
+exp(-((x - location)/scale)^shape) for x > location, fitted by maximum likelihood. At a given
+location the shape is the root of one equation and the scale follows from it, so that the likelihood
+is maximised over the location alone (profile likelihood). It has no maximum where the shape is
+below one: such shapes are left out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +40,10 @@ RESAMPLED = 300
 LEAST = 3  # samples for a correlation
 LEAST_DIFFERENT = 8  # different values for three parameters
 SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
-GRID, ROUNDS = 9, 9  # locations that are tried at once, and how often the grid is refined around the best
+GRID, ROUNDS = (
+    9,
+    9,
+)  # locations that are tried at once, and how often the grid is refined around the best
 SHAPES = 1.0, 1e3
 STEPS = 5  # of Newton's method, which begins close
 LEVEL = 0.95
@@ -111,7 +115,8 @@ def results(rows: Sequence[Row], column: str = RESULT) -> Array:
 
 
 def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
-    """Numbers of samples, moments, the Weibull fit, correlations, and the change without the weakest defects.
+    """Numbers of samples, moments, the Weibull fit, correlations, and the change without the
+    weakest defects.
 
     Parameters
     ----------
@@ -127,14 +132,19 @@ def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         "intervals": intervals(values, seed, RESAMPLED) if len(values) >= LEAST else {},
         "correlations": correlations(rows),
         "without_weakest": _without(rows),
-        "cpu_s_per_sample": float(np.mean([row["cpu_s"] for row in rows if row["cpu_s"] is not None] or [np.nan])),
+        "cpu_s_per_sample": float(
+            np.mean([row["cpu_s"] for row in rows if row["cpu_s"] is not None] or [np.nan])
+        ),
     }
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
     """The number of samples, and of those with each status."""
     statuses = [row["status"] for row in rows]
-    return {"samples": len(rows), **{status: statuses.count(status) for status in sorted(set(statuses))}}
+    return {
+        "samples": len(rows),
+        **{status: statuses.count(status) for status in sorted(set(statuses))},
+    }
 
 
 def moments(values: Array) -> dict[str, Any]:
@@ -154,31 +164,51 @@ def _weibull(values: Array) -> dict[str, Any] | None:
     fitted = fit(values) if len(values) else None
     if fitted is None:
         return None
-    return {**asdict(fitted), "quantile_1_percent": fitted.quantile(0.01), "distance": distance(values, fitted)}
+    return {
+        **asdict(fitted),
+        "quantile_1_percent": fitted.quantile(0.01),
+        "distance": distance(values, fitted),
+    }
 
 
 def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """The correlation of the result with the most severe defect and with every key: Pearson's and Spearman's."""
+    """The correlation of the result with the most severe defect and with every key: Pearson's and
+    Spearman's.
+    """
     from scipy.stats import pearsonr, spearmanr
 
     correlated = {}
     place, keys = "at.polar", drawn_keys(rows)
-    of_defects = "shell.imperfections.", *(key.removesuffix(place) for key in keys if key.endswith(f".{place}"))
+    of_defects = (
+        "shell.imperfections.",
+        *(key.removesuffix(place) for key in keys if key.endswith(f".{place}")),
+    )
     drawn = [key for key in keys if not key.startswith(of_defects)]
     for key in (*severest_keys(rows), *drawn):
         pairs = np.array(
-            [(x, y) for row in rows if isinstance(x := row.get(key), float | int) and (y := row[RESULT]) is not None]
+            [
+                (x, y)
+                for row in rows
+                if isinstance(x := row.get(key), float | int) and (y := row[RESULT]) is not None
+            ]
         )
         if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
             continue
         x, y = pairs.T
-        correlated[key] = {"pearson": float(pearsonr(x, y)[0]), "spearman": float(spearmanr(x, y)[0])}
+        correlated[key] = {
+            "pearson": float(pearsonr(x, y)[0]),
+            "spearman": float(spearmanr(x, y)[0]),
+        }
     return correlated
 
 
 def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
     """The change of the result by deleting the weakest defects, over the samples that have both."""
-    both = [(row[RESULT], row[WITHOUT]) for row in rows if row[RESULT] is not None and row.get(WITHOUT) is not None]
+    both = [
+        (row[RESULT], row[WITHOUT])
+        for row in rows
+        if row[RESULT] is not None and row.get(WITHOUT) is not None
+    ]
     if not both:
         return None
     whole, less = np.array(both).T
@@ -198,7 +228,8 @@ class Weibull:
     Attributes
     ----------
     bounded
-        Whether the best location is one of the bounds of the search, so that the sample does not determine it.
+        Whether the best location is one of the bounds of the search, so that the sample does not
+        determine it.
     """
 
     shape: float
@@ -243,7 +274,9 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
 
 
 def distance(values: Array, fitted: Weibull) -> float:
-    """The largest difference between the empirical and the fitted distribution function (Kolmogorov and Smirnov)."""
+    """The largest difference between the empirical and the fitted distribution function (Kolmogorov
+    and Smirnov).
+    """
     below, n = fitted.below(np.sort(values)), len(values)
     return float(np.max([np.arange(1, n + 1) / n - below, below - np.arange(n) / n]))
 
@@ -253,13 +286,16 @@ def _likelihoods(x: Array, locations: Array) -> Array:
     shapes, scales = _at(x, locations)
     logs = np.log((x - locations[:, None]) / scales[:, None])
     powers = np.exp(shapes[:, None] * logs)
-    return np.asarray(np.log(shapes / scales) + np.mean((shapes[:, None] - 1) * logs - powers, axis=1))
+    return np.asarray(
+        np.log(shapes / scales) + np.mean((shapes[:, None] - 1) * logs - powers, axis=1)
+    )
 
 
 def _at(x: Array, locations: Array) -> tuple[Array, Array]:
     """The best shape (m,) and scale (m,) for locations (m,).
 
-    The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by Newton's method for log k.
+    The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by
+    Newton's method for log k.
     """
     y = np.log(x - locations[:, None])
     y, middle = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # mean(log y) = 0 then
@@ -276,8 +312,11 @@ def _at(x: Array, locations: Array) -> tuple[Array, Array]:
     return np.asarray(k), np.asarray(np.exp(middle + mean / k))
 
 
-def intervals(values: Sequence[float] | Array, seed: int, count: int = 400) -> dict[str, tuple[float, float]]:
-    """Percentile intervals of the parameters, of the mean and of the 1 % quantile, from resampled values.
+def intervals(
+    values: Sequence[float] | Array, seed: int, count: int = 400
+) -> dict[str, tuple[float, float]]:
+    """Percentile intervals of the parameters, of the mean and of the 1 % quantile, from resampled
+    values.
 
     Parameters
     ----------
@@ -310,7 +349,9 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     """
     table = f"samples{ending}.csv"
     counts, fit = content["counts"], content["weibull"]
-    counted = ", ".join(f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples")
+    counted = ", ".join(
+        f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples"
+    )
     lines = [
         f"# {content['result']} of {content['case']}: {counts['samples']} random samples",
         "",
@@ -329,13 +370,23 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
         names = ("shape", "location", "scale", "quantile_1_percent", "distance")
         lines += [_row(key, fit[key], content["intervals"], "Weibull, ") for key in names]
         if fit["bounded"]:
-            lines += ["", "The likelihood has no maximum inside the bounds of the search: the three parameters are not"]
+            lines += [
+                "",
+                "The likelihood has no maximum inside the bounds of the search: the three parameters are not",
+            ]
             lines += ["determined by these samples."]
     else:
         lines += ["", "Too few different results for a Weibull distribution."]
     if content["correlations"]:
-        lines += ["", f"| {content['result']} against | Pearson | Spearman |", "| --- | --- | --- |"]
-        lines += [f"| {key} | {c['pearson']:.3f} | {c['spearman']:.3f} |" for key, c in content["correlations"].items()]
+        lines += [
+            "",
+            f"| {content['result']} against | Pearson | Spearman |",
+            "| --- | --- | --- |",
+        ]
+        lines += [
+            f"| {key} | {c['pearson']:.3f} | {c['spearman']:.3f} |"
+            for key, c in content["correlations"].items()
+        ]
     if less := content["without_weakest"]:
         lines += [
             "",
@@ -345,7 +396,13 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
         ]
     without = [row for row in rows if row["status"] != "found"]
     if without:
-        lines += ["", "Samples without the result:", "", "| sample | status | why |", "| --- | --- | --- |"]
+        lines += [
+            "",
+            "Samples without the result:",
+            "",
+            "| sample | status | why |",
+            "| --- | --- | --- |",
+        ]
         lines += [
             f"| {row['sample']} | {row['status']} | {str(row['why']).replace('|', '/')} |"
             for row in without[:MOST_LISTED]
@@ -355,7 +412,9 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     return "\n".join(lines) + "\n"
 
 
-def _row(key: str, value: float | None, intervals: dict[str, tuple[float, float]], of: str = "") -> str:
+def _row(
+    key: str, value: float | None, intervals: dict[str, tuple[float, float]], of: str = ""
+) -> str:
     ends = intervals.get(key)
     shown = "" if value is None else f"{value:.6g}"
     return f"| {of}{key.replace('_', ' ')} | {shown} | {f'{ends[0]:.5g} to {ends[1]:.5g}' if ends else ''} |"

@@ -1,4 +1,6 @@
-"""Error against run time of a case over meshes, degrees, models and ranks; every run is a separate process."""
+"""Error against run time of a case over meshes, degrees, models and ranks; every run is a separate
+process.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -31,7 +33,9 @@ from magshell_fenicsx.studies.study_report import (
     write_table,
 )
 
-FOLDER = Folder("a study", ("study.json", "study.csv", "study.md", "study.png"), ("machine", "result"))
+FOLDER = Folder(
+    "a study", ("study.json", "study.csv", "study.md", "study.png"), ("machine", "result")
+)
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,8 @@ def study(
 ) -> Study:
     """Measure error and run time at all points of a product; write study.csv, .json, .md and .png.
 
-    Runs are separate processes, one at a time: each point runs once to compile its kernels, then `repeat` times. Runs
-    in the folder are kept if this machine measured them with these sources.
+    Runs are separate processes, one at a time: each point runs once to compile its kernels, then
+    `repeat` times. Runs in the folder are kept if this machine measured them with these sources.
 
     Parameters
     ----------
@@ -91,8 +95,8 @@ def study(
     Raises
     ------
     CaseError
-        Before the first run: if a point is not a valid case, the result has no such name, or `out` cannot be
-        written.
+        Before the first run: if a point is not a valid case, the result has no such name, or `out`
+        cannot be written.
     DiskError
         If the disk is full; finished runs are kept.
     """
@@ -103,10 +107,19 @@ def study(
     with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
-        files = {(i, n): folder / "points" / f"{points[i].key}-{n}.json" for i in range(len(points)) for n in counts}
+        files = {
+            (i, n): folder / "points" / f"{points[i].key}-{n}.json"
+            for i in range(len(points))
+            for n in counts
+        }
         if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
-            say(f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx")
-        runs = {(i, n): Run(points[i], n, load(kept_in, machine, origins[i])) for (i, n), kept_in in files.items()}
+            say(
+                f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx"
+            )
+        runs = {
+            (i, n): Run(points[i], n, load(kept_in, machine, origins[i]))
+            for (i, n), kept_in in files.items()
+        }
 
         def point_measured(key: tuple[int, int]) -> Iterator[str]:
             (i, n), run = key, runs[key]
@@ -144,7 +157,9 @@ def parse_ranks(text: str) -> list[int]:
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
-        raise CaseError(f"--ranks {text}: write whole numbers with commas, for example 1,2") from None
+        raise CaseError(
+            f"--ranks {text}: write whole numbers with commas, for example 1,2"
+        ) from None
 
 
 def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
@@ -174,4 +189,6 @@ def _outcome(measured: Timings, scalar: Scalar) -> str:
     value = scalar.of(measured.summary, measured.rows)
     reached = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
     stopped = measured.summary["stopped"]
-    return f"{reached}, {measured.typical('wall_s'):.2f} s" + (f", stopped early: {stopped}" if stopped else "")
+    return f"{reached}, {measured.typical('wall_s'):.2f} s" + (
+        f", stopped early: {stopped}" if stopped else ""
+    )

@@ -40,7 +40,9 @@ class Reference:
         return abs(value - self.value) / (abs(self.value) or 1.0)
 
 
-def estimated_error(h: Sequence[float], values: Sequence[float]) -> tuple[float | None, float | None]:
+def estimated_error(
+    h: Sequence[float], values: Sequence[float]
+) -> tuple[float | None, float | None]:
     """Error of the last value, and the order p, from v(h) = v + C h^p (Richardson).
 
     Parameters
@@ -48,8 +50,8 @@ def estimated_error(h: Sequence[float], values: Sequence[float]) -> tuple[float 
     h
         Mesh sizes, decreasing.
     values
-        At least three values give the order. With two, or without monotonic convergence, the error is the last
-        difference and there is no order.
+        At least three values give the order. With two, or without monotonic convergence, the error
+        is the last difference and there is no order.
 
     Returns
     -------
@@ -72,7 +74,9 @@ def estimated_error(h: Sequence[float], values: Sequence[float]) -> tuple[float 
 
 
 def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
-    """p with (v1 - v2)/(v2 - v3) = (h1^p - h2^p)/(h2^p - h3^p); None if there is none between `ORDERS`."""
+    """p with (v1 - v2)/(v2 - v3) = (h1^p - h2^p)/(h2^p - h3^p); None if there is none between
+    `ORDERS`.
+    """
     (a, b, c), (v1, v2, v3) = h, values
     if (v1 - v2) * (v2 - v3) <= 0:
         return None
@@ -87,7 +91,18 @@ def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
 REFINEMENT = "mesh.refinement"
 COLUMNS = (
     *("ranks", "cells", "dofs", "degree", "result", "error"),
-    *("wall_s", "cpu_s", "jit_first_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s"),
+    *(
+        "wall_s",
+        "cpu_s",
+        "jit_first_s",
+        "jit_s",
+        "setup_s",
+        "assembly_s",
+        "factor_s",
+        "solve_s",
+        "output_s",
+        "total_s",
+    ),
     *("peak_mb", "factorisations", "iterations", "stopped", "pareto"),
 )
 Row = dict[str, Any]
@@ -106,7 +121,9 @@ class Run:
         return f"{self.point.label}, {self.ranks} rank{'s' if self.ranks > 1 else ''}"
 
 
-def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple[list[Row], Reference | None]:
+def make_rows(
+    runs: Sequence[Run], scalar: Scalar, given: float | None
+) -> tuple[list[Row], Reference | None]:
     """All rows, in the order of the runs, and the reference of their errors.
 
     Parameters
@@ -119,7 +136,10 @@ def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple
     if given is not None:
         reference = Reference(given, None, None, "given")
     elif any(row["result"] is not None for row in rows):
-        finest = max((row for row in rows if row["result"] is not None), key=lambda r: (r["degree"], r["dofs"]))
+        finest = max(
+            (row for row in rows if row["result"] is not None),
+            key=lambda r: (r["degree"], r["dofs"]),
+        )
         reference = _estimated(finest, runs, rows)
     for row in rows:
         if reference and row["result"] is not None:
@@ -127,13 +147,20 @@ def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple
     spent = clock(rows)
     comparable = [row for row in rows if row["error"] is not None and row[spent] is not None]
     for row in rows:
-        row["pareto"] = row in comparable and not any(_beats(other, row, spent) for other in comparable)
+        row["pareto"] = row in comparable and not any(
+            _beats(other, row, spent) for other in comparable
+        )
     return rows, reference
 
 
 def _row(run: Run, scalar: Scalar) -> Row:
     measured, summary = run.measured, run.measured.summary
-    row: Row = {**run.point.values, **dict.fromkeys(COLUMNS), "ranks": run.ranks, "stopped": measured.failure}
+    row: Row = {
+        **run.point.values,
+        **dict.fromkeys(COLUMNS),
+        "ranks": run.ranks,
+        "stopped": measured.failure,
+    }
     if summary is None:
         return row
     return row | {
@@ -153,17 +180,23 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
     series = {
         run.point.case.mesh.refinement: row["result"]
         for run, row in zip(runs, rows, strict=True)
-        if row["result"] is not None and row["dofs"] <= finest["dofs"] and all(row[k] == finest[k] for k in same)
+        if row["result"] is not None
+        and row["dofs"] <= finest["dofs"]
+        and all(row[k] == finest[k] for k in same)
     }
     refinements = sorted(series)
     error, order = estimated_error([1 / r for r in refinements], [series[r] for r in refinements])
     value = finest["result"]
     relative = None if error is None else error / (abs(value) or 1.0)
-    return Reference(value, relative, order, f"finest run: degree {finest['degree']}, {finest['dofs']} dofs")
+    return Reference(
+        value, relative, order, f"finest run: degree {finest['degree']}, {finest['dofs']} dofs"
+    )
 
 
 def clock(rows: Sequence[Row]) -> str:
-    """The time that compares runs: CPU time for one rank, because other processes affect it less; else wall time."""
+    """The time that compares runs: CPU time for one rank, because other processes affect it less;
+    else wall time.
+    """
     alone = all(row["ranks"] == 1 for row in rows) and any(row["cpu_s"] is not None for row in rows)
     return "cpu_s" if alone else "wall_s"
 
@@ -178,10 +211,25 @@ FORMS = {
     "result": ".9g",
     "error": ".1e",
     "peak_mb": ".0f",
-    **dict.fromkeys(("wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s"), ".3g"),
+    **dict.fromkeys(
+        ("wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s"),
+        ".3g",
+    ),
 }
 SHOWN = (
-    *("cells", "dofs", "result", "error", "wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s"),
+    *(
+        "cells",
+        "dofs",
+        "result",
+        "error",
+        "wall_s",
+        "cpu_s",
+        "jit_s",
+        "setup_s",
+        "assembly_s",
+        "factor_s",
+        "solve_s",
+    ),
     *("output_s", "peak_mb", "factorisations", "iterations", "stopped"),
 )
 LEGEND = """Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as in
@@ -189,7 +237,9 @@ summary.json; the peak is the resident memory of all ranks. **Bold**: no other r
 """
 
 
-def write_table(rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any], file: Path) -> None:
+def write_table(
+    rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any], file: Path
+) -> None:
     """Write study.md.
 
     Parameters
@@ -199,7 +249,11 @@ def write_table(rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any
     content
         The content of study.json.
     """
-    head = [*map(short, keys), "ranks", *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN)]
+    head = [
+        *map(short, keys),
+        "ranks",
+        *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN),
+    ]
     lines = [head, ["---"] * len(head)]
     for row in rows:
         cells = [_cell(row, key) for key in (*keys, "ranks", *SHOWN)]
@@ -233,7 +287,11 @@ def reference_sentence(reference: Reference | None) -> str:
         return f"{value})."
     if reference.error is None:
         return f"{value}; its own error is not known: it has no coarser mesh to compare with)."
-    how = f"observed order {reference.order:.2g}" if reference.order else "the last difference: no order was observed"
+    how = (
+        f"observed order {reference.order:.2g}"
+        if reference.order
+        else "the last difference: no order was observed"
+    )
     return f"{value}; its own error is estimated at {reference.error:.1e}, {how}): smaller errors mean nothing."
 
 
@@ -241,7 +299,11 @@ def _cell(row: Row, key: str) -> str:
     value = row[key]
     if value is None:
         return ""
-    return format(value, FORMS[key]) if key in FORMS else str(value).replace("|", "/").replace("\n", " ")
+    return (
+        format(value, FORMS[key])
+        if key in FORMS
+        else str(value).replace("|", "/").replace("\n", " ")
+    )
 
 
 CLOCKS = {"wall_s": "wall time of the process (s)", "cpu_s": "CPU time of the process (s)"}
@@ -255,10 +317,14 @@ PARTS = {
     "output_s": "output",
 }
 MARKERS = "osD^vP*X"
-LEAST_SPREAD = 3.0  # least factor between the middle and the ends of an axis, so that noise shows no trend
+LEAST_SPREAD = (
+    3.0  # least factor between the middle and the ends of an axis, so that noise shows no trend
+)
 
 
-def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: float | None, file: Path) -> None:
+def draw_study(
+    rows: Sequence[Row], keys: Sequence[str], title: str, own_error: float | None, file: Path
+) -> None:
     """Write study.png; runs without an error are left out.
 
     Parameters
@@ -276,7 +342,9 @@ def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: 
     spent = clock(rows)
     series = _series([row for row in rows if row["error"] and row[spent]], keys)
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")
-    for axes, (quantity, label) in zip(panels.flat, {spent: CLOCKS[spent], **AGAINST}.items(), strict=False):
+    for axes, (quantity, label) in zip(
+        panels.flat, {spent: CLOCKS[spent], **AGAINST}.items(), strict=False
+    ):
         _errors(axes, series, quantity, own_error)
         axes.set(xlabel=label, ylabel="relative error")
     _parts(panels[1, 1], series)
@@ -295,23 +363,44 @@ def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     shown = [name for name in names if len({row[name] for row in rows}) > 1]
     series: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
-        series.setdefault(", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []).append(row)
+        series.setdefault(
+            ", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []
+        ).append(row)
     return series
 
 
-def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None) -> None:
+def _errors(
+    axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None
+) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
         x, error = ([row[key] for row in rows] for key in (quantity, "error"))
         axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
-    best = sorted((row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"])
+    best = sorted(
+        (row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"]
+    )
     if quantity in CLOCKS and best:
         x, error = map(list, zip(*best, strict=True))
-        axes.step(x, error, where="post", color="0.6", linewidth=5, alpha=0.5, zorder=0, label="Pareto front")
+        axes.step(
+            x,
+            error,
+            where="post",
+            color="0.6",
+            linewidth=5,
+            alpha=0.5,
+            zorder=0,
+            label="Pareto front",
+        )
         axes.plot(x, error, "o", markersize=9, fillstyle="none", color="0.3")
     if own_error:
-        axes.axhline(own_error, color="C3", linewidth=0.8, linestyle=":", label="error of the reference itself")
+        axes.axhline(
+            own_error,
+            color="C3",
+            linewidth=0.8,
+            linestyle=":",
+            label="error of the reference itself",
+        )
     axes.set(xscale="log", yscale="log")
     if values := [row[quantity] for rows in series.values() for row in rows]:
         middle = (min(values) * max(values)) ** 0.5
@@ -325,7 +414,9 @@ def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: f
 
 def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
     """Draw the shares of the phases in the wall time, for the runs on the Pareto front."""
-    rows = sorted((r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"])
+    rows = sorted(
+        (r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"]
+    )
     bottom = [0.0] * len(rows)
     places = range(len(rows))
     for i, (key, label) in enumerate(PARTS.items()):
@@ -338,8 +429,15 @@ def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
         ("total_s", "0.6", "the rest of the run"),
         ("wall_s", "0.85", "start and end of the process"),
     ):
-        rest = [max((row[end] or 0.0) / row["wall_s"] - b, 0.0) for row, b in zip(rows, bottom, strict=True)]
+        rest = [
+            max((row[end] or 0.0) / row["wall_s"] - b, 0.0)
+            for row, b in zip(rows, bottom, strict=True)
+        ]
         axes.bar(places, rest, bottom=bottom, color=colour, label=label)
         bottom = [b + h for b, h in zip(bottom, rest, strict=True)]
     axes.set_xticks(places, [f"{row['error']:.0e}\n{row['dofs']}" for row in rows], fontsize=7)
-    axes.set(xlabel="error and unknowns of the Pareto front's runs", ylabel="share of the wall time", ylim=(0, 1))
+    axes.set(
+        xlabel="error and unknowns of the Pareto front's runs",
+        ylabel="share of the wall time",
+        ylim=(0, 1),
+    )

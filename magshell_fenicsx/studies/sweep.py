@@ -1,7 +1,8 @@
 """A case over ranges of its keys; the ranks share the points, and existing points are kept.
 
-The points along one axis are a chain. If the result is a knockdown, the fold of one point of a chain is followed to
-the next; the first point, and every point where this fails, computes the full path.
+The points along one axis are a chain. If the result is a knockdown, the fold of one point of a
+chain is followed to the next; the first point, and every point where this fails, computes the full
+path.
 """
 
 import copy
@@ -55,17 +56,32 @@ from magshell_fenicsx.studies.sweep_picture import draw_sweep
 
 NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
 FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
-SYMMETRIES = ("none", "half", "axisymmetric")  # a model with an earlier symmetry covers the later ones
+SYMMETRIES = (
+    "none",
+    "half",
+    "axisymmetric",
+)  # a model with an earlier symmetry covers the later ones
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 CURVE = (
-    *("label", "amplitude", "p_over_pc", "lambda_m", "field_angle", "force", "load_factor", "w_over_h"),
+    *(
+        "label",
+        "amplitude",
+        "p_over_pc",
+        "lambda_m",
+        "field_angle",
+        "force",
+        "load_factor",
+        "w_over_h",
+    ),
     *("w_pole_over_h", "volume_change", "mode", "branch"),
 )
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A finished sweep: its points in product order, their outcomes, and their results where one was asked for."""
+    """A finished sweep: its points in product order, their outcomes, and their results where one
+    was asked for.
+    """
 
     axes: list[Axis]
     points: list[SweepPoint]
@@ -93,31 +109,35 @@ def sweep(
 ) -> Sweep:
     """Run a case at all points of a product; collective, and every rank works.
 
-    If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed up to its fold, and
-    then the fold is followed along the last axis with numbers; see `Continuation`.
+    If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed
+    up to its fold, and then the fold is followed along the last axis with numbers; see
+    `Continuation`.
 
     Parameters
     ----------
     over
         `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     out
-        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources computed them. Tables and
-        picture have the points of earlier sweeps over the same keys too.
+        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources
+        computed them. Tables and picture have the points of earlier sweeps over the same keys too.
     say
         Called with one line per finished point, on the rank that finished it.
     made
         Makes a case of its source.
     result
-        A number of each point as of `magshell study`, beside those that every sweep has; see `parse_scalar`.
+        A number of each point as of `magshell study`, beside those that every sweep has; see
+        `parse_scalar`.
     full_paths
         Compute the full path at every point.
     part
-        "i/n": compute only the i-th of n equal shares of the points; several jobs may share one folder.
+        "i/n": compute only the i-th of n equal shares of the points; several jobs may share one
+        folder.
 
     Raises
     ------
     CaseError
-        Before the first point, if a point is not a valid case, or `out` cannot be written or has another sweep.
+        Before the first point, if a point is not a valid case, or `out` cannot be written or has
+        another sweep.
     DiskError
         If the tables cannot be written.
     """
@@ -130,15 +150,23 @@ def sweep(
     points = by_first(comm, lambda: with_earlier(folder, source, axes, asked, made))
     before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
-    first = {point.key: number for number, point in reversed(list(enumerate(points)))}  # equal points are one
-    missing = by_first(comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar)))
+    first = {
+        point.key: number for number, point in reversed(list(enumerate(points)))
+    }  # equal points are one
+    missing = by_first(
+        comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar))
+    )
     if part:
         missing = [number for number in missing if number - before in share]
     if comm.rank == 0:
         also = f" and {before} there" if before else ""
-        say(f"{len(asked)} points{also}, {len(missing)} to compute on {comm.size} rank{'s' * (comm.size > 1)}")
+        say(
+            f"{len(asked)} points{also}, {len(missing)} to compute on {comm.size} rank{'s' * (comm.size > 1)}"
+        )
         if again := sum(files[number].exists() for number in missing):
-            say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
+            say(
+                f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged"
+            )
     shared = Known(columns=COLUMNS if scalar else CURVE)
 
     def chain_computed(chain: Chain) -> Iterator[str]:
@@ -148,7 +176,11 @@ def sweep(
             yield f"{place}  {points[number].label}: {_words(outcome, scalar)}, {outcome.wall_s:.1f} s"
 
     compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
-    done = [(point, outcome) for point, file in zip(points, files, strict=True) if (outcome := kept_outcome(file))]
+    done = [
+        (point, outcome)
+        for point, file in zip(points, files, strict=True)
+        if (outcome := kept_outcome(file))
+    ]
     assert part or len(done) == len(points)
     if comm.rank == 0 and len(done) < len(points):
         say(f"{len(points) - len(done)} of {len(points)} points are left to other parts")
@@ -222,20 +254,32 @@ def make_chains(
         return [[Link(number, 0.0, points[number].case)] for number in missing]
     lines: dict[tuple[str, ...], list[int]] = {}
     for number, point in enumerate(points):
-        lines.setdefault(tuple(v for key, v in point.values.items() if key not in axis.keys), []).append(number)
-    return [chain for line in lines.values() for chain in _chains_of(line, axis, points, set(missing))]
+        lines.setdefault(
+            tuple(v for key, v in point.values.items() if key not in axis.keys), []
+        ).append(number)
+    return [
+        chain for line in lines.values() for chain in _chains_of(line, axis, points, set(missing))
+    ]
 
 
-def _chains_of(line: list[int], axis: Axis, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
+def _chains_of(
+    line: list[int], axis: Axis, points: Sequence[SweepPoint], missing: set[int]
+) -> list[Chain]:
     """The missing points along the axis, as one chain if their folds can be followed."""
     key = axis.keys[0]
-    wanted = [Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing]
+    wanted = [
+        Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing
+    ]
     one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
-    followed = all(has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
+    followed = all(
+        has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted
+    )
     if len(wanted) < 2 or not followed:
         return [[link] for link in wanted]
     common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
-    chain = [replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted]
+    chain = [
+        replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted
+    ]
     return [sorted(chain, key=lambda link: link.at)]
 
 
@@ -253,7 +297,8 @@ class Known:
     columns
         Those of every run that outcomes keep.
     first
-        The first fold of the last chain, from which that of the next one is followed if it has the same mesh.
+        The first fold of the last chain, from which that of the next one is followed if it has the
+        same mesh.
     """
 
     columns: Sequence[str] = CURVE
@@ -270,7 +315,9 @@ def run_chain(chain: Chain, folds: Known) -> Iterator[tuple[int, Outcome]]:
         if continuation:
             outcome, spent = _by_fold(continuation, link, folds, start, same_mesh=begun)
         if not outcome:
-            outcome, continuation = _by_path(link, folds.columns, spent, start, go_on=link is not chain[-1])
+            outcome, continuation = _by_path(
+                link, folds.columns, spent, start, go_on=link is not chain[-1]
+            )
         if begun:
             folds.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
@@ -311,7 +358,11 @@ def _by_path(
 
 def _begun(at: float, result: Result) -> Continuation | None:
     last = result.rows[result.end]
-    if last["label"] != "fold" or last["amplitude"] != "pressure" or last["p_over_pc"] != result.knockdown:
+    if (
+        last["label"] != "fold"
+        or last["amplitude"] != "pressure"
+        or last["p_over_pc"] != result.knockdown
+    ):
         return None
     try:
         return Continuation(at, result.scene, result.last)
@@ -332,11 +383,15 @@ def with_earlier(
     keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
     earlier = _earlier(folder, keys, base)
     asked = [[point.values[axis.keys[0]] for axis in axes] for point in points]
-    merged = [Axis(axis.keys, tuple(v[i] for v in (*asked, *earlier))) for i, axis in enumerate(axes)]
+    merged = [
+        Axis(axis.keys, tuple(v[i] for v in (*asked, *earlier))) for i, axis in enumerate(axes)
+    ]
     places = {_place(values, merged) for values in asked}
     left = [values for values in earlier if _place(values, merged) not in places]
     if (count := len(left) + len(asked)) > MOST_POINTS:
-        raise CaseError(f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}")
+        raise CaseError(
+            f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}"
+        )
     write_object(folder / NAME, asdict(Listed(keys, base, [*left, *asked])))
     return [*(make_point(source, axes, values, made) for values in left), *points]
 
@@ -349,7 +404,9 @@ def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Listed:
-    """What sweep.json says: the swept keys, a hash of the case without them, and the values of all points."""
+    """What sweep.json says: the swept keys, a hash of the case without them, and the values of all
+    points.
+    """
 
     keys: list[list[str]]
     base: str
@@ -361,7 +418,9 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
     file = folder / NAME
     if not file.exists():
         if (folder / TABLE).exists() and (folder / TABLE).stat().st_size:
-            raise CaseError(f"--out {folder}: has a sweep.csv of an earlier version; give another folder")
+            raise CaseError(
+                f"--out {folder}: has a sweep.csv of an earlier version; give another folder"
+            )
         return []
     try:
         listed = TypeAdapter(Listed).validate_python(read_object(file))
@@ -371,7 +430,9 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
         raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
     if listed.keys != keys:
         said = " and ".join("+".join(each) for each in listed.keys)
-        raise CaseError(f"--out {folder}: has a sweep over {said}, which is kept; give another folder for other keys")
+        raise CaseError(
+            f"--out {folder}: has a sweep over {said}, which is kept; give another folder for other keys"
+        )
     if listed.base != base:
         raise CaseError(
             f"--out {folder}: has a sweep of another case or other --set, which is kept; give another folder"
@@ -393,27 +454,60 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
 
 
 def _write(
-    axes: Sequence[Axis], done: Sequence[tuple[SweepPoint, Outcome]], scalar: Scalar | None, folder: Path
+    axes: Sequence[Axis],
+    done: Sequence[tuple[SweepPoint, Outcome]],
+    scalar: Scalar | None,
+    folder: Path,
 ) -> None:
     """Write the tables and the picture.
 
-    In sweep.csv values with units are columns of numbers too, and so are the results of a case with units.
+    In sweep.csv values with units are columns of numbers too, and so are the results of a case with
+    units.
     """
     points, outcomes = [point for point, _ in done], [outcome for _, outcome in done]
     swept = tuple(points[0].values)
     rows = [
-        {**point.values, **sweep_row(outcome), "point": point.key, **_numbers(axes, point), **_in_units(outcome)}
+        {
+            **point.values,
+            **sweep_row(outcome),
+            "point": point.key,
+            **_numbers(axes, point),
+            **_in_units(outcome),
+        }
         for point, outcome in done
     ]
     results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
-    rows = [row | {"result": value} for row, value in zip(rows, results, strict=True)] if results else rows
-    first = (*swept, "k_d", *OF_LIMIT, "stopped", "found", "factorisations", "dofs", "wall_s", "point", "barrier")
-    write_csv(rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE)
+    rows = (
+        [row | {"result": value} for row, value in zip(rows, results, strict=True)]
+        if results
+        else rows
+    )
+    first = (
+        *swept,
+        "k_d",
+        *OF_LIMIT,
+        "stopped",
+        "found",
+        "factorisations",
+        "dofs",
+        "wall_s",
+        "point",
+        "barrier",
+    )
+    write_csv(
+        rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE
+    )
     lines = [{**point.values, **row} for point, outcome in done for row in outcome.curve]
     curves = [key for key in CURVE if any(key in line for line in lines)]
     own = [key for line in lines for key in line if key not in COLUMNS]
     write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *own))), folder / CURVES)
-    draw_sweep(axes, points, outcomes, folder / PICTURE, (scalar.name, results) if scalar and results else None)
+    draw_sweep(
+        axes,
+        points,
+        outcomes,
+        folder / PICTURE,
+        (scalar.name, results) if scalar and results else None,
+    )
 
 
 def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:

@@ -23,7 +23,11 @@ LEGEND_ROWS = 16
 STYLES = ("-", "--", ":", "-.")
 MAPPED = 3  # least different values of both axes of a map
 SMOOTH = 8  # least for contours; fewer are cells with their values
-WRITTEN, LONGEST, BRIGHT = 9, 5, 0.6  # most columns and digits of written values; colours from here on are bright
+WRITTEN, LONGEST, BRIGHT = (
+    9,
+    5,
+    0.6,
+)  # most columns and digits of written values; colours from here on are bright
 KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E h R^2$)"
 
 
@@ -34,7 +38,8 @@ class Results:
     Attributes
     ----------
     size, measured
-        A second scale in the case's units: its factor, and its label; 0 if there is none for all points.
+        A second scale in the case's units: its factor, and its label; 0 if there is none for all
+        points.
     """
 
     values: Sequence[float | None]
@@ -50,19 +55,24 @@ def draw_sweep(
     file: Path,
     asked: tuple[str, Sequence[float | None]] | None = None,
 ) -> None:
-    """Draw one line for each combination of the values that are not on the horizontal axis, or a map.
+    """Draw one line for each combination of the values that are not on the horizontal axis, or a
+    map.
 
     Parameters
     ----------
     asked
-        The name of a result and its value at each point; None draws energy barriers, knockdown factors or curves.
+        The name of a result and its value at each point; None draws energy barriers, knockdown
+        factors or curves.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    axes = [Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points))) for axis in axes]
+    axes = [
+        Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points)))
+        for axis in axes
+    ]
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     results, mapped = _results(outcomes, asked), _is_map(axes)
     if mapped:
@@ -97,13 +107,19 @@ def _is_map(axes: Sequence[Axis]) -> bool:
     return len(axes) == 2 and all(len(set(axis.numbers or ())) >= MAPPED for axis in axes)
 
 
-def _results(outcomes: Sequence[Outcome], asked: tuple[str, Sequence[float | None]] | None) -> Results | None:
-    """The result that is asked for; else energy barriers or knockdown factors, with a second scale; None without."""
+def _results(
+    outcomes: Sequence[Outcome], asked: tuple[str, Sequence[float | None]] | None
+) -> Results | None:
+    """The result that is asked for; else energy barriers or knockdown factors, with a second scale;
+    None without.
+    """
     if asked and asked[0] not in ("knockdown", "barrier"):
         return Results(asked[1], asked[0])
     barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
     if any(value is not None for value in barriers):
-        return Results(barriers, BARRIER, _common(outcomes, "unit_energy_mJ"), "energy barrier  (mJ)")
+        return Results(
+            barriers, BARRIER, _common(outcomes, "unit_energy_mJ"), "energy barrier  (mJ)"
+        )
     if any(value is not None for value in knockdowns):
         size = _common(outcomes, "classical_pressure_Pa")
         return Results(knockdowns, KNOCKDOWN, size, "buckling pressure  (Pa)")
@@ -117,12 +133,17 @@ def _common(outcomes: Sequence[Outcome], name: str) -> float:
 
 
 def _ends(outcomes: Sequence[Outcome]) -> Results:
-    """What the last point of each curve has: its load, or its displacement where all loads are the same."""
+    """What the last point of each curve has: its load, or its displacement where all loads are the
+    same.
+    """
     last = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
     shown = next((row for row in last if row), {})
     x, y = axes_of(str(shown.get("amplitude", "")) or "force", shown)
     drawn = y if np.ptp([y.on_axis(row) for row in last if y.name in row]) > 0 else x
-    return Results([drawn.on_axis(row) if drawn.name in row else None for row in last], f"{drawn.label} at the end")
+    return Results(
+        [drawn.on_axis(row) if drawn.name in row else None for row in last],
+        f"{drawn.label} at the end",
+    )
 
 
 def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
@@ -133,7 +154,10 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     x, y = (sorted(set(axis.numbers or ())) for axis in (columns, rows))
     grid = np.full((len(y), len(x)), np.nan)
     for point, value in zip(points, results.values, strict=True):
-        i, j = y.index(rows.number(point.values[rows.keys[0]])), x.index(columns.number(point.values[columns.keys[0]]))
+        i, j = (
+            y.index(rows.number(point.values[rows.keys[0]])),
+            x.index(columns.number(point.values[columns.keys[0]])),
+        )
         grid[i, j] = np.nan if value is None else value
     hole = np.isnan(grid)
     if min(grid.shape) < SMOOTH:
@@ -142,11 +166,18 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     else:
         levels = MaxNLocator(24, steps=[1, 2, 5, 10]).tick_values(np.nanmin(grid), np.nanmax(grid))
         filled = plot.contourf(x, y, grid, levels, cmap="viridis")
-        lines = plot.contour(x, y, grid, levels[::2], colors="white", linewidths=0.8)  # at steps of the colours
+        lines = plot.contour(
+            x, y, grid, levels[::2], colors="white", linewidths=0.8
+        )  # at steps of the colours
         plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
-    for hidden, style in ((False, {"marker": ".", "color": "0.15"}), (True, {"marker": "x", "color": "0.5"})):
-        plot.plot(*places[hole == hidden].T, linestyle="", markersize=4, clip_on=False, zorder=5, **style)
+    for hidden, style in (
+        (False, {"marker": ".", "color": "0.15"}),
+        (True, {"marker": "x", "color": "0.5"}),
+    ):
+        plot.plot(
+            *places[hole == hidden].T, linestyle="", markersize=4, clip_on=False, zorder=5, **style
+        )
     bar = plot.figure.colorbar(filled, ax=plot, label=results.label)
     if results.size:
         second = bar.ax.secondary_yaxis("left", functions=_scales(results.size))
@@ -171,7 +202,9 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
             )  # fmt: skip
 
 
-def _values(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
+def _values(
+    plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results
+) -> None:
     """Draw a number of each point over the last axis with numbers; points without it are left out."""
     axis = along(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
@@ -215,7 +248,8 @@ def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outco
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
     """The part of a curve in which an amplitude varied, and the point before it.
 
-    Branches are left out, and so are instabilities of excluded modes, whose rows are not in the order of the path.
+    Branches are left out, and so are instabilities of excluded modes, whose rows are not in the
+    order of the path.
     """
     first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
     part = curve[max(first - 1, 0) :] if first < len(curve) else []
@@ -224,4 +258,6 @@ def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
 
 def _label(point: SweepPoint, without: Axis | None) -> str:
     hidden = without.keys if without else ()
-    return ", ".join(f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden)
+    return ", ".join(
+        f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden
+    )

@@ -1,4 +1,5 @@
-"""A gripper that is its own image in the planes y = 0 and x = y: a hub of 1 x 1 with four arms of 3 x 0.5.
+"""A gripper that is its own image in the planes y = 0 and x = y: a hub of 1 x 1 with four arms of 3
+x 0.5.
 
 python3 meshes/scripts/gripper_closed.py > meshes/gripper_closed.msh
 
@@ -18,7 +19,11 @@ def eighth() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     x = HUB + LONG * np.arange(ALONG + 1) / ALONG
     places = [(0.0, 0.0), (HUB, HUB), *((a, b) for a in x for b in (0.0, WIDE))]
     hub = [(0, 2, 3), (0, 3, 1)]
-    arm = [each for i in range(2, 2 + 2 * ALONG, 2) for each in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
+    arm = [
+        each
+        for i in range(2, 2 + 2 * ALONG, 2)
+        for each in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))
+    ]
     return np.array(places), np.array(hub + arm), np.arange(len(hub + arm)) < len(hub)
 
 
@@ -32,7 +37,9 @@ def write(file: TextIO) -> None:
             all_triangles.append(triangles[:, ::sign] + len(places) * len(all_places))
             all_places.append(places * [1, sign] @ np.array([[c, s], [-s, c]]))
             groups.append(np.where(of_hub, 1, 2))
-    nodes, number = np.unique(np.round(np.concatenate(all_places), 9) + 0.0, axis=0, return_inverse=True)
+    nodes, number = np.unique(
+        np.round(np.concatenate(all_places), 9) + 0.0, axis=0, return_inverse=True
+    )
     cells, group = number.reshape(-1)[np.concatenate(all_triangles)], np.concatenate(groups)
     sides = np.sort(np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]), axis=1)
     sides, count = np.unique(sides, axis=0, return_counts=True)

@@ -17,13 +17,25 @@ from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.simulate.scene import Scene
 
 CAP = {
-    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.01, "polar": 12.0, "poisson_ratio": 0.3},
+    "shell": {
+        "geometry": "cap",
+        "radius": 1.0,
+        "thickness": 0.01,
+        "polar": 12.0,
+        "poisson_ratio": 0.3,
+    },
     "boundary": {"rim": "clamped"},
     "symmetry": "axisymmetric",
     "loading": {"kind": "pressure", "until": "limit"},
 }
 RING = CAP | {  # a pressure without potential, and its skew tangent
-    "shell": {"geometry": "cylinder", "radius": 1.0, "length": 0.8, "thickness": 0.02, "poisson_ratio": 0.2},
+    "shell": {
+        "geometry": "cylinder",
+        "radius": 1.0,
+        "length": 0.8,
+        "thickness": 0.02,
+        "poisson_ratio": 0.2,
+    },
     "boundary": {"bottom": "clamped"},
 }
 
@@ -46,8 +58,12 @@ def _evaluated(case: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
 
 
 @pytest.mark.parametrize("case", [CAP, RING])
-def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its residual, tangent and energies are, to the last bit, those of forms that are compiled for it alone."""
+def test_a_scene_with_other_numbers_compiles_nothing(
+    case: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its residual, tangent and energies are, to the last bit, those of forms that are compiled for
+    it alone.
+    """
     other = case | {"shell": case["shell"] | {"poisson_ratio": 0.37, "thickness": 0.013}}
     monkeypatch.setattr(kernels, "_compiled_forms", {})
     alone = _evaluated(other)
@@ -63,8 +79,12 @@ def test_a_scene_with_other_numbers_compiles_nothing(case: dict[str, Any], monke
     assert not np.allclose(alone[-1], first[-1], rtol=1e-2, atol=0)
 
 
-def test_progress_where_nobody_listens(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Scenes in Python, sweeps, boundaries: a line on standard error, and the next one half a minute later."""
+def test_progress_where_nobody_listens(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Scenes in Python, sweeps, boundaries: a line on standard error, and the next one half a
+    minute later.
+    """
     clock = iter([40.0, 40.0, 50.0, 70.0, 70.0])
     monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(clock))
     status = kernels.Status()
@@ -83,7 +103,10 @@ def test_what_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         points = Points(1)
         z = points.field(1)
         z.x.array[:] = 0.5
-        begun = [point_values(f"{power}", z[0] ** power * ufl.as_vector([1.0]), log) for power in (2, 3, 4)]
+        begun = [
+            point_values(f"{power}", z[0] ** power * ufl.as_vector([1.0]), log)
+            for power in (2, 3, 4)
+        ]
         with kernels.reported(told.append):
             return [float(points.evaluate(each, 1)[0, 0]) for each in begun]
 

@@ -8,7 +8,9 @@ from magshell_fenicsx.assembly.motion import Motion, moved, turned
 RNG = np.random.default_rng(0)
 X = RNG.standard_normal((5, 3))
 SHIFT = Motion("a", np.array([0.3, -0.2, 0.1]), np.zeros(3), np.zeros(3))
-TURN = Motion("b", np.array([0.0, 0.4, 0.2]), np.array([0.5, -0.7, 1.1]), np.array([1.0, 0.0, -0.5]))
+TURN = Motion(
+    "b", np.array([0.0, 0.4, 0.2]), np.array([0.5, -0.7, 1.1]), np.array([1.0, 0.0, -0.5])
+)
 OTHER = Motion("c", np.zeros(3), np.array([-0.4, 0.9, 0.2]), np.array([0.2, 0.3, 0.0]))
 MOTIONS = (SHIFT, TURN, OTHER)
 STEP = 1e-5
@@ -27,10 +29,14 @@ def test_derivatives(mu: dict[str, float]) -> None:
 
 
 def test_rigid() -> None:
-    """Distances stay, the arm of each place turns by the rotation of all motions, and a quarter turn is one."""
+    """Distances stay, the arm of each place turns by the rotation of all motions, and a quarter
+    turn is one.
+    """
     mu = {"a": 0.7, "b": -1.3, "c": 2.0}
     here, Q = moved(MOTIONS, mu, X).x, turned(MOTIONS, mu).x.T
     np.testing.assert_allclose(here - here[0], (X - X[0]) @ Q.T, atol=1e-14)
     np.testing.assert_allclose(Q @ Q.T, np.eye(3), atol=1e-15)
     quarter = Motion("d", np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(moved([quarter], {"d": 1.0}, np.array([[2.0, 0.0, 5.0]])).x, [[1.0, 1.0, 5.0]])
+    np.testing.assert_allclose(
+        moved([quarter], {"d": 1.0}, np.array([[2.0, 0.0, 5.0]])).x, [[1.0, 1.0, 5.0]]
+    )

@@ -1,4 +1,6 @@
-"""Kernels for many points in one call against NumPy, and their derivatives against those of UFL by dolfinx."""
+"""Kernels for many points in one call against NumPy, and their derivatives against those of UFL by
+dolfinx.
+"""
 
 import shutil
 from collections.abc import Callable
@@ -11,15 +13,25 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_gradient, point_hessian, point_values
+from magshell_fenicsx.assembly.point_kernels import (
+    Pairs,
+    Points,
+    point_gradient,
+    point_hessian,
+    point_values,
+)
 from magshell_fenicsx.assembly.scalars import Scalars, terminals_of
 
 Array = np.ndarray
 i, j, k = ufl.indices(3)
 CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
     "roots and powers": (
-        lambda a, b, c: ufl.as_vector([ufl.sqrt(1 + a[0] ** 2) * b**1.5 / c, c**-2 * a[1], 2 * c, b ** a[0]]),
-        lambda a, b, c: np.stack([np.sqrt(1 + a[0] ** 2) * b**1.5 / c, a[1] / c**2, 2 * c + 0 * b, b ** a[0]], axis=1),
+        lambda a, b, c: ufl.as_vector(
+            [ufl.sqrt(1 + a[0] ** 2) * b**1.5 / c, c**-2 * a[1], 2 * c, b ** a[0]]
+        ),
+        lambda a, b, c: np.stack(
+            [np.sqrt(1 + a[0] ** 2) * b**1.5 / c, a[1] / c**2, 2 * c + 0 * b, b ** a[0]], axis=1
+        ),
     ),
     "an angle": (
         lambda a, b, c: ufl.as_vector([c * ufl.atan2(a[0], b), a[1]]),
@@ -30,7 +42,10 @@ CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
             [
                 ufl.conditional(ufl.gt(a[0], c), b, -b),
                 ufl.conditional(ufl.And(ufl.lt(a[0], c), ufl.Not(ufl.ge(a[1], 0.5))), 1.0, c),
-                ufl.max_value(a[0], a[1]) - ufl.min_value(a[0], c) + abs(a[0] - c) + ufl.sign(a[1] - c),
+                ufl.max_value(a[0], a[1])
+                - ufl.min_value(a[0], c)
+                + abs(a[0] - c)
+                + ufl.sign(a[1] - c),
             ]
         ),
         lambda a, b, c: np.stack(
@@ -51,7 +66,12 @@ CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
             ]
         ),
         lambda a, b, c: np.stack(
-            [a[0] + 3 * b + 2 * c + a[1] * b, a[0] * a[1] + a[0] ** 2 + a[1] ** 2, a[0] * a[1] - b * c], axis=1
+            [
+                a[0] + 3 * b + 2 * c + a[1] * b,
+                a[0] * a[1] + a[0] ** 2 + a[1] ** 2,
+                a[0] * a[1] - b * c,
+            ],
+            axis=1,
         ),
     ),
 }
@@ -76,14 +96,27 @@ def test_against_numpy(name: str, count: int) -> None:
 
 
 ENERGIES: dict[str, Callable[[Any], Expr]] = {  # of a vector of six numbers in (0, 1)
-    "powers": lambda z: z[0] ** 3 * z[1] ** -2 + z[2] ** 1.5 / (1 + z[3]) + (1 + z[4]) ** z[5] + z[0] ** 0.3,
+    "powers": lambda z: (
+        z[0] ** 3 * z[1] ** -2 + z[2] ** 1.5 / (1 + z[3]) + (1 + z[4]) ** z[5] + z[0] ** 0.3
+    ),
     "roots": lambda z: ufl.sqrt(ufl.dot(z, z)) * ufl.ln(1 + z[0] * z[5]) + ufl.exp(z[1] * z[2]),
-    "angles": lambda z: ufl.atan2(z[0], z[1]) * ufl.sin(z[2]) + ufl.cos(z[3] * z[4]) * ufl.tan(z[5]),
-    "arcs": lambda z: ufl.asin(z[0] / 2) * ufl.acos(z[1] / 2) + ufl.atan(z[2] * z[3]) + ufl.erf(z[4]),
-    "hyperbolas": lambda z: ufl.sinh(z[0]) * ufl.cosh(z[1]) + ufl.tanh(z[2] * z[3]) * ufl.bessel_J(1, z[4]),
-    "choices": lambda z: ufl.conditional(ufl.gt(z[0], z[1]), z[0] ** 2 * z[2], z[1] * z[3]) * abs(z[4] - z[5]),
+    "angles": lambda z: (
+        ufl.atan2(z[0], z[1]) * ufl.sin(z[2]) + ufl.cos(z[3] * z[4]) * ufl.tan(z[5])
+    ),
+    "arcs": lambda z: (
+        ufl.asin(z[0] / 2) * ufl.acos(z[1] / 2) + ufl.atan(z[2] * z[3]) + ufl.erf(z[4])
+    ),
+    "hyperbolas": lambda z: (
+        ufl.sinh(z[0]) * ufl.cosh(z[1]) + ufl.tanh(z[2] * z[3]) * ufl.bessel_J(1, z[4])
+    ),
+    "choices": lambda z: (
+        ufl.conditional(ufl.gt(z[0], z[1]), z[0] ** 2 * z[2], z[1] * z[3]) * abs(z[4] - z[5])
+    ),
     "normals": lambda z: (
-        ufl.cross(ufl.as_vector([z[i] for i in range(3)]), ufl.as_vector([z[i] for i in range(3, 6)]))[0] ** 2
+        ufl.cross(
+            ufl.as_vector([z[i] for i in range(3)]), ufl.as_vector([z[i] for i in range(3, 6)])
+        )[0]
+        ** 2
         / ufl.dot(z, z)
     ),
 }
@@ -91,7 +124,9 @@ ENERGIES: dict[str, Callable[[Any], Expr]] = {  # of a vector of six numbers in 
 
 @pytest.mark.parametrize("name", ENERGIES)
 def test_derivatives_against_ufl(name: str) -> None:
-    """Every rule of differentiation, for gradient and Hessian, by dolfinx's own evaluation of UFL's derivatives."""
+    """Every rule of differentiation, for gradient and Hessian, by dolfinx's own evaluation of UFL's
+    derivatives.
+    """
     points, log = Points(7), KernelLog()
     z = points.field(6)
     z.x.array[:] = np.random.default_rng(2).random(42)
@@ -112,9 +147,13 @@ def test_derivatives_against_ufl(name: str) -> None:
 
     gradient = points.evaluate(point_gradient(name, [(W, z)], log), 7).copy()
     assert gradient == pytest.approx(by_dolfinx(first), rel=1e-12, abs=1e-12)
-    blocks = points.evaluate(point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, at_zero=False), 7)
+    blocks = points.evaluate(
+        point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, at_zero=False), 7
+    )
     wanted = by_dolfinx(second).reshape(7, 2, 3, 2, 3)
-    whole = blocks[:, :18].reshape(7, 6, 3)  # components (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2) of three pairs
+    whole = blocks[:, :18].reshape(
+        7, 6, 3
+    )  # components (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2) of three pairs
     for number, (c, d) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
         for pair, (a, b) in enumerate([(0, 0), (0, 1), (1, 1)]):
             both = (wanted[:, a, c, b, d] + wanted[:, a, d, b, c]) / 2
@@ -133,7 +172,9 @@ def test_what_is_not_picked_needs_no_derivative() -> None:
     W = ufl.conditional(ufl.gt(z[0], 0), ufl.sqrt(z[0]), 0.0) ** 2
     gradient = points.evaluate(point_gradient("root", [(W, z)], log), 4).copy()
     assert gradient[:, 0] == pytest.approx([0, 1, 0, 1])
-    hessian = points.evaluate(point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, at_zero=False), 4)
+    hessian = points.evaluate(
+        point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, at_zero=False), 4
+    )
     assert hessian == pytest.approx(0, abs=1e-15)
 
 
@@ -144,7 +185,9 @@ def test_at_zero() -> None:
     z.x.array[:], a.x.array[:] = 0.3, [1, 2, 3]
     W = a[0] * z[0] ** 2 / 2 + z[1] * z[2] * ufl.exp(z[0])
     found = points.evaluate(point_hessian("zero", W, z, 1, Pairs(((0, 0),)), log, at_zero=True), 3)
-    assert found == pytest.approx(np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]]))
+    assert found == pytest.approx(
+        np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]])
+    )
 
 
 def test_each_operation_occurs_once() -> None:
@@ -159,9 +202,14 @@ def test_each_operation_occurs_once() -> None:
 
 
 def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of other fields and constants; another number, order of arguments or result is another kernel."""
+    """Of other fields and constants; another number, order of arguments or result is another
+    kernel.
+    """
     translated = list[Expr]()
-    components, new = Scalars.components, np.random.default_rng().uniform()  # an earlier run may have left a kernel
+    components, new = (
+        Scalars.components,
+        np.random.default_rng().uniform(),
+    )  # an earlier run may have left a kernel
 
     def counted(self: Scalars, e: Expr, *others: Any) -> Any:
         translated.append(e)
@@ -183,11 +231,15 @@ def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) 
     assert len(translated) == 1
     assert value(first, 1, 4, 6, 2, 3) == pytest.approx(3 * 1 * 2 + 4 * new)
     assert len(translated) == 1
-    assert value(lambda a, b, c: first(b, a, c), 2, 3, 4, 5, 7) == pytest.approx(7 * 4 * 3 + 5 * new)
-    assert value(lambda a, b, c: first(a, b, c) + ufl.as_vector([1e-9]), 2, 3, 4, 5, 7) > 70 + 3 * new
-    assert value(lambda a, b, c: first(a, b, c) + ufl.as_vector([2e-9]), 2, 3, 4, 5, 7) == pytest.approx(
-        70 + 3 * new + 2e-9, rel=1e-13
+    assert value(lambda a, b, c: first(b, a, c), 2, 3, 4, 5, 7) == pytest.approx(
+        7 * 4 * 3 + 5 * new
     )
+    assert (
+        value(lambda a, b, c: first(a, b, c) + ufl.as_vector([1e-9]), 2, 3, 4, 5, 7) > 70 + 3 * new
+    )
+    assert value(
+        lambda a, b, c: first(a, b, c) + ufl.as_vector([2e-9]), 2, 3, 4, 5, 7
+    ) == pytest.approx(70 + 3 * new + 2e-9, rel=1e-13)
     assert len(translated) == 4
 
 

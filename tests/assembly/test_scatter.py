@@ -15,7 +15,9 @@ from magshell_fenicsx.platform.native import native
 
 
 def space(degree: int) -> fem.FunctionSpace:
-    return fem.functionspace(mesh.create_unit_square(MPI.COMM_SELF, 3, 2), ("Lagrange", degree, (3,)))
+    return fem.functionspace(
+        mesh.create_unit_square(MPI.COMM_SELF, 3, 2), ("Lagrange", degree, (3,))
+    )
 
 
 def neighbours(V: fem.FunctionSpace) -> tuple[np.ndarray, ...]:
@@ -25,7 +27,9 @@ def neighbours(V: fem.FunctionSpace) -> tuple[np.ndarray, ...]:
     return tuple(np.array([pair for pair in pairs if len(pair) == 2]).T)
 
 
-def dense(V: fem.FunctionSpace, same: np.ndarray, cells: tuple[np.ndarray, ...], cross: np.ndarray) -> np.ndarray:
+def dense(
+    V: fem.FunctionSpace, same: np.ndarray, cells: tuple[np.ndarray, ...], cross: np.ndarray
+) -> np.ndarray:
     """The definitions of `BlockMatrix.add_cells` and `add_coupling`, entry by entry."""
     dofs, size = 3 * V.dofmap.list, 3 * V.dofmap.index_map.size_local
     functions, K = dofs.shape[1], np.zeros((size, size))
@@ -85,7 +89,9 @@ def conditions(V: fem.FunctionSpace, held: str) -> list[fem.DirichletBC]:
     return []
 
 
-def test_code_that_cannot_be_compiled_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_code_that_cannot_be_compiled_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     source = tmp_path / "wrong.c"
     source.write_text("int f(void) { return nothing; }")
     with pytest.raises(subprocess.CalledProcessError):

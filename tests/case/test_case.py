@@ -38,10 +38,19 @@ def test_numbers_with_exponents_are_numbers(file: Path) -> None:
 
 
 def test_words_that_yaml_reads_as_true_and_false_are_keys(file: Path) -> None:
-    """`on` and `no` are true and false in YAML 1.1, and 1 is a number: as names of things they are themselves."""
-    file.write_text("base: &base {until: target, 1: a}\nloading: {<<: *base, on: {no: off}}\n", encoding="utf-8")
+    """`on` and `no` are true and false in YAML 1.1, and 1 is a number: as names of things they are
+    themselves.
+    """
+    file.write_text(
+        "base: &base {until: target, 1: a}\nloading: {<<: *base, on: {no: off}}\n", encoding="utf-8"
+    )
     read = read_source(file, ["loading.hold={y: load}"])
-    assert read.data["loading"] == {"until": "target", "1": "a", "on": {"no": False}, "hold": {"y": "load"}}
+    assert read.data["loading"] == {
+        "until": "target",
+        "1": "a",
+        "on": {"no": False},
+        "hold": {"y": "load"},
+    }
 
 
 def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
@@ -76,7 +85,10 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
         ("magnetic.lambda_m=a lot", "'a lot'"),
         ("magnetic.energy=secnd", "must be 'full', 'first'"),
         ("magnetic.remanent.flux_density=60 mT", "not both"),
-        ("magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 1 T}}", "youngs_modulus is needed"),
+        (
+            "magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 1 T}}",
+            "youngs_modulus is needed",
+        ),
         ("magnetic={remanent: {flux_density: 0 T}, applied: {flux_density: 1 T}}", "length zero"),
         ("magnetic.remanent.kind=radiall", "'radiall'"),
         ("magnetic.remanent={kind: radial, polar: 3}", "belong to kind: uniform"),
@@ -89,7 +101,10 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
             "remanence of length zero",
         ),
         ("magnetic.applied.gradient=[[1, 0], [0, 1], [0, 0]]", "three rows of three"),
-        ("magnetic={lambda_m: 1, energy: first, applied: {gradient: [[1,0,0],[0,0,0],[0,0,-1]]}}", "energy: full"),
+        (
+            "magnetic={lambda_m: 1, energy: first, applied: {gradient: [[1,0,0],[0,0,0],[0,0,-1]]}}",
+            "energy: full",
+        ),
         ("loading={kind: field, control: load, until: points}", "goes with control: arc"),
         ("loading={kind: rotation, to: {polar: 180}}", "neither parallel nor opposite"),
         ("loading.kind=poke", "allowed: pressure, indentation, field, rotation"),
@@ -115,7 +130,10 @@ def test_mistakes_are_named(file: Path, setting: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (GOOD.replace("width", "widht"), ":5: shell.defect.widht: unknown key; did you mean width?"),
+        (
+            GOOD.replace("width", "widht"),
+            ":5: shell.defect.widht: unknown key; did you mean width?",
+        ),
         (GOOD.replace("90", "-90"), ":3: shell.radius_to_thickness: -90: must be"),
         (GOOD.replace("boundary", "loading"), ":8: loading is given twice"),
         (GOOD.replace("boundary: {equator: clamped}\n", ""), "boundary: is missing"),
@@ -154,16 +172,28 @@ def test_a_copy_has_a_programme_of_its_own() -> None:
 
 
 def test_changes_of_several_numbers_keep_each_other() -> None:
-    """Numbers of the shell and a target over one of them: all as in a case that has them from the start."""
+    """Numbers of the shell and a target over one of them: all as in a case that has them from the
+    start.
+    """
     values = {
         "shell.poisson_ratio": 0.3,
         "loading.pressure": 0.2,
         "shell.thickness": 0.8e-3,
         "shell.youngs_modulus": 2e6,
     }
-    shell = {"geometry": "cap", "radius": "20 mm", "polar": 45, "thickness": "0.7 mm", "youngs_modulus": "1 MPa"}
+    shell = {
+        "geometry": "cap",
+        "radius": "20 mm",
+        "polar": 45,
+        "thickness": "0.7 mm",
+        "youngs_modulus": "1 MPa",
+    }
     loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1}
-    data = {"shell": {**shell, "poisson_ratio": 0.5}, "boundary": {"rim": "clamped"}, "loading": loading}
+    data = {
+        "shell": {**shell, "poisson_ratio": 0.5},
+        "boundary": {"rim": "clamped"},
+        "loading": loading,
+    }
     found = changed(Case.from_source(data), values)
     data["shell"] |= {"poisson_ratio": 0.3, "thickness": "0.8 mm", "youngs_modulus": "2 MPa"}
     data["loading"]["pressure"] = 0.2

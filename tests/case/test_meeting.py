@@ -19,8 +19,16 @@ PRESSED = {"kind": "pressure", "pressure": 0.1, "until": "target", "points": 1}
 
 
 def cells_near_poles(**others: Any) -> Array:
-    """Mean length of the sides of the cells around the poles of two caps, over sqrt(R h) of the lower and the upper."""
-    cap = {"geometry": "cap", "polar": 20, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    """Mean length of the sides of the cells around the poles of two caps, over sqrt(R h) of the
+    lower and the upper.
+    """
+    cap = {
+        "geometry": "cap",
+        "polar": 20,
+        "thickness": h,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
+    }
     over = {"position": [0, 0, 2.4 + 1.2 * h], "axis": {"polar": 180}}
     shells = {
         "lower": {"shell": cap | {"radius": 1}, **RIM},
@@ -32,7 +40,9 @@ def cells_near_poles(**others: Any) -> Array:
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
     middle, lower = corners.mean(axis=1), corners[:, :, 2].max(axis=1) <= 1
     near = np.hypot(*middle[:, :2].T) < np.sqrt(h)
-    return np.array([sides[near & lower].mean() / np.sqrt(h), sides[near & ~lower].mean() / np.sqrt(1.4 * h)])
+    return np.array(
+        [sides[near & lower].mean() / np.sqrt(h), sides[near & ~lower].mean() / np.sqrt(1.4 * h)]
+    )
 
 
 def test_cells_are_small_where_caps_meet() -> None:
@@ -43,15 +53,22 @@ def test_cells_are_small_where_caps_meet() -> None:
 
 
 def test_faces_that_are_parallel_have_no_place_where_they_meet() -> None:
-    """A line of places across a flat one is nearest at its one end, if it is inclined; all are if not."""
+    """A line of places across a flat one is nearest at its one end, if it is inclined; all are if
+    not.
+    """
     x = np.linspace(0, 1, 41)
     flat, inclined = np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x, 0.1 + x])
     thickness, apart = {"a": 0.1, "b": 0.1}, {"a": 0.2, "b": 0.2}
     found = meetings([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart, {})
     assert [each.tolist() for each in found["b"]] == [[0, 0, 0.1]]
-    far = meetings([["a", "b"]], {"a": flat, "b": inclined + np.array([0, 0, 3])}, thickness, apart, {})
+    far = meetings(
+        [["a", "b"]], {"a": flat, "b": inclined + np.array([0, 0, 3])}, thickness, apart, {}
+    )
     assert far == {"a": [], "b": []}
-    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart, {}) == {"a": [], "b": []}
+    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart, {}) == {
+        "a": [],
+        "b": [],
+    }
 
 
 @pytest.mark.parametrize("off", [0.0, 0.17])
@@ -68,18 +85,34 @@ def test_the_place_is_that_of_spheres(off: float) -> None:
 
     places = {"a": cap.sample(), "b": above(cap.sample())}
     charted = {"a": Charted(cap, lambda x: x, lambda x: x), "b": Charted(cap, above, under)}
-    found = meetings([["a", "b"]], places, dict.fromkeys("ab", 0.02), dict.fromkeys("ab", 0.3), charted)
+    found = meetings(
+        [["a", "b"]], places, dict.fromkeys("ab", 0.02), dict.fromkeys("ab", 0.3), charted
+    )
     assert found["a"][0] == pytest.approx(centre / 2.03, abs=1e-3)
     assert found["b"][0] == pytest.approx(centre - centre / 2.03, abs=1e-3)
 
 
 def test_the_place_of_thick_faces() -> None:
     """A flat sheet above one that is thickest beside the middle: there; 1e-4."""
-    plate = {"geometry": "plate", "length": 1, "width": 1, "thickness": h, "poisson_ratio": 0.3, "youngs_modulus": 1}
+    plate = {
+        "geometry": "plate",
+        "length": 1,
+        "width": 1,
+        "thickness": h,
+        "poisson_ratio": 0.3,
+        "youngs_modulus": 1,
+    }
     held = {"boundary": {"left": "clamped"}}
-    thick = {"shell": plate | {"thickness_factor": "1 + 3*exp(-20*((x - 0.3)**2 + (y - 0.6)**2))"}, **held}
+    thick = {
+        "shell": plate | {"thickness_factor": "1 + 3*exp(-20*((x - 0.3)**2 + (y - 0.6)**2))"},
+        **held,
+    }
     flat = {"shell": plate, "place": {"position": [0, 0, 3 * h]}, **held}
-    data = {"shells": {"thick": thick, "flat": flat}, "contact": [["thick", "flat"]], "loading": PRESSED}
+    data = {
+        "shells": {"thick": thick, "flat": flat},
+        "contact": [["thick", "flat"]],
+        "loading": PRESSED,
+    }
     several = Case.from_source(data).several
     assert several
     met = Members(several)._met

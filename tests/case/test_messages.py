@@ -1,4 +1,6 @@
-"""What a user reads who makes the mistakes of the first day: one message with place, key, value and what is allowed."""
+"""What a user reads who makes the mistakes of the first day: one message with place, key, value and
+what is allowed.
+"""
 
 from pathlib import Path
 
@@ -36,24 +38,51 @@ MISTAKES = [
         "loading={kind: indentation, at: {point: A}, depth: 1}",
         "loading.at.point: A: name it in points, with its place; ",
     ),
-    ("bodies={ball: {kind: sphere, radius: 6 mm, at: {polar: 50}}}", "bodies.ball.at.polar: 50 is not on the shell"),
+    (
+        "bodies={ball: {kind: sphere, radius: 6 mm, at: {polar: 50}}}",
+        "bodies.ball.at.polar: 50 is not on the shell",
+    ),
     (
         "shell={geometry: disc, radius: 1, thickness: 0.02, poisson_ratio: 0.3}",
         "shell: radius and thickness: give each a unit, or radius_to_thickness: 50 in their place",
     ),
-    ("shell.thickness=0.5", "cap.yaml:1: shell: give every length and youngs_modulus a unit, or none of them: thick"),
-    ("shell.youngs_modulus=1.3 mPa", "shell.youngs_modulus: '1.3 mPa': allowed are 1 Pa to 1e13 Pa (MPa: megapascal"),
-    (f"{MAGNET}.polarization=1.2", f'{MAGNET}.polarization: 1.2: needs a unit, for example "60 mT"'),
-    (f"{MAGNET}.polarization=[1 T, 2, 3 T]", f'{MAGNET}.polarization.1: 2: needs a unit, for example "60 mT"'),
-    (f"{MAGNET}.position=[60 mm, 0]", f"{MAGNET}.position: ['60 mm', 0]: must have at least 3 items, not 2"),
-    ("magnetic.applied.sources.1.height=1", "magnetic.applied.sources.1: the list has items 0 to 0"),
-    ("loading={kind: pressure, on: upper}", "loading.on: 'upper': must be a mapping, as {upper: outside} (Name of one"),
+    (
+        "shell.thickness=0.5",
+        "cap.yaml:1: shell: give every length and youngs_modulus a unit, or none of them: thick",
+    ),
+    (
+        "shell.youngs_modulus=1.3 mPa",
+        "shell.youngs_modulus: '1.3 mPa': allowed are 1 Pa to 1e13 Pa (MPa: megapascal",
+    ),
+    (
+        f"{MAGNET}.polarization=1.2",
+        f'{MAGNET}.polarization: 1.2: needs a unit, for example "60 mT"',
+    ),
+    (
+        f"{MAGNET}.polarization=[1 T, 2, 3 T]",
+        f'{MAGNET}.polarization.1: 2: needs a unit, for example "60 mT"',
+    ),
+    (
+        f"{MAGNET}.position=[60 mm, 0]",
+        f"{MAGNET}.position: ['60 mm', 0]: must have at least 3 items, not 2",
+    ),
+    (
+        "magnetic.applied.sources.1.height=1",
+        "magnetic.applied.sources.1: the list has items 0 to 0",
+    ),
+    (
+        "loading={kind: pressure, on: upper}",
+        "loading.on: 'upper': must be a mapping, as {upper: outside} (Name of one",
+    ),
     ("points=[tip]", "points: ['tip']: must be a mapping, as {tip: ...} (Name -> place"),
     (
         f"ensemble={{defects: {{{DEFECTS}, on: [upper]}}}}",
         "ensemble.defects.on: ['upper']: must be a valid string (Name of one of several",
     ),
-    ("shell.thickness_factor=[2]", "shell.thickness_factor: [2]: must be a valid string (Multiplies h)"),
+    (
+        "shell.thickness_factor=[2]",
+        "shell.thickness_factor: [2]: must be a valid string (Multiplies h)",
+    ),
     (
         'magnetic.remanent={kind: expression, flux_density: 60 mT, components: ["x", "y", "q"]}',
         "magnetic.remanent.components.2: 'q': allowed are numbers, x, y, z",

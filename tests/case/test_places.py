@@ -15,14 +15,28 @@ from conftest import CASES
             "      eest:",
             "magnetic.remanent.patches: eest: the surface has no such patch, only hub, east, ",
         ),
-        ("hub: clamped", "hob: clamped", "boundary.hob: the surface has no such edge, only east, hub, "),
+        (
+            "hub: clamped",
+            "hob: clamped",
+            "boundary.hob: the surface has no such edge, only east, hub, ",
+        ),
     ],
 )
-def test_names_of_a_mesh_file_have_a_line(tmp_path: Path, written: str, instead: str, message: str) -> None:
-    text = (CASES / "gripper.yaml").read_text(encoding="utf-8").replace("../meshes", str(CASES.parent / "meshes"))
+def test_names_of_a_mesh_file_have_a_line(
+    tmp_path: Path, written: str, instead: str, message: str
+) -> None:
+    text = (
+        (CASES / "gripper.yaml")
+        .read_text(encoding="utf-8")
+        .replace("../meshes", str(CASES.parent / "meshes"))
+    )
     file = tmp_path / "gripper.yaml"
     file.write_text(text.replace(written, instead), encoding="utf-8")
-    line = next(i for i, each in enumerate(file.read_text(encoding="utf-8").splitlines(), 1) if instead in each)
+    line = next(
+        i
+        for i, each in enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+        if instead in each
+    )
     for command in (("check", file), ("run", file, "--out", tmp_path / "out")):
         done = magshell(*command)
         assert done.returncode == 2
@@ -32,4 +46,6 @@ def test_names_of_a_mesh_file_have_a_line(tmp_path: Path, written: str, instead:
 def test_patches_of_a_setting_are_checked_before_a_run() -> None:
     setting = "natural={curvature: {easst: 1}}"
     done = magshell("check", CASES / "gripper.yaml", "--set", setting)
-    assert done.stderr.startswith(f"--set {setting}: natural.curvature: easst: the surface has no such patch, only hub")
+    assert done.stderr.startswith(
+        f"--set {setting}: natural.curvature: easst: the surface has no such patch, only hub"
+    )

@@ -16,15 +16,23 @@ def case(**sections: object) -> Case:
 
 
 def test_common_azimuth() -> None:
-    up, tilted, across = (Direction(polar=p, azimuth=a).vector() for p, a in ((0, 70), (30, 20), (30, 110)))
+    up, tilted, across = (
+        Direction(polar=p, azimuth=a).vector() for p, a in ((0, 70), (30, 20), (30, 110))
+    )
     assert common_azimuth([up]) == 0.0
     assert common_azimuth([up, tilted]) == pytest.approx(np.radians(20))
-    assert common_azimuth([tilted, Direction(polar=45, azimuth=200).vector()]) == pytest.approx(np.radians(20))
+    assert common_azimuth([tilted, Direction(polar=45, azimuth=200).vector()]) == pytest.approx(
+        np.radians(20)
+    )
     assert common_azimuth([tilted, across]) is None
 
 
 def test_coplanar_fields_give_a_half_shell_turned_into_its_mirror_plane() -> None:
-    field = {"lambda_m": 1e-3, "remanent": {"polar": 30, "azimuth": 20}, "applied": {"polar": -60, "azimuth": 20}}
+    field = {
+        "lambda_m": 1e-3,
+        "remanent": {"polar": 30, "azimuth": 20},
+        "applied": {"polar": -60, "azimuth": 20},
+    }
     problem = make_problem(case(magnetic=field, loading={"kind": "pressure"}))
     assert problem.half
     assert problem.loads.magnetic
@@ -48,9 +56,13 @@ def test_what_is_not_needed_is_left_out() -> None:
 
 
 def test_a_turning_field_keeps_its_magnitude() -> None:
-    """With `uniform: 2` both directions that it turns between are twice as long, and normal to each other."""
+    """With `uniform: 2` both directions that it turns between are twice as long, and normal to each
+    other.
+    """
     field = {"lambda_m": 1e-3, "applied": {"polar": 30, "uniform": 2}}
-    magnetic = make_problem(case(magnetic=field, loading={"kind": "rotation", "to": {"polar": 80}})).loads.magnetic
+    magnetic = make_problem(
+        case(magnetic=field, loading={"kind": "rotation", "to": {"polar": 80}})
+    ).loads.magnetic
     assert magnetic
     (across,) = magnetic.across
     assert [np.linalg.norm(magnetic.applied), np.linalg.norm(across)] == pytest.approx([2, 2])

@@ -1,4 +1,6 @@
-"""The schema of the case file, and the page that is made of it: current, complete, and of one mind with `Case`."""
+"""The schema of the case file, and the page that is made of it: current, complete, and of one mind
+with `Case`.
+"""
 
 import json
 from functools import cache
@@ -18,8 +20,13 @@ LENGTHS = "length: 1 m, width: 30 cm, thickness: 1e-2 m, youngs_modulus: 1.8 MPa
 
 
 def test_committed_schema_is_current() -> None:
-    """Else: magshell schema > docs/case.schema.json. Pydantic's versions differ in how they write 0.0."""
-    assert json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8")) == json.loads(schema_text())
+    """Else: magshell schema > docs/case.schema.json.
+
+    Pydantic's versions differ in how they write 0.0.
+    """
+    assert json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8")) == json.loads(
+        schema_text()
+    )
 
 
 def test_committed_page_is_current() -> None:
@@ -31,9 +38,15 @@ def test_every_key_is_described() -> None:
     """All but those with one value, which tell sections apart and are described with these."""
     whole = schema()
     sections = {"case": whole, **whole["$defs"]}
-    keys = [(name, key, part) for name, section in sections.items() for key, part in section["properties"].items()]
+    keys = [
+        (name, key, part)
+        for name, section in sections.items()
+        for key, part in section["properties"].items()
+    ]
     assert len(keys) > 100
-    assert [(name, key) for name, key, part in keys if not ("description" in part or "const" in part)] == []
+    assert [
+        (name, key) for name, key, part in keys if not ("description" in part or "const" in part)
+    ] == []
     assert [name for name, section in sections.items() if "description" not in section] == []
 
 

@@ -9,12 +9,22 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError
 
 R, H, E, NU = 25.2e-3, 0.28e-3, 1.8e6, 0.3
-SHELL = {"geometry": "cap", "radius": "25.2 mm", "thickness": "0.28 mm", "youngs_modulus": "1.8 MPa", "polar": 60}
+SHELL = {
+    "geometry": "cap",
+    "radius": "25.2 mm",
+    "thickness": "0.28 mm",
+    "youngs_modulus": "1.8 MPa",
+    "polar": 60,
+}
 PATCH = {"kind": "indentation", "at": {"polar": 0}, "until": "target"}
 
 
 def case(loading: Any, **shell: Any) -> Case:
-    data = {"shell": {**SHELL, "poisson_ratio": NU, **shell}, "boundary": {"rim": "clamped"}, "loading": loading}
+    data = {
+        "shell": {**SHELL, "poisson_ratio": NU, **shell},
+        "boundary": {"rim": "clamped"},
+        "loading": loading,
+    }
     return Case.from_source(data)
 
 
@@ -24,13 +34,21 @@ def case(loading: Any, **shell: Any) -> Case:
         ({**PATCH, "depth": "0.7 mm"}, "depth", 0.7e-3 / H),
         ({**PATCH, "depth": "-3 um"}, "depth", -3e-6 / H),
         ({**PATCH, "depth": 1, "patch": "0.2 mm"}, "patch", 0.2e-3 / H),
-        ({**PATCH, "control": "load", "force": "2 mN"}, "force", 2e-3 * 6 * (1 - NU**2) * R / (pi * E * H**3)),
+        (
+            {**PATCH, "control": "load", "force": "2 mN"},
+            "force",
+            2e-3 * 6 * (1 - NU**2) * R / (pi * E * H**3),
+        ),
         (
             {"kind": "pressure", "control": "load", "until": "target", "pressure": "0.1 kPa"},
             "pressure",
             100 * sqrt(3 * (1 - NU**2)) * (R / H) ** 2 / (2 * E),
         ),
-        ({"kind": "pressure", "until": "target", "volume_change": "-80 mm^3"}, "volume_change", -80e-9 / R**3),
+        (
+            {"kind": "pressure", "until": "target", "volume_change": "-80 mm^3"},
+            "volume_change",
+            -80e-9 / R**3,
+        ),
     ],
 )
 def test_sizes(loading: dict[str, Any], key: str, size: float) -> None:
@@ -42,7 +60,10 @@ def test_a_gas() -> None:
     """Its volume in litres over R^3."""
     gas = {"ambient": "100 kPa", "volume": "0.03 l"}
     _, step = case(
-        [{"kind": "pressure", "control": "load"}, {**PATCH, "depth": 1, "hold": {"pressure": {"gas": gas}}}]
+        [
+            {"kind": "pressure", "control": "load"},
+            {**PATCH, "depth": 1, "hold": {"pressure": {"gas": gas}}},
+        ]
     ).programme
     assert step.load.hold["pressure"].gas.volume == pytest.approx(3e-5 / R**3, rel=1e-12)
 

@@ -22,7 +22,13 @@ FORMULAS = [
 def slope(f, i: int, step: float = 1e-3):  # type: ignore[no-untyped-def]
     """Of sixth order."""
     e = step * np.eye(3)[i]
-    return sum(w * (f(PLACES + n * e) - f(PLACES - n * e)) for n, w in ((1, 0.75), (2, -0.15), (3, 1 / 60))) / step
+    return (
+        sum(
+            w * (f(PLACES + n * e) - f(PLACES - n * e))
+            for n, w in ((1, 0.75), (2, -0.15), (3, 1 / 60))
+        )
+        / step
+    )
 
 
 @pytest.mark.parametrize("text", FORMULAS)

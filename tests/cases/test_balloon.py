@@ -1,7 +1,9 @@
-"""Balloons against Adkins and Rivlin's membrane (Phil. Trans. R. Soc. A 244, 1952) by SciPy: shooting from the pole.
+"""Balloons against Adkins and Rivlin's membrane (Phil. Trans. R. Soc. A 244, 1952) by SciPy:
+shooting from the pole.
 
-With the arc length S of the undeformed meridian, its radius rho(S), the deformed radius r, the slope phi of the
-deformed meridian and the stretches l1 along it and l2 = r/rho around it, the energy W(l1, l2) per undeformed area gives
+With the arc length S of the undeformed meridian, its radius rho(S), the deformed radius r, the
+slope phi of the deformed meridian and the stretches l1 along it and l2 = r/rho around it, the
+energy W(l1, l2) per undeformed area gives
 
     (rho W_1)' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   rho W_1 phi' = p l1 r - W_2 sin phi.
 """
@@ -40,7 +42,9 @@ class Membrane:
         self._rho, self._end, self._share = rho, end, share
 
     def pressure(self, height: float, near: tuple[float, float]) -> float:
-        """With the pole at this height; `near` are a stretch of the pole and a pressure to begin with."""
+        """With the pole at this height; `near` are a stretch of the pole and a pressure to begin
+        with.
+        """
 
         def off(unknown: Numbers) -> Numbers:
             r, z = self._shot(*unknown)
@@ -80,9 +84,17 @@ def path(found: Result, rise: float, R_over_h: float) -> CubicSpline:
 @lru_cache(maxsize=2)
 def disc(share: float) -> Result:
     """A thin one, R/h = 1000."""
-    law = {"law": "mooney-rivlin", "mooney": share / (1 - share)} if share else {"law": "neo-hookean"}
+    law = (
+        {"law": "mooney-rivlin", "mooney": share / (1 - share)} if share else {"law": "neo-hookean"}
+    )
     shell = {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.5} | law
-    loading = {"kind": "pressure", "control": "volume", "until": "target", "volume_change": 5, "points": 25}
+    loading = {
+        "kind": "pressure",
+        "control": "volume",
+        "until": "target",
+        "volume_change": 5,
+        "points": 25,
+    }
     return run({"shell": shell, "boundary": {"rim": "clamped"}, "loading": loading})
 
 
@@ -98,17 +110,26 @@ def test_flat_disc(share: float) -> None:
 
 @pytest.mark.parametrize(
     ("settings", "warned"),
-    [([], True), (["boundary.rim=hinged"], False), (["shell.thickness=0.1 mm"], False), (["shell.law=koiter"], False)],
+    [
+        ([], True),
+        (["boundary.rim=hinged"], False),
+        (["shell.thickness=0.1 mm"], False),
+        (["shell.law=koiter"], False),
+    ],
 )
 def test_warning_of_a_clamped_rim(settings: list[str], warned: bool) -> None:
-    """An axisymmetric solid of R/h = 50 has its fold 0.6 % above a membrane's; here it may be a fourth below."""
+    """An axisymmetric solid of R/h = 50 has its fold 0.6 % above a membrane's; here it may be a
+    fourth below.
+    """
     said = make_problem(Case.load(CASES / "balloon.yaml", settings)).warnings
     assert any(each.startswith("boundary.rim: clamped: blown-up rubber") for each in said) == warned
 
 
 @pytest.mark.slow
 def test_balloon() -> None:
-    """The case "balloon.yaml", a dome of R/h = 100: the largest pressure is that of the membrane to the order h/R."""
+    """The case "balloon.yaml", a dome of R/h = 100: the largest pressure is that of the membrane to
+    the order h/R.
+    """
     found = run(Case.load(CASES / "balloon.yaml"))
     (fold,) = [row for row in found.rows if row["label"] == "fold"]
     membrane, p = Membrane(np.sin, np.pi / 3, 0.0), -float(fold["p_over_pc"]) * 4 / 3 / 100
@@ -121,13 +142,28 @@ def test_balloon() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["neo-hookean", "mooney-rivlin", "ogden"])
 def test_closed_sphere(law: str) -> None:
-    """p(lambda) to 1e-4 up to 4, and its folds; half of it, R/h = 1000, whose bending adds parts of 1e-6."""
-    keys = {"neo-hookean": {}, "mooney-rivlin": {"mooney": 0.1}, "ogden": {"mu": [*MU], "alpha": [*ALPHA]}}
-    terms = {"neo-hookean": ([1 / 3], [2]), "mooney-rivlin": ([1 / 3.3, -1 / 33], [2, -2]), "ogden": TRELOAR}[law]
+    """p(lambda) to 1e-4 up to 4, and its folds; half of it, R/h = 1000, whose bending adds parts of
+    1e-6.
+    """
+    keys = {
+        "neo-hookean": {},
+        "mooney-rivlin": {"mooney": 0.1},
+        "ogden": {"mu": [*MU], "alpha": [*ALPHA]},
+    }
+    terms = {
+        "neo-hookean": ([1 / 3], [2]),
+        "mooney-rivlin": ([1 / 3.3, -1 / 33], [2, -2]),
+        "ogden": TRELOAR,
+    }[law]
     volume = 4 * np.pi / 3 * (4**3 - 1) / 2
     found = run(
         {
-            "shell": {"geometry": "hemisphere", "radius_to_thickness": 1000, "poisson_ratio": 0.5, "law": law}
+            "shell": {
+                "geometry": "hemisphere",
+                "radius_to_thickness": 1000,
+                "poisson_ratio": 0.5,
+                "law": law,
+            }
             | keys[law],
             "points": {"top": [0, 0, 1]},
             "boundary": {"equator": "symmetry", "top": {"held": ["x", "y"]}},
@@ -145,7 +181,10 @@ def test_closed_sphere(law: str) -> None:
     def pressure(stretch: Numbers) -> Numbers:
         """Over E h/R: 2 sum mu (l^(alpha - 3) - l^(-2 alpha - 3))."""
         return np.asarray(
-            sum(2 * mu * (stretch ** (a - 3.0) - stretch ** (-2 * a - 3.0)) for mu, a in zip(*terms, strict=True))
+            sum(
+                2 * mu * (stretch ** (a - 3.0) - stretch ** (-2 * a - 3.0))
+                for mu, a in zip(*terms, strict=True)
+            )
         )
 
     rows = [row for row in found.rows if row["label"] != "start"]
@@ -154,7 +193,11 @@ def test_closed_sphere(law: str) -> None:
     assert stretch[-1] == pytest.approx(4)
     assert p == pytest.approx(pressure(stretch), rel=1e-4)
     folds = [i for i, row in enumerate(rows) if row["label"] == "fold"]
-    slope = CubicSpline(fine := np.linspace(1.2, 4, 20001), pressure(fine)).derivative().roots(extrapolate=False)
+    slope = (
+        CubicSpline(fine := np.linspace(1.2, 4, 20001), pressure(fine))
+        .derivative()
+        .roots(extrapolate=False)
+    )
     assert p[folds] == pytest.approx(pressure(slope), rel=1e-6)
     assert stretch[folds] == pytest.approx(slope, rel=3e-5)  # where dp = 0
     if law == "neo-hookean":
@@ -164,16 +207,19 @@ def test_closed_sphere(law: str) -> None:
 class MagneticMembrane(Membrane):
     """That of a part of the unit sphere, magnetised along its axis, in a field along it.
 
-    Per undeformed area w = W - lambda_m m, with phi the slope of the deformed meridian and m = cos(phi - S) where the
-    remanence turns with the shell; where it deforms with it m = l1 sin(phi) sin(S) + cos(phi) cos(S)/(l1 l2).
-    The momenta of L = rho w + p r^2 z'/2 are integrated: that of z is zero, that of r changes by dL/dr.
+    Per undeformed area w = W - lambda_m m, with phi the slope of the deformed meridian and m =
+    cos(phi - S) where the remanence turns with the shell; where it deforms with it m = l1 sin(phi)
+    sin(S) + cos(phi) cos(S)/(l1 l2). The momenta of L = rho w + p r^2 z'/2 are integrated: that of
+    z is zero, that of r changes by dL/dr.
     """
 
     def __init__(self, end: float, lambda_m: float, *, deforms: bool) -> None:
         super().__init__(np.sin, end, 0.0)
         self._lambda_m, self._deforms = lambda_m, deforms
 
-    def _field(self, along: float, around: float, phi: float, S: float) -> tuple[float, float, float]:
+    def _field(
+        self, along: float, around: float, phi: float, S: float
+    ) -> tuple[float, float, float]:
         """Minus lambda_m times the derivatives of m by l1, l2 and phi."""
         if not self._deforms:
             return 0.0, 0.0, self._lambda_m * np.sin(phi - S)
@@ -183,7 +229,10 @@ class MagneticMembrane(Membrane):
         return -self._lambda_m * of[0], -self._lambda_m * of[1], -self._lambda_m * of[2]
 
     def _shot(self, stretch: float, p: float) -> Numbers:
-        e, latest = 1e-4, [stretch, p * stretch**2 * 1e-4 / (2 * tensions(stretch, stretch, 0.0)[0])]
+        e, latest = (
+            1e-4,
+            [stretch, p * stretch**2 * 1e-4 / (2 * tensions(stretch, stretch, 0.0)[0])],
+        )
 
         def slopes(S: float, y: Numbers) -> tuple[float, float]:
             """lambda_1 and phi with these momenta."""
@@ -192,7 +241,10 @@ class MagneticMembrane(Membrane):
                 along, phi = unknown
                 by_along, _, by_phi = self._field(along, y[1] / np.sin(S), phi, S)
                 W1, turned = tensions(along, y[1] / np.sin(S), 0.0)[0] + by_along, by_phi / along
-                by_r, by_z = W1 * np.cos(phi) - turned * np.sin(phi), -W1 * np.sin(phi) - turned * np.cos(phi)
+                by_r, by_z = (
+                    W1 * np.cos(phi) - turned * np.sin(phi),
+                    -W1 * np.sin(phi) - turned * np.cos(phi),
+                )
                 return [np.sin(S) * by_r - y[0], np.sin(S) * by_z + p * y[1] ** 2 / 2]
 
             latest[:] = fsolve(off, latest, xtol=1e-12)
@@ -201,7 +253,10 @@ class MagneticMembrane(Membrane):
         def rates(S: float, y: Numbers) -> list[float]:
             along, phi = slopes(S, y)
             r1, z1 = along * np.cos(phi), -along * np.sin(phi)
-            W2 = tensions(along, y[1] / np.sin(S), 0.0)[1] + self._field(along, y[1] / np.sin(S), phi, S)[1]
+            W2 = (
+                tensions(along, y[1] / np.sin(S), 0.0)[1]
+                + self._field(along, y[1] / np.sin(S), phi, S)[1]
+            )
             return [W2 + p * y[1] * z1, r1, z1]
 
         begin = [e * tensions(stretch, stretch, 0.0)[0], stretch * e, 0.0]
@@ -211,15 +266,18 @@ class MagneticMembrane(Membrane):
 @pytest.mark.slow
 @pytest.mark.parametrize(("remanence", "raised"), [("rotation", 1.038), ("deformation", 0.9993)])
 def test_magnetic_balloon(remanence: str, raised: float) -> None:
-    """The case "magnetic_balloon.yaml": the field raises the largest pressure as in the membrane, by 3.8 %,
-    where the remanence turns with the rubber, and leaves it where it deforms too.
+    """The case "magnetic_balloon.yaml": the field raises the largest pressure as in the membrane,
+    by 3.8 %, where the remanence turns with the rubber, and leaves it where it deforms too.
 
     R/h = 100: pressures agree to the order h/R, and so their ratio far better.
     """
     p = dict[float, float]()
     of_membrane = dict[float, float]()
     for field in (0.0, 1.0):
-        settings = [f"magnetic.applied.flux_density={100 * field:g} mT", f"magnetic.remanence={remanence}"]
+        settings = [
+            f"magnetic.applied.flux_density={100 * field:g} mT",
+            f"magnetic.remanence={remanence}",
+        ]
         found = run(Case.load(CASES / "magnetic_balloon.yaml", settings))
         (fold,) = [row for row in found.rows if row["label"] == "fold"]
         lambda_m = field * 0.08 * 0.1 / (4e-7 * np.pi * 1e5)
@@ -239,7 +297,12 @@ def test_magnetic_balloon(remanence: str, raised: float) -> None:
 def test_models_of_a_balloon() -> None:
     """Meridian, half and full dome of Mooney and Rivlin's rubber under a live pressure have the same fold, 5e-4; its
     volume, at the flat top of the curve, to 1e-2."""
-    settings = ["shell.law=mooney-rivlin", "shell.mooney=0.05", "shell.thickness=1 mm", "loading.points=3"]
+    settings = [
+        "shell.law=mooney-rivlin",
+        "shell.mooney=0.05",
+        "shell.thickness=1 mm",
+        "loading.points=3",
+    ]
     settings.append("loading.volume_change=600000 mm^3")
     p, volume = list[float](), list[float]()
     for symmetry in ("axisymmetric", "half", "none"):

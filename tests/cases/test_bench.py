@@ -17,8 +17,17 @@ from magshell_fenicsx.studies.results import parse_scalar
 
 
 def file(machine: str = "a", **numbers: float) -> dict[str, Any]:
-    machines = {"cpu": machine, "cores": 2, "memory_gb": 8, "blas": "openblas", "versions": {"dolfinx": "0.9.0"}}
-    return {"machine": machines, "items": {"x": {key: {"median": value} for key, value in numbers.items()}}}
+    machines = {
+        "cpu": machine,
+        "cores": 2,
+        "memory_gb": 8,
+        "blas": "openblas",
+        "versions": {"dolfinx": "0.9.0"},
+    }
+    return {
+        "machine": machines,
+        "items": {"x": {key: {"median": value} for key, value in numbers.items()}},
+    }
 
 
 @pytest.mark.parametrize("item", ITEMS.values(), ids=ITEMS)
@@ -30,7 +39,8 @@ def test_every_item_is_a_valid_case(item: Item) -> None:
 
 def test_ratios_beyond_a_fifth_are_marked() -> None:
     same, slower, faster = (
-        line.split() for line in compare(file(a_s=1.1, b_s=2.5, c_s=0.5, d_s=1), file(a_s=1, b_s=2, c_s=1))
+        line.split()
+        for line in compare(file(a_s=1.1, b_s=2.5, c_s=0.5, d_s=1), file(a_s=1, b_s=2, c_s=1))
     )
     assert same == ["x", "a_s", "1.100"]
     assert slower == ["x", "b_s", "1.250", "more"]
@@ -42,7 +52,12 @@ def test_other_machine_is_taken_out_of_times_alone() -> None:
     new, old = file("b", a_s=3, b_s=6, c_s=12, count=4), file("a", a_s=1, b_s=2, c_s=1, count=3)
     lines = compare(new, old)
     assert "Not the same machine" in lines[2]
-    assert [line.split()[2:] for line in lines[3:]] == [["1.000"], ["1.000"], ["4.000", "more"], ["1.333", "more"]]
+    assert [line.split()[2:] for line in lines[3:]] == [
+        ["1.000"],
+        ["1.000"],
+        ["4.000", "more"],
+        ["1.333", "more"],
+    ]
 
 
 def test_ratios_within_a_benchmark() -> None:
@@ -54,7 +69,9 @@ def test_ratios_within_a_benchmark() -> None:
     path = item(factor_wall_s=5, back_solve_wall_s=1, solve_phase_wall_s=8)
     one = item(tangent_wall_s=2, factor_wall_s=4, back_solves_wall_s=0.4, residual_wall_s=0.2)
     two = item(tangent_wall_s=1, factor_wall_s=3, back_solves_wall_s=0.2, residual_wall_s=0.2)
-    found = derived({"k_d 20 000": path, "iteration 100 000": one, "iteration 100 000, 2 ranks": two})
+    found = derived(
+        {"k_d 20 000": path, "iteration 100 000": one, "iteration 100 000, 2 ranks": two}
+    )
     assert list(found.values()) == pytest.approx([0.75, 1.5])
     assert derived({"iteration 100 000": one}) == {}
 
@@ -63,10 +80,15 @@ def test_growth_with_the_unknowns() -> None:
     """Four times the unknowns and eight times the seconds: the power 3/2."""
 
     def item(dofs: float, seconds: float) -> dict[str, Any]:
-        parts = {f"{part}_cpu_s": {"median": seconds} for part in ("tangent", "factor", "back_solves", "residual")}
+        parts = {
+            f"{part}_cpu_s": {"median": seconds}
+            for part in ("tangent", "factor", "back_solves", "residual")
+        }
         return {"dofs": {"median": dofs}, **parts}
 
-    assert list(derived({"iteration 10 000": item(1e4, 1), "iteration 30 000": item(4e4, 8)}).values()) == [1.5]
+    assert list(
+        derived({"iteration 10 000": item(1e4, 1), "iteration 30 000": item(4e4, 8)}).values()
+    ) == [1.5]
 
 
 def test_table_has_the_medians_and_the_ratios() -> None:
@@ -113,9 +135,16 @@ def test_cold_kernels_are_compiled() -> None:
 def test_file_and_comparison(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(ITEMS, "k_d meridian", Item("run", "dimple_buckling", ("mesh.refinement=0.5",), repeat=1))
-    earlier, out = file("b", process_wall_s=1, process_cpu_s=1, peak_mb=100), tmp_path / "deep" / "b.json"
-    (tmp_path / "a.json").write_text(json.dumps(earlier | {"items": {"k_d meridian": earlier["items"]["x"]}}))
+    monkeypatch.setitem(
+        ITEMS, "k_d meridian", Item("run", "dimple_buckling", ("mesh.refinement=0.5",), repeat=1)
+    )
+    earlier, out = (
+        file("b", process_wall_s=1, process_cpu_s=1, peak_mb=100),
+        tmp_path / "deep" / "b.json",
+    )
+    (tmp_path / "a.json").write_text(
+        json.dumps(earlier | {"items": {"k_d meridian": earlier["items"]["x"]}})
+    )
     main(["k_d meridian", "--out", str(out), "--compare", str(tmp_path / "a.json")])
     found = json.loads(out.read_text(encoding="utf-8"))
     numbers = found["items"]["k_d meridian"]
@@ -127,7 +156,10 @@ def test_file_and_comparison(
 
 
 def test_mistakes_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, said in ((["nothing"], "no item 'nothing'"), (["--compare", "/none.json"], "--compare /none.json")):
+    for words, said in (
+        (["nothing"], "no item 'nothing'"),
+        (["--compare", "/none.json"], "--compare /none.json"),
+    ):
         with pytest.raises(SystemExit) as e:
             main(words)
         assert e.value.code == 2

@@ -27,14 +27,24 @@ Array = NDArray[np.float64]
 
 
 def force_at(found: Result, depth: float) -> float:
-    (row,) = [row for row in found.rows if row["label"] == "target" and abs(float(row["w_over_h"]) - depth) < 1e-6]
+    (row,) = [
+        row
+        for row in found.rows
+        if row["label"] == "target" and abs(float(row["w_over_h"]) - depth) < 1e-6
+    ]
     return float(row["force"])
 
 
 def test_every_case_is_run() -> None:
     """Here or in another of these files, where its name stands in quotes."""
-    tests = "".join(file.read_text(encoding="utf-8") for file in pathlib.Path(__file__).parents[1].rglob("test_*.py"))
-    cases = [file.relative_to(CASES).as_posix().removeprefix("benchmarks/") for file in CASES.rglob("*.yaml")]
+    tests = "".join(
+        file.read_text(encoding="utf-8")
+        for file in pathlib.Path(__file__).parents[1].rglob("test_*.py")
+    )
+    cases = [
+        file.relative_to(CASES).as_posix().removeprefix("benchmarks/")
+        for file in CASES.rglob("*.yaml")
+    ]
     assert [case for case in cases if f'"{case}"' not in tests] == []
 
 
@@ -74,7 +84,9 @@ def test_dimple_buckling(
 
 
 def test_excluded_mode_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Newton failing while an excluded instability is located ends the run with a message, after the whole path."""
+    """Newton failing while an excluded instability is located ends the run with a message, after
+    the whole path.
+    """
 
     def lost(path: Path, stable: Point, *others: object) -> Point:
         raise PathStopped("the iteration diverged", stable)
@@ -97,20 +109,25 @@ def test_dimple_drift() -> None:
         ("bifurcation", "m = 1"),
         ("bifurcation", "m = 1"),
     ]
-    assert [p["value"] for p in found.limit_points] == pytest.approx([0.328068, 0.303360, 0.151836], rel=1e-5)
+    assert [p["value"] for p in found.limit_points] == pytest.approx(
+        [0.328068, 0.303360, 0.151836], rel=1e-5
+    )
     assert found.stopped is None
     assert found.knockdown == found.limit_points[0]["value"]
     labels = [row["label"] for row in found.rows]
     first, last = (i for i, label in enumerate(labels) if label == "bifurcation")
-    assert [row["excluded_pivots"] for row in found.rows] == [int(first < i < last) for i in range(len(labels))]
+    assert [row["excluded_pivots"] for row in found.rows] == [
+        int(first < i < last) for i in range(len(labels))
+    ]
 
 
 @pytest.mark.slow
 def test_dimple_drift_on_the_shell() -> None:
-    """A half shell brought into equilibrium at the meridian's volumes, before, between and after the two.
+    """A half shell brought into equilibrium at the meridian's volumes, before, between and after
+    the two.
 
-    Besides the direction of the fold it sees one wave, cos, and excludes the other, sin; its mesh lowers and raises
-    the pressures by up to 3e-3.
+    Besides the direction of the fold it sees one wave, cos, and excludes the other, sin; its mesh
+    lowers and raises the pressures by up to 3e-3.
     """
     records = list(follow(scene := Scene(Case.load(CASES / "dimple_drift.yaml"))))
     shell = Scene(Case.load(CASES / "dimple_drift.yaml", ["symmetry=half", "mesh.refinement=1.5"]))
@@ -121,17 +138,28 @@ def test_dimple_drift_on_the_shell() -> None:
     c, s = (np.divide(a, rho, out=np.zeros_like(a), where=rho > 0) for a in (x, y))
     places = np.arctan2(*scene.model.r0.x.array.reshape(-1, 2).T)
     found = []
-    depths = {scene.observe(r.point.state)["w_over_h"]: r for r in records if r.label not in ("fold", "bifurcation")}
+    depths = {
+        scene.observe(r.point.state)["w_over_h"]: r
+        for r in records
+        if r.label not in ("fold", "bifurcation")
+    }
     for wanted in (4.0, 6.0, 14.0, 17.6):
         record = depths[min(depths, key=lambda depth: abs(depth - wanted))]
-        U, W = CubicSpline(np.sort(places), record.point.state.u.reshape(-1, 2)[np.argsort(places)])(
-            np.arctan2(rho, z)
-        ).T
-        guess = State(shell.model.system.held(np.column_stack([U * c, U * s, W]).ravel()), record.point.state.mu)
+        U, W = CubicSpline(
+            np.sort(places), record.point.state.u.reshape(-1, 2)[np.argsort(places)]
+        )(np.arctan2(rho, z)).T
+        guess = State(
+            shell.model.system.held(np.column_stack([U * c, U * s, W]).ravel()),
+            record.point.state.mu,
+        )
         volume = -shell.model.system.potential(guess.u, {}, "pressure")
-        there = shell.newton.solve(guess, "pressure", GivenConjugate(shell.newton.system, "pressure", volume))
+        there = shell.newton.solve(
+            guess, "pressure", GivenConjugate(shell.newton.system, "pressure", volume)
+        )
         assert there.converged
-        assert there.state.mu["pressure"] == pytest.approx(record.point.state.mu["pressure"], rel=4e-3)
+        assert there.state.mu["pressure"] == pytest.approx(
+            record.point.state.mu["pressure"], rel=4e-3
+        )
         tangents = shell.newton, shell.model.excluded_modes
         found.append([tangent.factor_at(there.state).negative_pivots for tangent in tangents])
     assert found == [[1, 0], [2, 1], [2, 1], [1, 0]]
@@ -140,8 +168,13 @@ def test_dimple_drift_on_the_shell() -> None:
 @pytest.mark.slow
 def test_half_and_full_shell_agree() -> None:
     """A field that is tilted to the remanence, in its plane."""
-    settings = "magnetic={lambda_m: 0.00184, remanent: {polar: 0}, applied: {polar: 45}}", "mesh.refinement=0.45"
-    half, full = (result("dimple_buckling.yaml", *settings, f"symmetry={s}") for s in ("half", "none"))
+    settings = (
+        "magnetic={lambda_m: 0.00184, remanent: {polar: 0}, applied: {polar: 45}}",
+        "mesh.refinement=0.45",
+    )
+    half, full = (
+        result("dimple_buckling.yaml", *settings, f"symmetry={s}") for s in ("half", "none")
+    )
     assert half.knockdown == pytest.approx(full.knockdown, rel=1e-4)
 
 
@@ -164,13 +197,22 @@ def test_clamped_plate() -> None:
 
 def test_standing_strip() -> None:
     """Greenhill's column: g = 9/4 j² E h²/(12 ρ L³), j the first zero of J₋⅓."""
-    found = result("standing_strip.yaml", "shell.poisson_ratio=0", "loading.then=null", "loading.acceleration=null")
+    found = result(
+        "standing_strip.yaml",
+        "shell.poisson_ratio=0",
+        "loading.then=null",
+        "loading.acceleration=null",
+    )
     (row,) = [row for row in found.rows if row["label"] == "bifurcation"]
-    assert row["gravity_m_per_s2"] == pytest.approx(7.8373 * 1e6 * 1e-3**2 / (12 * 1100 * 0.05**3), rel=2e-3)
+    assert row["gravity_m_per_s2"] == pytest.approx(
+        7.8373 * 1e6 * 1e-3**2 / (12 * 1100 * 0.05**3), rel=2e-3
+    )
 
 
 def test_spinning_blade() -> None:
-    """SciPy's boundary values of an extensible elastica: how deep its tip hangs at rest and at 300 rpm."""
+    """SciPy's boundary values of an extensible elastica: how deep its tip hangs at rest and at 300
+    rpm.
+    """
     found = result("spinning_blade.yaml", "shell.poisson_ratio=0", "loading.1.points=2")
     L, h, E, rho, weight = 0.05, 1e-3, 1e6, 1100, 10.79
     rows = [row for row in found.rows if row["label"] == "target"]
@@ -187,7 +229,14 @@ def test_spinning_blade() -> None:
                 stretch = 1 + (N * c + Q * d) / (E * h)
                 turned = M / (E * h**3 / 12)
                 return np.array(
-                    [stretch * c, stretch * d, turned, stretch * (N * d - Q * c), -outward * x, down + 0 * x]
+                    [
+                        stretch * c,
+                        stretch * d,
+                        turned,
+                        stretch * (N * d - Q * c),
+                        -outward * x,
+                        down + 0 * x,
+                    ]
                 )
 
             solved = solve_bvp(along, lambda a, b: np.concatenate([a[:3], b[3:]]), s, y, tol=1e-6)
@@ -197,7 +246,9 @@ def test_spinning_blade() -> None:
 
 
 def test_cylinder_waves() -> None:
-    """The half shell's first bifurcation, p/p_c = 0.113764 with elements of 0.14 R; a tube between two walls, m = 9."""
+    """The half shell's first bifurcation, p/p_c = 0.113764 with elements of 0.14 R; a tube between
+    two walls, m = 9.
+    """
     found = result("cylinder_waves.yaml")
     (first,) = found.limit_points
     assert (first["kind"], first["mode"]) == ("bifurcation", "m = 9")
@@ -207,7 +258,9 @@ def test_cylinder_waves() -> None:
 
 @pytest.mark.slow
 def test_cap_waves_branch() -> None:
-    """The fold of the branch of five waves, p/p_c = 0.474389 of the sector with elements of two thirds the size."""
+    """The fold of the branch of five waves, p/p_c = 0.474389 of the sector with elements of two
+    thirds the size.
+    """
     found = result("cap_waves_branch.yaml")
     first, fold = found.limit_points[:2]
     assert (first["mode"], fold["kind"]) == ("m = 5", "fold")
@@ -235,7 +288,9 @@ def test_indentation() -> None:
 
 @pytest.mark.slow
 def test_indentation_against_the_field_stops_at_the_fold_in_displacement() -> None:
-    """Mixed reference: 1.7949 and 1.3149 at w/h = 1 and 5, the force peaks at 2.10, w turns back at 5.9."""
+    """Mixed reference: 1.7949 and 1.3149 at w/h = 1 and 5, the force peaks at 2.10, w turns back at
+    5.9.
+    """
     found = result("indentation.yaml", "magnetic.lambda_m=-0.00184", "mesh.refinement=0.75")
     assert force_at(found, 1) == pytest.approx(1.7949, rel=3e-3)
     assert force_at(found, 5) == pytest.approx(1.3149, rel=3e-3)
@@ -264,7 +319,9 @@ def test_magnetic_strip(polar: float, shortening: float, deflection: float) -> N
 
 
 def test_gripper() -> None:
-    """Each arm is the same elastica on the hub's edge, from a mesh file in mm; stretching is O(lambda_m) = 4e-4."""
+    """Each arm is the same elastica on the hub's edge, from a mesh file in mm; stretching is
+    O(lambda_m) = 4e-4.
+    """
     row = result("gripper.yaml").rows[-1]
     assert row["label"] == "target"
     assert -row["tip_ux"] / 3e-3 == pytest.approx(0.32894, rel=1.5e-3)
@@ -286,8 +343,12 @@ def test_turning_field_ends_where_the_tilted_one_does() -> None:
 
 
 def test_strip_against_its_field_buckles() -> None:
-    """Field antiparallel to the magnetisation: straight until q = pi^2/4, there a bifurcation (elastica)."""
-    found = result("magnetic_strip.yaml", "magnetic.applied.polar=-90.0", "loading={kind: field, until: limit}")
+    """Field antiparallel to the magnetisation: straight until q = pi^2/4, there a bifurcation
+    (elastica).
+    """
+    found = result(
+        "magnetic_strip.yaml", "magnetic.applied.polar=-90.0", "loading={kind: field, until: limit}"
+    )
     (limit,) = found.limit_points
     assert limit["kind"] == "bifurcation"
     assert 12 * limit["value"] * 100**2 == pytest.approx(np.pi**2 / 4, rel=1e-4)
@@ -304,9 +365,14 @@ def test_solid_buckling() -> None:
 
 @pytest.mark.slow
 def test_solid_indentation() -> None:
-    """The shell under the same patch: the field alone moves the body's middle elsewhere (docs/solid), 5 % of F here."""
+    """The shell under the same patch: the field alone moves the body's middle elsewhere
+    (docs/solid), 5 % of F here.
+    """
     settings = ["loading.depth=2", "loading.points=2", "mesh.refinement=0.5"]
-    solid, shell = (result("solid_indentation.yaml", *settings, f"model={model}") for model in ("solid", "shell"))
+    solid, shell = (
+        result("solid_indentation.yaml", *settings, f"model={model}")
+        for model in ("solid", "shell")
+    )
     for depth in (1.0, 2.0):
         assert force_at(solid, depth) == pytest.approx(force_at(shell, depth), rel=0.05)
 
@@ -327,7 +393,9 @@ def test_figure_of_coplanar_fields() -> None:
 
 @pytest.mark.slow
 def test_figure_of_non_coplanar_fields() -> None:
-    """figures/noncoplanar.yaml at azimuth zero has parallel fields: the half shell of the default mesh, 0.4915468."""
+    """figures/noncoplanar.yaml at azimuth zero has parallel fields: the half shell of the default
+    mesh, 0.4915468.
+    """
     assert result("figures/noncoplanar.yaml").knockdown == pytest.approx(0.4915468, rel=5e-4)
 
 
@@ -340,9 +408,13 @@ def test_figure_of_indentation() -> None:
 
 @pytest.mark.slow
 def test_natural_strip() -> None:
-    """A natural curvature of 2 pi/L closes a strip to a circle; a quarter of it lifts the tip by 2 L/pi, to 1e-6."""
+    """A natural curvature of 2 pi/L closes a strip to a circle; a quarter of it lifts the tip by 2
+    L/pi, to 1e-6.
+    """
     rows = [row for row in result("natural_strip.yaml").rows if row["label"] == "target"]
     w = [float(row["w_pole_over_h"]) for row in rows]
-    assert w == pytest.approx([-200 / np.pi, -200 / np.pi, -200 / (3 * np.pi), 0], rel=1e-6, abs=1e-5)
+    assert w == pytest.approx(
+        [-200 / np.pi, -200 / np.pi, -200 / (3 * np.pi), 0], rel=1e-6, abs=1e-5
+    )
     assert [float(row["natural_curvature"]) for row in rows] == [0.25, 0.5, 0.75, 1.0]
     assert abs(float(rows[-1]["energy"])) < 1e-12

@@ -1,4 +1,6 @@
-"""Cases with bodies: paths, folds and rings of contact against other models, stiffnesses and the point force."""
+"""Cases with bodies: paths, folds and rings of contact against other models, stiffnesses and the
+point force.
+"""
 
 import csv
 from functools import cache
@@ -33,9 +35,11 @@ ONE = ("loading.approach=0.8", "loading.points=1")
 
 @pytest.mark.slow
 def test_plate() -> None:
-    """Flat up to a fold near 2.55 h, back to one at 2.50 h, then a dimple in a ring with the radius of a mirrored cap.
+    """Flat up to a fold near 2.55 h, back to one at 2.50 h, then a dimple in a ring with the radius
+    of a mirrored cap.
 
-    The plane of the plate cuts the sphere at sqrt(2 R a); a mirrored cap of the depth w has the radius sqrt(R w).
+    The plane of the plate cuts the sphere at sqrt(2 R a); a mirrored cap of the depth w has the
+    radius sqrt(R w).
     """
     path = rows("plate_contact.yaml", "loading.points=4")
     first, second = (row["approach_over_h"] for row in path if row["label"] == "fold")
@@ -57,11 +61,13 @@ def test_plate() -> None:
 def test_hard_plate() -> None:
     """Without folds, the flat branch goes on, as the shell presses on the plate at its centre too.
 
-    Where it is flat, b = 0 and K = A/R: M = D (1 + nu) A/R is constant, but not the map from the sphere's metric A to
-    the plane. With its radius r = theta - (3 nu - 1) theta^3/48 (plane stress), the pressure is (1 + nu)^2 D/R^3. A
-    dimple at the same approach needs less force.
+    Where it is flat, b = 0 and K = A/R: M = D (1 + nu) A/R is constant, but not the map from the
+    sphere's metric A to the plane. With its radius r = theta - (3 nu - 1) theta^3/48 (plane
+    stress), the pressure is (1 + nu)^2 D/R^3. A dimple at the same approach needs less force.
     """
-    scene = Scene(Case.load(CASES / "plate_contact.yaml", ["bodies.plate.stiffness=2e6", "loading.points=1"]))
+    scene = Scene(
+        Case.load(CASES / "plate_contact.yaml", ["bodies.plate.stiffness=2e6", "loading.points=1"])
+    )
     records = list(follow(scene))
     assert [r.label for r in records if r.label != "step"] == ["start", "target"]
     end = records[-1]
@@ -77,7 +83,9 @@ def test_hard_plate() -> None:
 @pytest.mark.slow
 def test_stiffness() -> None:
     """Over four decades of it the force changes by less than 1e-3, with penetrations below 1e-3 h."""
-    found = [last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e8")]
+    found = [
+        last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e8")
+    ]
     assert all(row["penetration_over_h"] < 1e-3 for row in found)
     assert np.ptp([row["force"] for row in found]) < 1e-3 * found[0]["force"]
     assert found[1]["penetration_over_h"] < 0.05 * found[0]["penetration_over_h"]
@@ -90,7 +98,9 @@ def test_half_and_full_against_meridian() -> None:
     plate = "bodies.plate={kind: plane, stiffness: 2e4, penetration: 0.01}"
     forces = []
     for symmetry in ("axisymmetric", "half", "none"):
-        scene = Scene(Case.load(CASES / "plate_contact.yaml", [steps, plate, f"symmetry={symmetry}"]))
+        scene = Scene(
+            Case.load(CASES / "plate_contact.yaml", [steps, plate, f"symmetry={symmetry}"])
+        )
         forces.append(scene.observe(list(follow(scene))[-1].point.state)["force"])
     assert forces == pytest.approx([forces[0]] * 3, rel=2e-4)
 
@@ -98,15 +108,22 @@ def test_half_and_full_against_meridian() -> None:
 def test_stiffer_by_itself() -> None:
     """A plate without a given stiffness penetrates no more than it may, with the same force."""
     few = ("loading.approach=0.4", "loading.points=1", "mesh.refinement=0.5")
-    soft, path = last("plate_contact.yaml", *few), rows("plate_contact.yaml", *few, "bodies.plate.penetration=2e-4")
+    soft, path = (
+        last("plate_contact.yaml", *few),
+        rows("plate_contact.yaml", *few, "bodies.plate.penetration=2e-4"),
+    )
     assert max(row["penetration_over_h"] for row in path) < 2e-4 < soft["penetration_over_h"]
     assert path[-1]["contact_stiffness"] > path[0]["contact_stiffness"]
     assert path[-1]["force"] == pytest.approx(soft["force"], rel=1e-3)
 
 
 def test_ball_and_rod_against_a_point_force() -> None:
-    """At the same displacement of the pole the real indenters need a little more force; both press by their units."""
-    ball, rod = (last(name, "loading.points=2") for name in ("ball_contact.yaml", "rod_contact.yaml"))
+    """At the same displacement of the pole the real indenters need a little more force; both press
+    by their units.
+    """
+    ball, rod = (
+        last(name, "loading.points=2") for name in ("ball_contact.yaml", "rod_contact.yaml")
+    )
     case = "{kind: indentation, at: {polar: 0}, depth: 4, points: 2}"
     point = last("pole_indentation.yaml", f"loading={case}")
     stiffness = 0.563  # dF/d(w/h) there
@@ -119,14 +136,19 @@ def test_ball_and_rod_against_a_point_force() -> None:
 
 @pytest.mark.slow
 def test_egg_between_two_balls() -> None:
-    """The body that contains another leaves fewer shapes to the shell: the least energy at an approach is higher.
+    """The body that contains another leaves fewer shapes to the shell: the least energy at an
+    approach is higher.
 
-    A ball of its least radius of curvature is within the egg, one of the largest, 0.4^2/0.25, around it; both are
-    modelled by their meridian.
+    A ball of its least radius of curvature is within the egg, one of the largest, 0.4^2/0.25,
+    around it; both are modelled by their meridian.
     """
     egg = last("egg_contact.yaml", "loading.points=2")
     within, around = (
-        last("egg_contact.yaml", "loading.points=2", f"bodies={{ball: {{kind: sphere, radius: {radius}}}}}")
+        last(
+            "egg_contact.yaml",
+            "loading.points=2",
+            f"bodies={{ball: {{kind: sphere, radius: {radius}}}}}",
+        )
         for radius in (0.25, 0.4**2 / 0.25)
     )
     assert egg["approach_over_h"] == within["approach_over_h"] == around["approach_over_h"] == 2
@@ -138,7 +160,9 @@ def test_sweep_of_a_body(tmp_path: Path) -> None:
     """The columns of a body are in the curves, and drawn: a blunter ball needs more force."""
     few = ("loading.approach=0.2", "loading.points=1", "mesh.refinement=0.4")
     over = ("--over", "bodies.ball.radius=0.1,0.3")
-    done = magshell("sweep", CASES / "ball_contact.yaml", *over, *(f"--set={s}" for s in few), "--out", tmp_path)
+    done = magshell(
+        "sweep", CASES / "ball_contact.yaml", *over, *(f"--set={s}" for s in few), "--out", tmp_path
+    )
     assert done.returncode == 0, done.stderr
     with (tmp_path / "curves.csv").open(encoding="utf-8") as file:
         ends = [row for row in csv.DictReader(file) if row["label"] == "target"]
@@ -149,7 +173,12 @@ def test_sweep_of_a_body(tmp_path: Path) -> None:
 
 def test_held_while_the_shell_moves() -> None:
     """A ball that comes in a time, with drag, ends with the force of the static path, 1e-3."""
-    shell = {"geometry": "hemisphere", "radius": "30 mm", "thickness": "1.5 mm", "poisson_ratio": 0.3}
+    shell = {
+        "geometry": "hemisphere",
+        "radius": "30 mm",
+        "thickness": "1.5 mm",
+        "poisson_ratio": 0.3,
+    }
     given = {
         "shell": {**shell, "youngs_modulus": "1 MPa", "density": "1000 kg/m^3"},
         "boundary": {"equator": "clamped"},
@@ -172,7 +201,9 @@ def test_held_while_the_shell_moves() -> None:
 
 
 def test_force_control_and_a_held_force(tmp_path: Path) -> None:
-    """A ball with a weight: the approach follows; the weight stays while a pressure acts; then it is taken away."""
+    """A ball with a weight: the approach follows; the weight stays while a pressure acts; then it
+    is taken away.
+    """
     steps = (
         "[{kind: contact, control: force, force: 1, points: 1},"
         " {kind: pressure, control: load, until: target, pressure: 0.1, points: 1, hold: {approach: conjugate}},"

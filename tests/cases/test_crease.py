@@ -14,7 +14,9 @@ D = h**3 / 12
 
 
 def force(w: float) -> float:
-    """On bars of length 1 that the crease has moved down by w; their bending is in series with the spring."""
+    """On bars of length 1 that the crease has moved down by w; their bending is in series with the
+    spring.
+    """
     c, y = np.cos(FOLDED), np.sin(FOLDED) - w
     strain, spring = (c**2 + y**2 - 1) / 2, STIFFNESS / (1 + 2 * STIFFNESS / (3 * D))
     angle = 2 * (np.arctan2(y, c) - FOLDED)

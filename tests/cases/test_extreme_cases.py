@@ -1,4 +1,5 @@
-"""Every case of cases/extreme/ as it stands, and one physical number of each; `make extremes` runs the variants.
+"""Every case of cases/extreme/ as it stands, and one physical number of each; `make extremes` runs
+the variants.
 
 "axisymmetric" is an independent solver of the meridian's equations, nine digits.
 """
@@ -8,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import CASES
-from extreme.extremes import ASPECTS, TIP, VARIANTS, Variant, condition_estimate, line, outcome, slivers
+from extreme.extremes import (
+    ASPECTS,
+    TIP,
+    VARIANTS,
+    Variant,
+    condition_estimate,
+    line,
+    outcome,
+    slivers,
+)
 from extreme.extremes_table import cells, write
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -40,7 +50,9 @@ def test_first_instability(file: str, k_d: float) -> None:
 @pytest.mark.parametrize("penalty", [10, 1e7])
 def test_penalty_moves_nothing_over_six_decades(penalty: float) -> None:
     """Axisymmetric: k_d = 0.326233289."""
-    assert first(result("extreme/penalty.yaml", f"mesh.penalty={penalty}")) == pytest.approx(0.326233289, rel=1e-6)
+    assert first(result("extreme/penalty.yaml", f"mesh.penalty={penalty}")) == pytest.approx(
+        0.326233289, rel=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -53,7 +65,9 @@ def test_almost_perfect_dimple_buckles_like_the_perfect_shell() -> None:
 
 @pytest.mark.slow
 def test_beyond_the_fold() -> None:
-    """The fold does not depend on R/h in a thin shell (0.325723564 at 1000, axisymmetric); the path goes on."""
+    """The fold does not depend on R/h in a thin shell (0.325723564 at 1000, axisymmetric); the path
+    goes on.
+    """
     found = result("extreme/beyond.yaml", "loading.points=14")
     assert found.stopped is None
     assert first(found) == pytest.approx(0.325723564, rel=2e-3)
@@ -62,10 +76,16 @@ def test_beyond_the_fold() -> None:
 
 @pytest.mark.slow
 def test_hemisphere_turned_inside_out() -> None:
-    """Pogorelov's mirror buckling, F ~ sqrt(w), in the middle; at w = 2R the pole is as far below as it was above."""
+    """Pogorelov's mirror buckling, F ~ sqrt(w), in the middle; at w = 2R the pole is as far below
+    as it was above.
+    """
     found = result("extreme/inside_out.yaml")
     assert found.stopped is None
-    force = {round(float(row["w_over_h"])): float(row["force"]) for row in found.rows if row["label"] == "target"}
+    force = {
+        round(float(row["w_over_h"])): float(row["force"])
+        for row in found.rows
+        if row["label"] == "target"
+    }
     assert force[80] / force[40] == pytest.approx(2**0.5, rel=0.03)
     assert float(found.rows[-1]["w_over_h"]) == pytest.approx(180)
 
@@ -102,8 +122,15 @@ def test_table(tmp_path: Path) -> None:
     assert row.error < 1e-6
     write([row], tmp_path)
     assert " | ".join(cells(row)) in (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert (tmp_path / "extremes.csv").read_text(encoding="utf-8").splitlines()[1].startswith("nothing,")
-    assert {v.case for v in VARIANTS} | {"slivers"} == {file.stem for file in (CASES / "extreme").glob("*.yaml")}
+    assert (
+        (tmp_path / "extremes.csv")
+        .read_text(encoding="utf-8")
+        .splitlines()[1]
+        .startswith("nothing,")
+    )
+    assert {v.case for v in VARIANTS} | {"slivers"} == {
+        file.stem for file in (CASES / "extreme").glob("*.yaml")
+    }
 
 
 def test_condition_of_a_known_spectrum() -> None:
@@ -111,7 +138,11 @@ def test_condition_of_a_known_spectrum() -> None:
     rng = np.random.default_rng(0)
     values = np.array([1e-3, -0.5, 1.0, 2.0, -30.0, 1e4])
     Q = np.linalg.qr(rng.standard_normal((6, 6)))[0]
-    K = PETSc.Mat().createDense((6, 6), array=Q @ np.diag(values) @ Q.T, comm=MPI.COMM_SELF).convert("aij")
+    K = (
+        PETSc.Mat()
+        .createDense((6, 6), array=Q @ np.diag(values) @ Q.T, comm=MPI.COMM_SELF)
+        .convert("aij")
+    )
     K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     factors = Factorisation(MPI.COMM_SELF)
     factors.factor(K)

@@ -12,14 +12,20 @@ import magshell_fenicsx as ms
 
 @pytest.mark.slow
 def test_identify_arch(tmp_path: Path) -> None:
-    """Both are as published (67.5 mT, 4.2 MPa) within their bands, their ratio to three deviations; data in theirs.
+    """Both are as published (67.5 mT, 4.2 MPa) within their bands, their ratio to three deviations;
+    data in theirs.
 
     On a coarse mesh, from each third datum.
     """
     head, *lines = (CASES / "identify_arch.csv").read_text(encoding="utf-8").splitlines()
     data = tmp_path / "each_third.csv"
     data.write_text("\n".join([head, *lines[::3]]), encoding="utf-8")
-    coarse = ["mesh={size: 20 mm, degree: 3}", "loading.1.points=5", "identify.candidates=[]", "identify.predict={}"]
+    coarse = [
+        "mesh={size: 20 mm, degree: 3}",
+        "loading.1.points=5",
+        "identify.candidates=[]",
+        "identify.predict={}",
+    ]
     found = ms.identify(CASES / "identify_arch.yaml", data, coarse, tmp_path / "out")
     keys = ("shell.youngs_modulus", "magnetic.remanent.flux_density")
     modulus, remanence = (found.parameters[key] for key in keys)

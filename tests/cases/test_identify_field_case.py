@@ -1,4 +1,6 @@
-"""The remanence of a strip as a field of numbers, from two shapes that were computed for a known one."""
+"""The remanence of a strip as a field of numbers, from two shapes that were computed for a known
+one.
+"""
 
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import magshell_fenicsx as ms
 
 @pytest.mark.slow
 def test_identify_field(tmp_path: Path) -> None:
-    """The misfit is at the noise that was added (0.02 mm), and the bands hold the remanence that was put in.
+    """The misfit is at the noise that was added (0.02 mm), and the bands hold the remanence that
+    was put in.
 
     On a coarse mesh, of 12 points, from each third place.
     """
@@ -29,6 +32,8 @@ def test_identify_field(tmp_path: Path) -> None:
     assert np.mean((np.array(field["low"]) < truth) & (truth < np.array(field["high"]))) > 0.85
     assert np.array(field["deviation"]).max() < 0.3
     for noise in found.content["noise"].values():
-        assert noise["deviation"] == pytest.approx(0.02, rel=0.4)  # of some 15 degrees of freedom each
+        assert noise["deviation"] == pytest.approx(
+            0.02, rel=0.4
+        )  # of some 15 degrees of freedom each
     assert 0.7 < found.content["misfit_over_noise"] < 1.1
     assert found.content["normal"]["difference"] < found.content["normal"]["within"]

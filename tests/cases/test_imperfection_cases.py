@@ -8,7 +8,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.public import Scene, run
 
-POLAR = 0.326233289  # of the paper's dimple at the pole; an independent solver of the meridian's equations, nine digits
+# of the paper's dimple at the pole; an independent solver of the meridian's equations, nine digits
+POLAR = 0.326233289
 ONE = "shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2, at: {polar: 40, azimuth: 25}}]"
 
 
@@ -21,7 +22,9 @@ def knockdown(file: str, *settings: str) -> float:
 @pytest.mark.slow
 def test_a_dimple_far_from_the_edge_is_as_at_the_pole() -> None:
     """The clamped edge changes k_d at 40 degrees by 1.1e-4."""
-    assert knockdown("dimple_buckling.yaml", ONE, "mesh.refinement=0.5") == pytest.approx(POLAR, rel=5e-4)
+    assert knockdown("dimple_buckling.yaml", ONE, "mesh.refinement=0.5") == pytest.approx(
+        POLAR, rel=5e-4
+    )
 
 
 @pytest.mark.slow
@@ -32,8 +35,13 @@ def test_two_dimples() -> None:
 
 @pytest.mark.parametrize("model", ["axisymmetric", "half", "solid"])
 def test_the_deviation_is_a_field(model: str) -> None:
-    """For ParaView, where the nodes of the shell are: their distance from the sphere; of a solid in its middle."""
-    settings = ["shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2}]", "mesh.refinement=0.3"]
+    """For ParaView, where the nodes of the shell are: their distance from the sphere; of a solid in
+    its middle.
+    """
+    settings = [
+        "shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2}]",
+        "mesh.refinement=0.3",
+    ]
     if model == "solid":
         settings += ["model=solid", "mesh.degree=2", "shell.radius_to_thickness=20"]
     else:
@@ -41,7 +49,10 @@ def test_the_deviation_is_a_field(model: str) -> None:
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
     surface = gatherer(scene.model, scene.comm).gather(scene.model.zero())
     assert surface
-    w0, away = surface.fields["w0_over_h"], (np.linalg.norm(surface.r0, axis=1) - 1) / scene.problem.material.h
+    w0, away = (
+        surface.fields["w0_over_h"],
+        (np.linalg.norm(surface.r0, axis=1) - 1) / scene.problem.material.h,
+    )
     assert w0.min() == pytest.approx(-1.64, abs=1e-9)
     if model != "solid":
         assert w0 == pytest.approx(away, abs=1e-3)  # r0 is a polynomial between its nodes

@@ -1,4 +1,6 @@
-"""A case file with every kind of imperfection that is not drawn by hand: data, modes, random fields and dimples."""
+"""A case file with every kind of imperfection that is not drawn by hand: data, modes, random fields
+and dimples.
+"""
 
 from pathlib import Path
 
@@ -37,13 +39,20 @@ def case(tmp_path: Path) -> Path:
 @pytest.mark.usefixtures("no_pictures")
 def test_all_kinds_checked_and_run(case: Path) -> None:
     said = magshell("check", case).stdout
-    for words in ("full shell", "0.1 h of mode 1 (m = 6), 0.05 h of mode 2 (m = 7)", "random field of 0.05 h, seed 1"):
+    for words in (
+        "full shell",
+        "0.1 h of mode 1 (m = 6), 0.05 h of mode 2 (m = 7)",
+        "random field of 0.05 h, seed 1",
+    ):
         assert words in said
     assert "scan.csv: 400 values, w0 from -" in said
     one, three = case.parent / "one", case.parent / "three"
     assert magshell("run", case, "--out", one).returncode == 0
     assert started("run", case, "--out", three, ranks=3, pictures=False).returncode == 0
-    here, there = ([float(read_path(folder)[-1][key]) for key in ("w_over_h", "energy")] for folder in (one, three))
+    here, there = (
+        [float(read_path(folder)[-1][key]) for key in ("w_over_h", "energy")]
+        for folder in (one, three)
+    )
     assert there == pytest.approx(here, abs=1e-8)
     membrane = 0.1 * (1 - 0.3) / np.sqrt(3 * (1 - 0.3**2))  # w/h of a perfect sphere
     assert membrane < here[0] < 1.5 * membrane

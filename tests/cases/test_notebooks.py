@@ -21,7 +21,11 @@ def namespace(name: str) -> dict[str, Any]:
 
 
 def test_all_are_here() -> None:
-    assert {file.stem for file in NOTEBOOKS.glob("*.py")} == {"buckling", "foundation", "indentation"}
+    assert {file.stem for file in NOTEBOOKS.glob("*.py")} == {
+        "buckling",
+        "foundation",
+        "indentation",
+    }
 
 
 def test_buckling_in_a_field() -> None:
@@ -61,7 +65,10 @@ def coarse_arch(folder: Path) -> None:
     for each in CASES.iterdir():
         (folder / "cases" / each.name).symlink_to(each)
     case, data = (folder / "cases" / f"identify_arch.{ending}" for ending in ("yaml", "csv"))
-    written, (head, *lines) = case.read_text(encoding="utf-8"), data.read_text(encoding="utf-8").splitlines()
+    written, (head, *lines) = (
+        case.read_text(encoding="utf-8"),
+        data.read_text(encoding="utf-8").splitlines(),
+    )
     coarse = written.partition("  candidates:")[0].replace("size: 10 mm", "size: 20 mm, degree: 3")
     assert coarse.count("degree: 3") == 1
     for file, text in ((case, coarse), (data, "\n".join([head, *lines[::4]]))):
@@ -71,14 +78,18 @@ def coarse_arch(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_python_of_the_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their Python, block after block, as a reader would type it; knockdown: axisymmetric reference.
+    """Their Python, block after block, as a reader would type it; knockdown: axisymmetric
+    reference.
 
-    The arch that is identified is coarse and has fewer data (its numbers: test_identify_case.py); the program without a
-    case has a test of its own (test_without_a_case.py).
+    The arch that is identified is coarse and has fewer data (its numbers: test_identify_case.py);
+    the program without a case has a test of its own (test_without_a_case.py).
     """
     coarse_arch(tmp_path)
     monkeypatch.chdir(tmp_path)
-    text = "".join((CASES.parent / page).read_text(encoding="utf-8") for page in ("docs/api.md", "docs/howto.md"))
+    text = "".join(
+        (CASES.parent / page).read_text(encoding="utf-8")
+        for page in ("docs/api.md", "docs/howto.md")
+    )
     found: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         if not block.startswith("import gmsh\n"):

@@ -1,4 +1,6 @@
-"""A step on which shells would pass through each other is shortened: the same on two ranks, and after a resume."""
+"""A step on which shells would pass through each other is shortened: the same on two ranks, and
+after a resume.
+"""
 
 import json
 import os
@@ -11,7 +13,14 @@ import pytest
 from command import mpirun, read_path
 
 h = 0.005
-STRIP = {"geometry": "plate", "length": 1, "width": 0.1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
+STRIP = {
+    "geometry": "plate",
+    "length": 1,
+    "width": 0.1,
+    "thickness": h,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0,
+}
 HELD = {"left": "clamped", "right": "clamped"}
 CASE: dict[str, Any] = {
     "shells": {
@@ -28,7 +37,8 @@ CASE: dict[str, Any] = {
         "moves": [{"supports": ["upper.left", "upper.right"], "translation": [0, 0, -2 * h]}],
     },
 }  # fmt: skip
-# a step longer than 0.5 counts as one that passes through; the process dies at the second look at a step, if it shall
+# a step longer than 0.5 counts as one that passes through; the process dies at the second look at a
+# step, if it shall
 RUN = """
 import os, sys
 from magshell_fenicsx.cli import main
@@ -63,13 +73,17 @@ def run(folder: Path, *words: str, ranks: int = 1, dies: int = 0) -> int:
 
 @pytest.mark.slow
 def test_shortened_steps(tmp_path: Path) -> None:
-    """Steps, motion and contact force to 1e-9: on one rank; on two, killed behind the shortened step, then resumed."""
+    """Steps, motion and contact force to 1e-9: on one rank; on two, killed behind the shortened
+    step, then resumed.
+    """
     one, resumed = tmp_path / "one", tmp_path / "resumed"
     assert run(one) == 0
     assert run(resumed, ranks=2, dies=4) != 0
     assert run(resumed, "--resume") == 0
     wanted = read_path(one)
-    assert [row["label"] for row in wanted].count("step") >= 2  # that to the first touch, and the shortened one
+    assert [row["label"] for row in wanted].count(
+        "step"
+    ) >= 2  # that to the first touch, and the shortened one
     rows = read_path(resumed)
     assert [row["label"] for row in rows] == [row["label"] for row in wanted]
     for key in ("motion", "contact_force"):

@@ -30,8 +30,8 @@ def forces(data: dict[str, Any], column: str) -> list[float]:
 def test_two_arches_and_a_plane() -> None:
     """The force at approaches of h/2 and h of each, 1e-3.
 
-    Both are halves on the same mesh. That of a whole arch has no sides of cells along the line of contact: on it two
-    arches, and one on the plane, have 1.4 % more force.
+    Both are halves on the same mesh. That of a whole arch has no sides of cells along the line of
+    contact: on it two arches, and one on the plane, have 1.4 % more force.
     """
     top = {"position": [0, 2 + 1.0001 * h, 0], "turn": 180}
     move = {"supports": ["upper.left", "upper.right"], "translation": [0, -2 * h, 0]}
@@ -48,6 +48,8 @@ def test_two_arches_and_a_plane() -> None:
         "shell": ARCH,
         "boundary": HELD,
         "bodies": {"plane": plane},
-        "loading": [{"kind": "contact", "body": "plane", "approach": f, "points": 1} for f in (0.5, 1)],
+        "loading": [
+            {"kind": "contact", "body": "plane", "approach": f, "points": 1} for f in (0.5, 1)
+        ],
     }
     assert forces(both, "contact_force") == pytest.approx(forces(one, "force"), rel=1e-3)

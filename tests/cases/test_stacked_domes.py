@@ -67,7 +67,9 @@ def test_a_dome_lands() -> None:
     (fold,), rest = (row for row in landed if row["label"] == "fold"), landed[-1]
     assert rest["contact_force"] > 0
     assert rest["kinetic"] == 0
-    assert max(abs(row["imbalance"]) for row in landed if "imbalance" in row) < 1e-3 * rest["stored"]
+    assert (
+        max(abs(row["imbalance"]) for row in landed if "imbalance" in row) < 1e-3 * rest["stored"]
+    )
     loading = domes[1]["loading"] | {"displacement": rest["w_over_h"] * 0.036}
     still = run(Case.from_source(Source("still", domes[1] | mesh | {"loading": loading}))).rows[-1]
     assert still["load_factor"] == pytest.approx(fold["load_factor"], rel=1e-5)

@@ -13,9 +13,11 @@ Array = NDArray[np.float64]
 
 
 def touching_pressure(gap: float) -> float:
-    """p R^3/D at which opposite places of an inextensible ring under live pressure are a gap (over R) apart.
+    """p R^3/D at which opposite places of an inextensible ring under live pressure are a gap (over
+    R) apart.
 
-    A quarter of the ring from the x to the y axis: position, angle of the tangent, curvature, force on the section.
+    A quarter of the ring from the x to the y axis: position, angle of the tangent, curvature, force
+    on the section.
     """
 
     def slopes(s: Array, z: Array) -> Array:
@@ -26,7 +28,15 @@ def touching_pressure(gap: float) -> float:
     s = np.linspace(0, np.pi / 2, 401)
     bent = 0.05 * np.array([np.sin(2 * s), 2 * np.cos(2 * s)])
     z = np.stack(
-        [np.cos(s), np.sin(s), np.pi / 2 + s + bent[0], 1 + bent[1], -3 * np.sin(s), -3 * np.cos(s), 3 + 0 * s]
+        [
+            np.cos(s),
+            np.sin(s),
+            np.pi / 2 + s + bent[0],
+            1 + bent[1],
+            -3 * np.sin(s),
+            -3 * np.cos(s),
+            3 + 0 * s,
+        ]
     )
     for half in np.linspace(0.93, gap / 2, 40):
 
@@ -40,13 +50,17 @@ def touching_pressure(gap: float) -> float:
 
 
 def test_the_ring_of_the_comparison() -> None:
-    """5.247 D/R^3 without thickness (Flaherty, Keller and Rubinow, SIAM Journal on Applied Mathematics 23, 1972)."""
+    """5.247 D/R^3 without thickness (Flaherty, Keller and Rubinow, SIAM Journal on Applied
+    Mathematics 23, 1972).
+    """
     assert touching_pressure(0.0) == pytest.approx(5.247, abs=1e-3)
 
 
 @pytest.mark.slow
 def test_collapsing_tube() -> None:
-    """It touches itself where the elastica's walls are a thickness apart, 2e-3, and goes on to twice that pressure."""
+    """It touches itself where the elastica's walls are a thickness apart, 2e-3, and goes on to
+    twice that pressure.
+    """
     case = Case.load(CASES / "collapsing_tube.yaml")
     result = run(case)
     assert result.stopped is None
@@ -62,15 +76,19 @@ def test_collapsing_tube() -> None:
     assert (np.diff(force[first:]) > 0).all()
     assert p[-1] * unit > 2 * meets
     assert gap[first:].min() > -1e-3
-    assert max(row["contact_penalty"] for row in result.rows) == pytest.approx(1e6 / 12)  # no need to be stiffer
+    assert max(row["contact_penalty"] for row in result.rows) == pytest.approx(
+        1e6 / 12
+    )  # no need to be stiffer
     refuse_instabilities(result)
 
 
 @pytest.mark.slow
 def test_no_instability_of_the_points_of_contact() -> None:
-    """On another mesh too: the softest mode of the ring in contact slides, with a stiffness of +0.005 D/R^3.
+    """On another mesh too: the softest mode of the ring in contact slides, with a stiffness of
+    +0.005 D/R^3.
 
-    The zone of contact is narrower than the distance of the points on cells, which would push the ring along with them.
+    The zone of contact is narrower than the distance of the points on cells, which would push the
+    ring along with them.
     """
     refuse_instabilities(run(Case.load(CASES / "collapsing_tube.yaml", ["mesh.size=0.2"])))
 

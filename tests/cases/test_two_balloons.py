@@ -1,7 +1,9 @@
-"""The case "two_balloons.yaml" against Adkins and Rivlin's membrane, blown up against a plane without friction.
+"""The case "two_balloons.yaml" against Adkins and Rivlin's membrane, blown up against a plane
+without friction.
 
-Two equal balloons meet in the plane between them. Where a membrane lies on it the slope is zero, and nothing else
-changes: with the arc length S of the undeformed disc, its radius S, and forces F = S W_1 (see test_balloon.py)
+Two equal balloons meet in the plane between them. Where a membrane lies on it the slope is zero,
+and nothing else changes: with the arc length S of the undeformed disc, its radius S, and forces F =
+S W_1 (see test_balloon.py)
 
     F' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   F phi' = p l1 r - W_2 sin phi,   phi = 0 up to S = c.
 """
@@ -36,16 +38,26 @@ def end(stretch: float, c: float, p: float) -> tuple[float, float, float, float]
         one = stretched(F / S, r / S)
         W2, slope = tension(r / S, one), (p * one * r - tension(r / S, one) * np.sin(phi)) / F
         down = one * np.sin(phi)
-        return [W2 * np.cos(phi), one * np.cos(phi), -down, 0.0 if c >= S else slope, np.pi * r**2 * down]
+        return [
+            W2 * np.cos(phi),
+            one * np.cos(phi),
+            -down,
+            0.0 if c >= S else slope,
+            np.pi * r**2 * down,
+        ]
 
     e, close = 1e-3, {"rtol": 1e-8, "atol": 1e-10}
-    flat = solve_ivp(rates, (e, c), [e * tension(stretch, stretch), stretch * e, 0, 0, 0], **close).y[:, -1]
+    flat = solve_ivp(
+        rates, (e, c), [e * tension(stretch, stretch), stretch * e, 0, 0, 0], **close
+    ).y[:, -1]
     rim = solve_ivp(rates, (c * (1 + 1e-12), 1), flat, **close).y[:, -1]
     return float(rim[1]), float(rim[2]), float(rim[4]), float(flat[1])
 
 
 def blown(volume: float, height: float) -> tuple[float, float]:
-    """The pressure over E h/R and the radius of the contact, of a balloon of this volume under a plane so high."""
+    """The pressure over E h/R and the radius of the contact, of a balloon of this volume under a
+    plane so high.
+    """
 
     def off(unknown: np.ndarray) -> list[float]:
         r, z, swept, _ = end(*unknown)

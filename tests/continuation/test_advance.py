@@ -1,4 +1,6 @@
-"""Steps of the size that a tolerance needs, and how late a snap comes under a load that rises past a fold."""
+"""Steps of the size that a tolerance needs, and how late a snap comes under a load that rises past
+a fold.
+"""
 
 import numpy as np
 import pytest
@@ -34,7 +36,9 @@ def delay(rate: float, mass: float, drag: float) -> float:
 
 @pytest.mark.parametrize(("mass", "drag", "exponent"), [(1.0, 0.0, 4 / 5), (1e-4, 1.0, 2 / 3)])
 def test_exponent(mass: float, drag: float, exponent: float) -> None:
-    """M x'' + c x' = a + x^2 with a = rate t: times are like rate^(-1/5) with inertia, rate^(-1/3) with drag."""
+    """M x'' + c x' = a + x^2 with a = rate t: times are like rate^(-1/5) with inertia, rate^(-1/3)
+    with drag.
+    """
     rates = np.array([2e-5, 5e-6])
     late = [delay(rate, mass, drag) for rate in rates]
     found = np.log(late[0] / late[1]) / np.log(rates[0] / rates[1])
@@ -67,6 +71,8 @@ def test_a_fixed_step_grows_again() -> None:
         return "no" if now.t < 0.1 and dt > 0.02 else solve(now, dt)
 
     integrator.step = failing  # type: ignore[method-assign]
-    advance(integrator, integrator.begin(0.0, START, np.zeros(2)), 2.0, TimeSteps(0.1, 1.0, 0.1), 0.1)
+    advance(
+        integrator, integrator.begin(0.0, START, np.zeros(2)), 2.0, TimeSteps(0.1, 1.0, 0.1), 0.1
+    )
     assert taken[-1] > 0.09
     assert len(taken) < 45

@@ -1,4 +1,6 @@
-"""Factors of the sparse part of K + D in place of those of all of it: dense eigenvalues and solutions by NumPy."""
+"""Factors of the sparse part of K + D in place of those of all of it: dense eigenvalues and
+solutions by NumPy.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ SIZE = 60
 
 
 def beside(soft: list[float], moved: float, noise: float) -> tuple[Array, Array]:
-    """K with these eigenvalues beside those from 1 to 1e4, and D that adds a number to them and noise to all."""
+    """K with these eigenvalues beside those from 1 to 1e4, and D that adds a number to them and
+    noise to all.
+    """
     random = np.random.default_rng(1)
     Q = np.linalg.qr(random.standard_normal((SIZE, SIZE)))[0]
     eigenvalues = np.concatenate([soft, np.geomspace(1, 1e4, SIZE - len(soft))])
@@ -36,7 +40,9 @@ def beside(soft: list[float], moved: float, noise: float) -> tuple[Array, Array]
     ],
 )
 def test_inertia_and_solutions(soft: list[float], moved: float) -> None:
-    """Negative pivots of K + D are its negative eigenvalues, and solutions those of NumPy, from factors of K."""
+    """Negative pivots of K + D are its negative eigenvalues, and solutions those of NumPy, from
+    factors of K.
+    """
     K0, D = beside(soft, moved, 1e-5)
     factors, b = Factorisation(MPI.COMM_SELF), np.cos(np.arange(SIZE))
     factors.factor(Beside(dense(K0), Full(D)))
@@ -47,7 +53,9 @@ def test_inertia_and_solutions(soft: list[float], moved: float) -> None:
     error = 1e-9 / min(1.0, 1e2 * np.abs(eigenvalues).min())
     assert np.linalg.norm(factors.solve(b) - exact) < error * np.linalg.norm(exact)
     assert np.linalg.norm(factors.times(exact) - b) < 1e-6 * np.linalg.norm(b)
-    assert factors.doubt > 1 or np.sum(np.linalg.eigvalsh(K0 + 2 * D) < 0) == factors.negative_pivots
+    assert (
+        factors.doubt > 1 or np.sum(np.linalg.eigvalsh(K0 + 2 * D) < 0) == factors.negative_pivots
+    )
 
 
 def test_what_is_not_small() -> None:
@@ -60,7 +68,9 @@ def test_what_is_not_small() -> None:
 
 
 def test_an_older_part_is_corrected_where_the_count_depends_on_it() -> None:
-    """D of an earlier state, by which K + D is still definite: the count is that of the present, by two products."""
+    """D of an earlier state, by which K + D is still definite: the count is that of the present, by
+    two products.
+    """
     K, D = beside([0.02], -0.015, 1e-5)
     present, products = 1.5 * D, 0
 

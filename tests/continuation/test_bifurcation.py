@@ -54,7 +54,10 @@ def test_pitchfork_at_load_one(load: float, stiffening: float) -> None:
 
 def test_a_split_pitchfork_is_found_where_it_would_be_whole() -> None:
     found = find_bifurcation(
-        BorderedNewton(pitchfork(imperfection=1e-6)), at([0.9, 0.01], 0.9), np.array([0.0, 1.0]), "load"
+        BorderedNewton(pitchfork(imperfection=1e-6)),
+        at([0.9, 0.01], 0.9),
+        np.array([0.0, 1.0]),
+        "load",
     )
     assert found.state.mu["load"] == pytest.approx(1.0, abs=1e-9)
 
@@ -63,7 +66,9 @@ def test_a_pitchfork_behind_an_arch() -> None:
     """x = c = 0.3: load = f(c), see `toys.snap_back`."""
     toy, c = snap_back(0.5, 0.3), 0.3
     f = c**3 - 3 * c**2 + 2 * c
-    found = find_bifurcation(BorderedNewton(toy), at([0.9, 0.28, 0.0], 0.3), np.array([0.0, 0.0, 1.0]), "load")
+    found = find_bifurcation(
+        BorderedNewton(toy), at([0.9, 0.28, 0.0], 0.3), np.array([0.0, 0.0, 1.0]), "load"
+    )
     assert found.state.mu["load"] == pytest.approx(f, abs=1e-9)
     assert found.state.u == pytest.approx([c + f / 0.5, c, 0.0], abs=1e-8)
 
@@ -80,7 +85,10 @@ def path_through(toy: Toy) -> list[tuple[float, float]]:
     low = path.start(at([0.0] * toy.size, 0.0))
     found = []
     for high, _ in path.towards(low, [1.9]):
-        found += [(event.point.state.mu["load"], event.point.load_error) for event in instabilities(path, low, high)]
+        found += [
+            (event.point.state.mu["load"], event.point.load_error)
+            for event in instabilities(path, low, high)
+        ]
         low = high
     return found
 
@@ -94,7 +102,9 @@ def test_noise_moves_a_bifurcation_by_its_estimated_error(level: float, seed: in
 
 
 def test_what_cannot_be_located_is_reported_with_its_bracket_and_the_path_goes_on() -> None:
-    """Two modes of the same load are no simple bifurcation: Pi_0 = u^2/2 + (1 - u)(v^2 + w^2)/2 + (v^4 + w^4)/4."""
+    """Two modes of the same load are no simple bifurcation: Pi_0 = u^2/2 + (1 - u)(v^2 + w^2)/2 +
+    (v^4 + w^4)/4.
+    """
 
     def gradient(x: Vector) -> Vector:
         u, v, w = x

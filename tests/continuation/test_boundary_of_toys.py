@@ -39,7 +39,8 @@ class OfToys:
 def arch(rise: float) -> Toy:
     """A shallow pinned arch of rise e under a half-sine load (Fung and Kaplan, NACA TN 2840).
 
-    Pi_0 = (a - e)^2 + 16 b^2 + (e^2 - a^2 - 4 b^2)^2/2 with a, b of the first two sines; the load is on -a.
+    Pi_0 = (a - e)^2 + 16 b^2 + (e^2 - a^2 - 4 b^2)^2/2 with a, b of the first two sines; the load
+    is on -a.
     """
 
     def gradient(x: np.ndarray) -> np.ndarray:
@@ -50,7 +51,9 @@ def arch(rise: float) -> Toy:
     def hessian(x: np.ndarray) -> np.ndarray:
         a, b = rise - x[0], x[1]
         m = rise**2 - a**2 - 4 * b**2
-        return np.array([[2 - 2 * m + 4 * a**2, -16 * a * b], [-16 * a * b, 32 - 8 * m + 64 * b**2]])
+        return np.array(
+            [[2 - 2 * m + 4 * a**2, -16 * a * b], [-16 * a * b, 32 - 8 * m + 64 * b**2]]
+        )
 
     return Toy(gradient, hessian, 2)
 
@@ -60,18 +63,27 @@ def load_of(a: float, rise: float) -> float:
 
 
 def followed(
-    kind: Kind, rise: float, a: float, phi: list[float], ends: tuple[float, float], toys: OfToys | None = None
+    kind: Kind,
+    rise: float,
+    a: float,
+    phi: list[float],
+    ends: tuple[float, float],
+    toys: OfToys | None = None,
 ) -> list[tuple[Label, Locus]]:
     boundary = Boundary(toys or OfToys(arch), "load", kind, (10.0, ends[1] - ends[0]))
-    start = boundary.start(rise, State(np.array([rise - a, 0.0]), {"load": load_of(a, rise)}), np.array(phi))
+    start = boundary.start(
+        rise, State(np.array([rise - a, 0.0]), {"load": load_of(a, rise)}), np.array(phi)
+    )
     return [("start", start), *boundary.followed(start, -1.0, ends, 20)]
 
 
 @pytest.mark.parametrize("costly", [False, True])
 def test_folds_through_a_cusp(costly: bool) -> None:
-    """Folds at a^2 = (e^2 - 1)/3, born at e = 1, where the load is 2; no antisymmetric mode below e^2 = 5.5.
+    """Folds at a^2 = (e^2 - 1)/3, born at e = 1, where the load is 2; no antisymmetric mode below
+    e^2 = 5.5.
 
-    Where each p costs a system, a point far from the cusp takes one of them, but for the first ones.
+    Where each p costs a system, a point far from the cusp takes one of them, but for the first
+    ones.
     """
     toys = OfToys(arch, costly)
     found = followed("fold", 2.2, np.sqrt((2.2**2 - 1) / 3), [1.0, 0.0], (0.5, 2.3), toys)
@@ -91,7 +103,9 @@ def test_folds_through_a_cusp(costly: bool) -> None:
 
 
 def test_a_fold_meets_a_bifurcation() -> None:
-    """At e^2 = 5.5 the antisymmetric mode is neutral at the fold; its own boundary a^2 = e^2 - 4 turns at e = 2."""
+    """At e^2 = 5.5 the antisymmetric mode is neutral at the fold; its own boundary a^2 = e^2 - 4
+    turns at e = 2.
+    """
     fold = followed("fold", 2.6, np.sqrt((2.6**2 - 1) / 3), [1.0, 0.0], (2.1, 2.7))
     (met,) = (locus for label, locus in fold if label == "meeting")
     assert met.p == pytest.approx(np.sqrt(5.5), abs=1e-6)
@@ -113,7 +127,10 @@ def test_bifurcations_turn() -> None:
 
 @dataclass
 class WithoutModes(OfToys):
-    """The arch's first sine alone. It excludes the second one and another, neutral at thrusts of 4 and 2 e - 1.6."""
+    """The arch's first sine alone.
+
+    It excludes the second one and another, neutral at thrusts of 4 and 2 e - 1.6.
+    """
 
     def factored(self, p: float, state: State, m: int) -> Factorisation:
         matrix = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
@@ -136,16 +153,24 @@ def neutral(m: int, rise: float) -> float:
 
 @pytest.mark.parametrize("costly", [False, True])
 @pytest.mark.parametrize(("m", "rise", "way"), [(1, 3.2, -1.0), (2, 2.45, 1.0)])
-def test_two_families_of_excluded_modes_cross(costly: bool, m: int, rise: float, way: float) -> None:
+def test_two_families_of_excluded_modes_cross(
+    costly: bool, m: int, rise: float, way: float
+) -> None:
     """At a rise of 2.8; on its way each is the first one, up to there."""
 
     def first(rise: float) -> Toy:
         gradient, hessian = arch(rise).gradient, arch(rise).hessian
-        return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+        return Toy(
+            lambda x: gradient(np.append(x, 0.0))[:1],
+            lambda x: hessian(np.append(x, 0.0))[:1, :1],
+            1,
+        )
 
     a = np.sqrt(rise**2 - neutral(m, rise))
     boundary = Boundary(WithoutModes(first, costly), "load", "bifurcation", (10.0, 1.0), m=m)
-    start = boundary.start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1))
+    start = boundary.start(
+        rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1)
+    )
     found = [*boundary.followed(start, way, (2.42, 3.3), 20)]
     for label, locus in found:
         a = np.sqrt(locus.p**2 - neutral(m, locus.p))
@@ -169,7 +194,9 @@ class WithoutPairs(WithoutModes):
         return factors
 
     def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
-        return float(sum(super(WithoutPairs, self).along(p, state, i, v[i - 1 : i]) for i in (1, 2)))
+        return float(
+            sum(super(WithoutPairs, self).along(p, state, i, v[i - 1 : i]) for i in (1, 2))
+        )
 
     def counts(self, p: float, state: State) -> list[int]:
         return [sum(self.along(p, state, 1, v) < 0 for v in np.eye(2))]
@@ -177,16 +204,26 @@ class WithoutPairs(WithoutModes):
 
 @pytest.mark.parametrize(("rise", "way", "first"), [(3.2, -1.0, 1), (2.45, 1.0, 2)])
 def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> None:
-    """At a rise of 2.8 again; the boundary goes on with the other mode, which is then the first one."""
+    """At a rise of 2.8 again; the boundary goes on with the other mode, which is then the first
+    one.
+    """
 
     def alone(rise: float) -> Toy:
         gradient, hessian = arch(rise).gradient, arch(rise).hessian
-        return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+        return Toy(
+            lambda x: gradient(np.append(x, 0.0))[:1],
+            lambda x: hessian(np.append(x, 0.0))[:1, :1],
+            1,
+        )
 
     a = np.sqrt(rise**2 - neutral(first, rise))
     mode = Boundary(WithoutPairs(alone), "load", "bifurcation", (10.0, 1.0), m=1)
-    start = mode.start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.eye(2)[first - 1])
-    found = [*critical(lambda *_: mode, lambda at, *_: at.phi[::-1], mode, start, way, (2.42, 3.3), 20)]
+    start = mode.start(
+        rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.eye(2)[first - 1]
+    )
+    found = [
+        *critical(lambda *_: mode, lambda at, *_: at.phi[::-1], mode, start, way, (2.42, 3.3), 20)
+    ]
     (crossing,) = (locus for label, locus, _ in found if label == "crossing")
     assert (crossing.met, crossing.p) == (1, pytest.approx(2.8, abs=1e-7))
     for label, locus, _ in found:
@@ -200,7 +237,9 @@ def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> N
 def first_sine(rise: float) -> Toy:
     """The arch's first sine alone."""
     gradient, hessian = arch(rise).gradient, arch(rise).hessian
-    return Toy(lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1)
+    return Toy(
+        lambda x: gradient(np.append(x, 0.0))[:1], lambda x: hessian(np.append(x, 0.0))[:1, :1], 1
+    )
 
 
 @dataclass
@@ -225,7 +264,15 @@ class WithoutThree(WithoutModes):
 
 @pytest.mark.parametrize(
     ("gap", "missed"),
-    [(0.0, False), (-1e-9, False), (-1e-6, False), (1e-6, False), (1e-3, False), (0.0, True), (-1e-6, True)],
+    [
+        (0.0, False),
+        (-1e-9, False),
+        (-1e-6, False),
+        (1e-6, False),
+        (1e-3, False),
+        (0.0, True),
+        (-1e-6, True),
+    ],
 )
 def test_the_first_of_three_modes_that_meet_is_followed(
     gap: float, missed: bool, monkeypatch: pytest.MonkeyPatch
@@ -239,7 +286,11 @@ def test_the_first_of_three_modes_that_meet_is_followed(
     toys = WithoutThree(first_sine, gap=gap)
     meeting = Boundary._meeting
     if missed:
-        monkeypatch.setattr(Boundary, "_meeting", lambda self, *args: None if args[-1] == 3 else meeting(self, *args))
+        monkeypatch.setattr(
+            Boundary,
+            "_meeting",
+            lambda self, *args: None if args[-1] == 3 else meeting(self, *args),
+        )
 
     def curve(m: int, *_: object) -> Boundary:
         return Boundary(toys, "load", "bifurcation", (10.0, 1.0), m=m)
@@ -253,7 +304,9 @@ def test_the_first_of_three_modes_that_meet_is_followed(
     for label, locus, on in found:
         first = min(toys.neutral(m, locus.p) for m in (1, 2, 3))
         assert toys.neutral(on.m, locus.p) == pytest.approx(first, abs=1e-6)
-        assert locus.state.mu["load"] == pytest.approx(load_of(np.sqrt(locus.p**2 - first), locus.p), rel=1e-6)
+        assert locus.state.mu["load"] == pytest.approx(
+            load_of(np.sqrt(locus.p**2 - first), locus.p), rel=1e-6
+        )
         assert not locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
 
 
@@ -267,7 +320,9 @@ def test_a_start_is_that_of_the_first_of_two_modes_that_are_near(gap: float, tak
         return Boundary(toys, "load", "bifurcation", (10.0, 1.0), m=m)
 
     a = np.sqrt(rise**2 - neutral(2, rise))
-    start = curve(2).start(rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1))
+    start = curve(2).start(
+        rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1)
+    )
     mode, begun = first_mode(curve, lambda *_: np.ones(1), curve(2), start)
     thrust = rise**2 - (rise - begun.state.u[0]) ** 2
     assert mode.m == taken

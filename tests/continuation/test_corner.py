@@ -1,7 +1,8 @@
-"""A body on a spring that snaps against a stop: by arc length, its load falls to the touch and rises at once behind it.
+"""A body on a spring that snaps against a stop: by arc length, its load falls to the touch and
+rises at once behind it.
 
-A softening spring, f = x^3 - 3 x^2 + 2 x, carries a body with x <= X but for the penalty; the load pulls at its other
-end by a linear spring, q = x + load/K. All of it is known in closed form.
+A softening spring, f = x^3 - 3 x^2 + 2 x, carries a body with x <= X but for the penalty; the load
+pulls at its other end by a linear spring, q = x + load/K. All of it is known in closed form.
 """
 
 import numpy as np
@@ -68,18 +69,24 @@ def way_to_touch(here: State, guess: State) -> Ahead:
 
 def walked(load: float, first: float) -> list[tuple[Label, Point]]:
     newton = BorderedNewton(stop(), NewtonOptions(fresh=0.0, patience=7, stiffnesses={"stop": 1.0}))
-    path = Path(newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch)
+    path = Path(
+        newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch
+    )
     return list(Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("target", [load])))
 
 
 @pytest.mark.parametrize("first", [0.02, 0.1])
 def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
-    """Folds at f' = 0 and at the touch, between them one unstable direction; then the stop bears what f does not."""
+    """Folds at f' = 0 and at the touch, between them one unstable direction; then the stop bears
+    what f does not.
+    """
     passed = walked(0.6, first)
     folds = [point for label, point in passed if label == "fold"]
     assert [point.negative_pivots for point in folds] == [0, 1]
     assert folds[0].state.mu["load"] == pytest.approx(f(1 - 1 / np.sqrt(3)), rel=1e-8)
-    assert folds[1].state.mu["load"] == pytest.approx(f(X), rel=1e-4)  # the penalty sets in over SOFT
+    assert folds[1].state.mu["load"] == pytest.approx(
+        f(X), rel=1e-4
+    )  # the penalty sets in over SOFT
     assert len(passed) < 60, "it does not creep"
     q, x = passed[-1][1].state.u
     assert passed[-1][0] == "target"

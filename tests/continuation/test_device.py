@@ -1,11 +1,13 @@
-"""Loading devices: amplitudes that are unknown since their conjugates are held, against sums made by hand.
+"""Loading devices: amplitudes that are unknown since their conjugates are held, against sums made
+by hand.
 
-An arch x with V = x^4/4 - x^3 + x^2 under a force f, held by springs to y (k) and z (n), which a spring m joins; a
-pressure p pushes y, and a body at d presses on z through a spring c:
+An arch x with V = x^4/4 - x^3 + x^2 under a force f, held by springs to y (k) and z (n), which a
+spring m joins; a pressure p pushes y, and a body at d presses on z through a spring c:
 
     Pi = V(x) + k (x - y)^2/2 + n (x - z)^2/2 + m (y - z)^2/2 + c (z - d)^2/2 - f x - p y
 
-What y and z leave of their springs is a stiffness s on x, so that the arch folds where V'' = 3x^2 - 6x + 2 = -s.
+What y and z leave of their springs is a stiffness s on x, so that the arch folds where V'' = 3x^2 -
+6x + 2 = -s.
 """
 
 from dataclasses import dataclass
@@ -53,7 +55,12 @@ class Machine:
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         arch = np.array([u[0] ** 3 - 3 * u[0] ** 2 + 2 * u[0], 0, 0])
-        return arch + self.springs() @ u + mu["d"] * self.load(u, mu, "d") - np.array([mu["f"], mu["p"], 0])
+        return (
+            arch
+            + self.springs() @ u
+            + mu["d"] * self.load(u, mu, "d")
+            - np.array([mu["f"], mu["p"], 0])
+        )
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         return np.array([0, 0, -self.c]) if name == "d" else -np.eye(3)[PLACE[name]]
@@ -64,14 +71,22 @@ class Machine:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         return self.c if name == other == "d" else 0.0
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: list[Weighted] | tuple[()] = ()) -> PETSc.Mat:
-        self.K.setValues(range(3), range(3), self.springs() + np.diag([3 * u[0] ** 2 - 6 * u[0] + 2, 0, 0]))
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: list[Weighted] | tuple[()] = ()
+    ) -> PETSc.Mat:
+        self.K.setValues(
+            range(3), range(3), self.springs() + np.diag([3 * u[0] ** 2 - 6 * u[0] + 2, 0, 0])
+        )
         self.K.assemble()
         return self.K
 
 
 REST = State(np.zeros(3), {"f": 0.0, "p": 0.0, "d": 0.0})
-HELD: dict[str, dict[str, float]] = {"loads": {}, "y": {"p": HEIGHT}, "y and force": {"p": HEIGHT, "d": FORCE}}
+HELD: dict[str, dict[str, float]] = {
+    "loads": {},
+    "y": {"p": HEIGHT},
+    "y and force": {"p": HEIGHT, "d": FORCE},
+}
 # s for k, m, n, c = 0.3, 0.2, 0.1, 0.4, from eliminating y and z, only z, or z without the spring c
 STIFFNESS = {"loads": 0.4 - 8 / 31, "y": 0.4 - 0.01 / 0.7, "y and force": 0.4 - 0.01 / 0.3}
 PUSH = {"loads": 0.0, "y": -0.3 * HEIGHT - 0.1 * 0.2 * HEIGHT / 0.7}  # f at x = 0
@@ -133,7 +148,9 @@ def test_what_is_held_stays() -> None:
 
 
 def test_a_coordinate_is_unstable_where_a_force_is_not() -> None:
-    """z alone has the stiffness n + m = -0.1: the body at d holds it, a dead force on the body does not."""
+    """z alone has the stiffness n + m = -0.1: the body at d holds it, a dead force on the body does
+    not.
+    """
     for device, unstable in (("y", 0), ("y and force", 1)):
         newton, rest = under(device, Machine(m=-0.2))
         assert newton.factor_at(rest).negative_pivots == unstable
@@ -154,7 +171,9 @@ def test_eigenpair_of_the_edged_tangent() -> None:
 
 
 def test_solving_where_the_inner_tangent_is_singular_but_for_rounding() -> None:
-    """At the fold under loads the tangent with y held is regular; elimination by the singular K is refined."""
+    """At the fold under loads the tangent with y held is regular; elimination by the singular K is
+    refined.
+    """
     newton, rest = under("y")
     x = 1 - np.sqrt((1 - STIFFNESS["loads"]) / 3) + 1e-9
     state = State(np.array([x, *rest.u[1:]]), rest.mu)

@@ -1,4 +1,6 @@
-"""Factors of tangents that change, banded ones against NumPy's eigenvalues, and the condition of a known spectrum."""
+"""Factors of tangents that change, banded ones against NumPy's eigenvalues, and the condition of a
+known spectrum.
+"""
 
 import resource
 from collections.abc import Callable
@@ -48,7 +50,9 @@ def test_null_vector_survives_an_exactly_singular_matrix() -> None:
 
 @pytest.mark.parametrize(("across", "unstable"), [(1.0, 0), (0.1, 1)])
 def test_inertia_of_a_skewed_tangent(across: float, unstable: int) -> None:
-    """Of [-0.1 c; -c 1], whose determinant is c^2 - 0.1: K alone has a negative pivot, a large c makes up for it."""
+    """Of [-0.1 c; -c 1], whose determinant is c^2 - 0.1: K alone has a negative pivot, a large c
+    makes up for it.
+    """
     N, factors = matrix([0.0, 0.0]), Factorisation(MPI.COMM_SELF)
     N.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     N.setValue(0, 1, across)
@@ -60,7 +64,9 @@ def test_inertia_of_a_skewed_tangent(across: float, unstable: int) -> None:
     assert factors.negative_pivots == unstable
     assert factors.skewed
     assert factors.solve(np.array([1.0, 2.0])) == pytest.approx(np.linalg.solve(A, [1.0, 2.0]))
-    assert factors.solve_transposed(np.array([1.0, 2.0])) == pytest.approx(np.linalg.solve(A.T, [1.0, 2.0]))
+    assert factors.solve_transposed(np.array([1.0, 2.0])) == pytest.approx(
+        np.linalg.solve(A.T, [1.0, 2.0])
+    )
     factors.factor(K)
     assert (factors.skewed, factors.negative_pivots) == (False, 1)
     assert factors.solve(np.ones(2)) == pytest.approx([-10.0, 1.0])
@@ -102,7 +108,9 @@ def test_blocks(bs: int) -> None:
         factors = Factorisation(MPI.COMM_SELF)
         for _ in range(2):
             factors.factor(K)
-            assert factors.solve(np.ones(6)) == pytest.approx(np.linalg.solve(A - shift * np.eye(6), np.ones(6)))
+            assert factors.solve(np.ones(6)) == pytest.approx(
+                np.linalg.solve(A - shift * np.eye(6), np.ones(6))
+            )
             assert factors.negative_pivots == negative
 
 
@@ -124,7 +132,9 @@ def test_another_matrix_or_another_pattern(monkeypatch: pytest.MonkeyPatch, defi
 
 
 @pytest.mark.parametrize("number", [81, 92, 76])
-def test_mumps_takes_over_where_cholmod_cannot(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_mumps_takes_over_where_cholmod_cannot(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
     """Not positive definite; no CHOLMOD there; too large for it."""
     factors = failing(monkeypatch, number)
     factors.factor(matrix([2.0, 4.0]))
@@ -148,7 +158,9 @@ def refused(new_pc: Callable[..., PETSc.PC], K: PETSc.Mat, solver: str, *kind: s
 
 
 def test_cholmod_comes_back() -> None:
-    """After two matrices that MUMPS finds definite; one that is not in between begins the count again."""
+    """After two matrices that MUMPS finds definite; one that is not in between begins the count
+    again.
+    """
     factors, used = Factorisation(MPI.COMM_SELF), []
     K = matrix([2.0, 4.0])
     for last in (4.0, -4.0, 1.0, -2.0, 3.0, 5.0, 6.0, 7.0, -1.0):

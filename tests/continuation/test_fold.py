@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from continuation.toys import Toy, pitchfork, snap_back, snap_through
 
-from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, fold_ahead, predict_fold, sensitivity
+from magshell_fenicsx.continuation.fold import (
+    Fold,
+    FoldLost,
+    Guess,
+    find_fold,
+    fold_ahead,
+    predict_fold,
+    sensitivity,
+)
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
@@ -50,7 +58,9 @@ def test_a_found_fold_is_found_again(toy: Toy) -> None:
 
 
 def test_other_unstable_directions_are_counted() -> None:
-    """Behind a spring the arch folds in the load at x = 1 -+ 1/sqrt(3); the column is unstable beyond x = c."""
+    """Behind a spring the arch folds in the load at x = 1 -+ 1/sqrt(3); the column is unstable
+    beyond x = c.
+    """
     x = 1 - 1 / np.sqrt(3)
     f = x**3 - 3 * x**2 + 2 * x
     for c, unstable in ((0.6, 0), (0.2, 1)):
@@ -78,7 +88,9 @@ def column_fold(imperfection: float) -> Fold:
 
 @pytest.mark.parametrize("imperfection", [1e-4, 1e-2, 0.1])
 def test_imperfection_sensitivity_is_koiters(imperfection: float) -> None:
-    """The load at the fold, 1 - 3 (imperfection/2)^(2/3), and its derivative from the null vector; R_p = (0, -1)."""
+    """The load at the fold, 1 - 3 (imperfection/2)^(2/3), and its derivative from the null vector;
+    R_p = (0, -1).
+    """
     fold = column_fold(imperfection)
     assert fold.value == pytest.approx(koiter(imperfection), rel=1e-10)
     found = sensitivity(pitchfork(imperfection, -0.5), fold, np.array([0.0, -1.0]))
@@ -97,7 +109,9 @@ def test_fold_is_followed_through_a_parameter() -> None:
 
 @pytest.mark.parametrize(("earlier", "expected"), [((0.0, 1.0), 16.0), ((0.0, 50.0), 9.0)])
 def test_prediction_has_the_least_residual(earlier: tuple[float, float], expected: float) -> None:
-    """Equilibrium is u = p^2: a quadratic meets it; if the fold before was off, the last one alone is best."""
+    """Equilibrium is u = p^2: a quadratic meets it; if the fold before was off, the last one alone
+    is best.
+    """
     fold = fold_near(snap_through(), [0.4], 0.3)
     at_4 = Toy(lambda u: u - 16.0, lambda u: np.eye(1), 1)
     known = [

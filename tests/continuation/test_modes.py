@@ -12,7 +12,13 @@ from toys import matrix, pitchfork, snap_through
 
 from magshell_fenicsx.continuation import modes
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair, lowest_modes, nearest_to_zero, null_vector
+from magshell_fenicsx.continuation.modes import (
+    ModesNotFound,
+    NoEigenpair,
+    lowest_modes,
+    nearest_to_zero,
+    null_vector,
+)
 
 N, HELD = 60, 7
 SPECTRA = {
@@ -108,7 +114,9 @@ def test_spectrum_is_found(spectrum: list[float]) -> None:
     K, M = pencil(spectrum)
     lowest = lowest_modes(K, M, 4)
     expected = sorted(spectrum)[: max(4, sum(value < 0 for value in spectrum))]
-    assert [mode.eigenvalue for mode in lowest] == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(spectrum).max())
+    assert [mode.eigenvalue for mode in lowest] == pytest.approx(
+        expected, rel=1e-9, abs=1e-9 * np.abs(spectrum).max()
+    )
 
 
 def test_vectors_are_eigenvectors_of_length_one() -> None:
@@ -139,7 +147,9 @@ def test_toys() -> None:
         (mode,) = lowest_modes(arch.tangent(np.array([u]), {"load": 0.0}), matrix(np.eye(1)), 3)
         assert mode.eigenvalue == pytest.approx(3 * u**2 - 6 * u + 2, rel=1e-12)
     for u in (0.4, 0.999, 1.5):
-        first, second = lowest_modes(column.tangent(np.array([u, 0.0]), {"load": 0.0}), matrix(np.eye(2)), 2)
+        first, second = lowest_modes(
+            column.tangent(np.array([u, 0.0]), {"load": 0.0}), matrix(np.eye(2)), 2
+        )
         assert first.eigenvalue == pytest.approx(1 - u, rel=1e-9)
         assert second.eigenvalue == pytest.approx(1.0, rel=1e-12)
         assert abs(first.vector) == pytest.approx([0, 1], abs=1e-9)

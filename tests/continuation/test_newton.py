@@ -21,9 +21,21 @@ FULL, CHORD = True, False
         ([(1e-10, FULL)], 0.0, "converged"),  # the next step is the error, whatever came before
         ([(1.0, FULL), (1e-2, CHORD), (5e-10, CHORD)], 0.0, "converged"),
         ([(1e-5, FULL), (9e-6, FULL)], 1e-12, "go on"),  # a stall far above rounding is no solution
-        ([(1e-5, FULL), (9e-6, FULL)], 2e-6, "rounding"),  # one at its level is, but not to the tolerance
-        ([(1e-5, CHORD), (9e-6, FULL)], 2e-6, "go on"),  # a new matrix has yet to show what it can do
-        ([(1e-7, FULL), (1e-9, CHORD), (2e-8, FULL)], 0.0, "go on"),  # the old matrix had hidden the error
+        (
+            [(1e-5, FULL), (9e-6, FULL)],
+            2e-6,
+            "rounding",
+        ),  # one at its level is, but not to the tolerance
+        (
+            [(1e-5, CHORD), (9e-6, FULL)],
+            2e-6,
+            "go on",
+        ),  # a new matrix has yet to show what it can do
+        (
+            [(1e-7, FULL), (1e-9, CHORD), (2e-8, FULL)],
+            0.0,
+            "go on",
+        ),  # the old matrix had hidden the error
         ([(1e-3, FULL), (1e-4, FULL), (1e-4, CHORD), (1e-2, FULL)], 0.0, "diverged"),
         ([(1.0, FULL), (0.9, FULL), (0.8, FULL), (0.7, FULL), (0.6, FULL)], 0.0, "diverged"),
         ([(2e4, FULL)], 0.0, "diverged"),
@@ -51,7 +63,9 @@ def steep() -> Toy:
 
 
 def from_afar(toy: Toy) -> Outcome:
-    return BorderedNewton(toy).solve(State(np.full(1, 3.0), {"load": 0.0}), "load", GivenLoad("load", 0.0))
+    return BorderedNewton(toy).solve(
+        State(np.full(1, 3.0), {"load": 0.0}), "load", GivenLoad("load", 0.0)
+    )
 
 
 @pytest.mark.parametrize("prefix", ["", "magshell_"])
@@ -87,8 +101,13 @@ def test_snes_reports(options: PETSc.Options, capfd: pytest.CaptureFixture[str])
 
 
 def test_the_linear_solver_serves_others(options: PETSc.Options) -> None:
-    """A Krylov method and an error-oriented line search solve for other right sides than the residual."""
-    start, row = State(np.array([0.1, 0.5]), {"load": 0.0}), GivenConjugate(toy := pitchfork(0.1), "load", 1.3)
+    """A Krylov method and an error-oriented line search solve for other right sides than the
+    residual.
+    """
+    start, row = (
+        State(np.array([0.1, 0.5]), {"load": 0.0}),
+        GivenConjugate(toy := pitchfork(0.1), "load", 1.3),
+    )
     plain = BorderedNewton(toy).solve(start, "load", row)
     options["ksp_type"], options["snes_linesearch_type"] = "gmres", "nleqerr"
     other = BorderedNewton(toy).solve(start, "load", row)

@@ -25,7 +25,9 @@ def path_of(toy: Toy, control: Control, options: StepOptions) -> tuple[Path, Poi
 
 def test_load_control_finds_the_equilibrium() -> None:
     toy = snap_through()
-    outcome = BorderedNewton(toy).solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad("load", 0.2))
+    outcome = BorderedNewton(toy).solve(
+        State(np.zeros(1), {"load": 0.0}), "load", GivenLoad("load", 0.2)
+    )
     assert outcome.converged
     u = outcome.state.u[0]
     assert u**3 - 3 * u**2 + 2 * u == pytest.approx(0.2, abs=1e-9)
@@ -56,7 +58,10 @@ def test_displacement_control_passes_the_folds_and_counts_pivots() -> None:
 
 @pytest.mark.parametrize("step", [0.02, 0.3, 0.9])
 def test_fold_is_located(step: float) -> None:
-    """To 1e-8 of the load, as README says: refined tangents near a fold are no better. Its place follows from that."""
+    """To 1e-8 of the load, as README says: refined tangents near a fold are no better.
+
+    Its place follows from that.
+    """
     path, low = path_of(snap_through(), "conjugate", StepOptions(step, step, 1e-6))
     for high, _ in path.towards(low, [2.0]):
         if high.negative_pivots:
@@ -66,7 +71,10 @@ def test_fold_is_located(step: float) -> None:
     assert found.kind == "fold"
     assert found.point.state.mu["load"] == pytest.approx(2 / (3 * np.sqrt(3)), rel=1e-8)
     assert found.point.s == pytest.approx(1 - 1 / np.sqrt(3), abs=5e-5)
-    assert (found.point.negative_pivots, found.point.negative_pivots_held) == (0, 0)  # a neutral mode is not unstable
+    assert (found.point.negative_pivots, found.point.negative_pivots_held) == (
+        0,
+        0,
+    )  # a neutral mode is not unstable
 
 
 @pytest.mark.parametrize("control", ["load", "conjugate"])
@@ -94,7 +102,9 @@ def test_imperfection_turns_the_pitchfork_into_a_stable_path() -> None:
 
 
 def test_a_point_that_was_too_far_away_is_a_step_later() -> None:
-    """Where the path bends steps are too long, but none is in vain; every point is on the branch v > 0."""
+    """Where the path bends steps are too long, but none is in vain; every point is on the branch v
+    > 0.
+    """
 
     class Tried(NoProgress):
         places: ClassVar[list[float]] = []
@@ -131,7 +141,9 @@ def test_steps_that_targets_cut_grow() -> None:
 def test_targets_may_turn_back() -> None:
     """The next point is foreseen from three, of which no two are at one place."""
     path, start = path_of(snap_through(), "conjugate", StepOptions(0.25, 0.25, 1e-6))
-    loads = [p.state.mu["load"] for p, flag in path.towards(start, [0.25, 0.5, 0.25, 0.0, 0.25]) if flag]
+    loads = [
+        p.state.mu["load"] for p, flag in path.towards(start, [0.25, 0.5, 0.25, 0.0, 0.25]) if flag
+    ]
     assert loads[0] == pytest.approx(loads[2], abs=1e-12)
     assert loads[0] == pytest.approx(loads[4], abs=1e-12)
 
@@ -140,8 +152,12 @@ def test_foreseen_as_by_scipy() -> None:
     """The polynomial with given values and slopes at three places (Krogh 1970)."""
     nodes, f, slope = [0.3, 1.0, 1.2], np.exp, np.exp
     twice = np.repeat(nodes, 2)
-    given = KroghInterpolator(twice, [f(x) if i % 2 == 0 else slope(x) for i, x in enumerate(twice)])
-    ours = sum(a * f(x) + b * slope(x) for (a, b), x in zip(hermite(1.7, nodes), nodes, strict=True))
+    given = KroghInterpolator(
+        twice, [f(x) if i % 2 == 0 else slope(x) for i, x in enumerate(twice)]
+    )
+    ours = sum(
+        a * f(x) + b * slope(x) for (a, b), x in zip(hermite(1.7, nodes), nodes, strict=True)
+    )
     assert ours == pytest.approx(float(given(1.7)), rel=1e-13)
 
 

@@ -1,4 +1,6 @@
-"""Deflation against dense linear algebra, and searches on systems all of whose equilibria are known."""
+"""Deflation against dense linear algebra, and searches on systems all of whose equilibria are
+known.
+"""
 
 import numpy as np
 import pytest
@@ -53,12 +55,20 @@ def test_all_equilibria_of_a_buckled_column() -> None:
 
 
 def test_all_equilibria_of_an_arch_on_a_spring_and_a_column() -> None:
-    # q = x + f/k, f = load + v^2/2: roots of f(x) = 0 with v = 0, and of f(x) = (x - c)/2 with v^2 = x - c
+    # q = x + f/k, f = load + v^2/2: roots of f(x) = 0 with v = 0, and of f(x) = (x - c)/2 with v^2
+    # = x - c
     c = 0.3
     straight = [(x, 0.0) for x in (1.0, 2.0)]
-    bent = [(x, side * np.sqrt(x - c)) for x in np.roots([1, -3, 1.5, c / 2]).real if x > c for side in (-1, 1)]
+    bent = [
+        (x, side * np.sqrt(x - c))
+        for x in np.roots([1, -3, 1.5, c / 2]).real
+        if x > c
+        for side in (-1, 1)
+    ]
     found = _found(snap_back(0.5, c), State(np.zeros(3), {"load": 0.0}), solutions=6)
-    assert sorted((x, v) for _, x, v in np.round(found, 8)) == pytest.approx(np.round(sorted(straight + bent), 8))
+    assert sorted((x, v) for _, x, v in np.round(found, 8)) == pytest.approx(
+        np.round(sorted(straight + bent), 8)
+    )
 
 
 def test_a_search_ends_at_its_limits() -> None:
@@ -113,11 +123,14 @@ def test_settling_goes_down_to_the_stable_equilibrium_on_its_side() -> None:
     system = snap_through()
     settling = Settling(system, State(np.zeros(1), {"load": 0.0}))
     for begin, end in ((0.9, 0.0), (1.1, 2.0), (5.0, 2.0)):
-        assert settling.settled(State(np.array([begin]), {"load": 0.0})).u == pytest.approx([end], abs=0.01)
+        assert settling.settled(State(np.array([begin]), {"load": 0.0})).u == pytest.approx(
+            [end], abs=0.01
+        )
 
 
 def test_solutions_with_a_conjugate_held() -> None:
-    # the spring's end q is held at 1 instead of its force: k (q - x) = f(x), so x^3 - 3 x^2 + (2 + k) x = k
+    # the spring's end q is held at 1 instead of its force: k (q - x) = f(x), so x^3 - 3 x^2 + (2 +
+    # k) x = k
     class Idle(Toy):
         """With a second amplitude, which does nothing."""
 
@@ -135,7 +148,15 @@ def test_solutions_with_a_conjugate_held() -> None:
     start = device.enter(State(np.array([1.0, x[0], 0.0]), {"load": load[0], "idle": 0.0}))
     path = Path(BorderedNewton(device), "idle", "load", StepOptions(1.0, 1.0, 1.0))
     guess = device.enter(State(np.array([1.0, 1.7, 0.0]), {"load": 0.0, "idle": 0.0}))
-    points = list(further(path, start, [lambda: guess], Limits(9, 1), lambda v: device.padded(device.displacement(v))))
+    points = list(
+        further(
+            path,
+            start,
+            [lambda: guess],
+            Limits(9, 1),
+            lambda v: device.padded(device.displacement(v)),
+        )
+    )
     found = sorted((device.leave(p.state).u[1], p.negative_pivots) for p in points)
     assert [v for v, _ in found] == pytest.approx(x[1:], abs=1e-8)
     assert [n for _, n in found] == [1, 0]

@@ -1,4 +1,5 @@
-"""Steps in time against SciPy and PETSc's TSALPHA2, the conservation of energy, and motions under a loading device.
+"""Steps in time against SciPy and PETSc's TSALPHA2, the conservation of energy, and motions under a
+loading device.
 
 The device holds a pendulum's rod, which is a constraint, or a body on a spring that is pressed on.
 """
@@ -31,7 +32,9 @@ def load(t: float) -> float:
 def column(rho: float, drag: float = 0.0, *, loaded: bool = True) -> tuple[Toy, Integrator]:
     """A column that bends, Pi = u^2/2 + (1 - u) v^2/2 + v^4/4 - load u, from rest."""
     toy = pitchfork()
-    return toy, Integrator(toy, matrix(MASS), lambda t, before: {"load": load(t) if loaded else 0.0}, rho, drag)
+    return toy, Integrator(
+        toy, matrix(MASS), lambda t, before: {"load": load(t) if loaded else 0.0}, rho, drag
+    )
 
 
 def moved(integrator: Integrator, end: float, steps: int) -> Motion:
@@ -44,7 +47,9 @@ def reference(toy: Toy, end: float, drag: float) -> Array:
         force = toy.residual(y[:2], {"load": load(t)})
         return np.concatenate([y[2:], -np.linalg.solve(MASS, force) - drag * y[2:]])
 
-    return np.asarray(solve_ivp(rate, (0, end), [*START, 0, 0], "DOP853", rtol=1e-12, atol=1e-12).y[:, -1])
+    return np.asarray(
+        solve_ivp(rate, (0, end), [*START, 0, 0], "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    )
 
 
 @pytest.mark.parametrize(("rho", "drag"), [(1.0, 0.0), (0.0, 0.1)])
@@ -68,7 +73,9 @@ def test_same_motion_as_petsc() -> None:
     ts.setType(PETSc.TS.Type.ALPHA2)
     J = matrix(np.ones((2, 2)))
 
-    def function(ts: PETSc.TS, t: float, u: PETSc.Vec, v: PETSc.Vec, a: PETSc.Vec, f: PETSc.Vec) -> None:
+    def function(
+        ts: PETSc.TS, t: float, u: PETSc.Vec, v: PETSc.Vec, a: PETSc.Vec, f: PETSc.Vec
+    ) -> None:
         f.setArray(MASS @ a.array_r + toy.residual(u.array_r.copy(), {"load": load(t)}))
 
     def jacobian(
@@ -121,7 +128,8 @@ def test_energy_is_conserved() -> None:
 
 
 class Pendulum:
-    """Pi = WEIGHT y + tension (x^2 + y^2 - 1)/2: a bob whose distance from the origin is conjugate to the tension.
+    """Pi = WEIGHT y + tension (x^2 + y^2 - 1)/2: a bob whose distance from the origin is conjugate
+    to the tension.
 
     "body" is the height d of a body that presses through a spring, (d - y)^2/2.
     """
@@ -151,15 +159,21 @@ def of(angle: float) -> Array:
 
 
 def swung(rho: float, steps: int, end: float) -> Motion:
-    """From an angle, with a tension that is not yet the right one and a velocity that stretches the rod."""
+    """From an angle, with a tension that is not yet the right one and a velocity that stretches the
+    rod.
+    """
     system = Pendulum()
     device = Device(system, {"tension": 0.0}, {"tension": 1.0})
-    integrator = Integrator(system, matrix(BOB), lambda t, before: {"tension": 0.0}, rho, device=device)
+    integrator = Integrator(
+        system, matrix(BOB), lambda t, before: {"tension": 0.0}, rho, device=device
+    )
     along = np.array([np.cos(ANGLE), np.sin(ANGLE)])
     now = integrator.begin(0.0, 1.01 * of(ANGLE), SPIN * along + 0.3 * of(ANGLE))
     assert now.u == pytest.approx(of(ANGLE), abs=1e-12)
     assert now.v == pytest.approx(SPIN * along, abs=1e-12)
-    assert now.mu["tension"] == pytest.approx(WEIGHT * np.cos(ANGLE) + BOB[0, 0] * SPIN**2, rel=1e-9)
+    assert now.mu["tension"] == pytest.approx(
+        WEIGHT * np.cos(ANGLE) + BOB[0, 0] * SPIN**2, rel=1e-9
+    )
     return advance(integrator, now, end, TimeSteps(end / steps, 1.0, end / steps), end / steps)[0]
 
 
@@ -167,7 +181,12 @@ def test_a_pendulum() -> None:
     """Angle and tension of SciPy's solution for the angle: second order; the rod keeps its length."""
     end, g = 4.0, WEIGHT / BOB[0, 0]
     solved = solve_ivp(
-        lambda t, y: [y[1], -g * np.sin(y[0])], (0, end), [ANGLE, SPIN], "DOP853", rtol=1e-12, atol=1e-12
+        lambda t, y: [y[1], -g * np.sin(y[0])],
+        (0, end),
+        [ANGLE, SPIN],
+        "DOP853",
+        rtol=1e-12,
+        atol=1e-12,
     )
     angle, spin = solved.y[:, -1]
     exact = np.array([*of(angle), WEIGHT * np.cos(angle) + BOB[0, 0] * spin**2])
@@ -181,10 +200,14 @@ def test_a_pendulum() -> None:
 
 
 def test_a_body_pressed_on_with_a_force() -> None:
-    """The body follows the bob at the distance that its force compresses the spring by: a heavier bob."""
+    """The body follows the bob at the distance that its force compresses the spring by: a heavier
+    bob.
+    """
     system, force = Pendulum(), 0.7
     device = Device(system, {"body": -force}, {"body": 1.0})  # dPi/dd = d - y
-    integrator = Integrator(system, matrix(BOB), lambda t, before: {"tension": 0.0, "body": 0.0}, 1.0, device=device)
+    integrator = Integrator(
+        system, matrix(BOB), lambda t, before: {"tension": 0.0, "body": 0.0}, 1.0, device=device
+    )
     now = integrator.begin(0.0, np.zeros(2), np.zeros(2))
     assert now.mu["body"] == pytest.approx(force)
     now, _ = advance(integrator, now, 2.0, TimeSteps(0.1, 1.0, 0.1), 0.1)

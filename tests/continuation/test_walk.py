@@ -1,4 +1,6 @@
-"""Walks by arc length on a toy with snap-through, snap-back and a pitchfork, all known in closed form."""
+"""Walks by arc length on a toy with snap-through, snap-back and a pitchfork, all known in closed
+form.
+"""
 
 from itertools import islice
 
@@ -60,10 +62,16 @@ def test_path_passes_the_snap_back_and_its_stability_is_told() -> None:
 
 @pytest.mark.parametrize("below", [0.2849, 1e-4, 1e-6])
 def test_targets_are_met_on_every_part_of_the_path(below: float) -> None:
-    """q = 1 is passed once; a load below the fold three times, twice in one step where it is just below."""
+    """q = 1 is passed once; a load below the fold three times, twice in one step where it is just
+    below.
+    """
     target = f(FOLDS[0]) - below
     roots = np.sort(np.roots([1, -3, 2, -target]).real)
-    loads = [p.state.u[1] for label, p in walked(Goal("points", [target], "load", steps=60)) if label == "target"]
+    loads = [
+        p.state.u[1]
+        for label, p in walked(Goal("points", [target], "load", steps=60))
+        if label == "target"
+    ]
     assert np.sort(loads)[:3] == pytest.approx(roots, abs=1e-9)
     label, point = walked(Goal("target", [target], "load"))[-1]
     assert (label, point.state.u[1]) == ("target", pytest.approx(roots[0], abs=1e-9))
@@ -113,7 +121,9 @@ def test_both_branches_of_the_pitchfork() -> None:
 
 
 def test_asymmetric_branch_is_told() -> None:
-    """u^2/2 + (1 - u) v^2/2 + v^3/3: load = u - v^2/2 and v = u - 1 on the branch, which rises one way."""
+    """u^2/2 + (1 - u) v^2/2 + v^3/3: load = u - v^2/2 and v = u - 1 on the branch, which rises one
+    way.
+    """
     toy = pitchfork()
     base_gradient, base_hessian = toy.gradient, toy.hessian
     toy.gradient = lambda x: base_gradient(x) + np.array([0.0, x[1] ** 2 - x[1] ** 3])
@@ -135,7 +145,12 @@ def test_asymmetric_branch_is_told() -> None:
 def test_a_closed_loop_is_told() -> None:
     """Four folds on the circle; the walk ends at the first of them, met again."""
     path = Path(BorderedNewton(closed_loop()), "load", "arc", StepOptions(0.05, 0.1, 1e-7))
-    walk, folds = Walk(path, path.start(State(np.array([1.0, 0.0]), {"load": 0.0})), Goal("points", steps=900)), []
+    walk, folds = (
+        Walk(
+            path, path.start(State(np.array([1.0, 0.0]), {"load": 0.0})), Goal("points", steps=900)
+        ),
+        [],
+    )
     with pytest.raises(PathStopped, match="come back to this fold: a closed loop"):  # noqa: PT012
         for label, point in walk:
             folds += [point.state.mu["load"]] if label == "fold" else []
@@ -144,7 +159,9 @@ def test_a_closed_loop_is_told() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*encountered in")
 def test_a_renewal_that_fails_shortens_the_step() -> None:
-    """Far from the first of two points other amplitudes have no solution: nearer to it the walk goes on."""
+    """Far from the first of two points other amplitudes have no solution: nearer to it the walk
+    goes on.
+    """
     refused, wild = list[float](), State(np.full(3, 1e200), {"load": 0.0})
 
     def renew(low: Point, high: Point) -> State | None:
@@ -163,7 +180,9 @@ def test_a_renewal_that_fails_shortens_the_step() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*encountered in")
 def test_a_renewal_that_need_not_be_leaves_the_steps() -> None:
-    """Where other amplitudes have no solution, and are not asked for again, the point that was found counts."""
+    """Where other amplitudes have no solution, and are not asked for again, the point that was
+    found counts.
+    """
     asked, wild = list[float](), State(np.full(3, 1e200), {"load": 0.0})
 
     def renew(low: Point, high: Point) -> State | None:
@@ -179,9 +198,15 @@ def test_a_renewal_that_need_not_be_leaves_the_steps() -> None:
 
 
 def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
-    """Long steps with several targets within each, passed upwards and downwards: the polynomial is a good guess."""
+    """Long steps with several targets within each, passed upwards and downwards: the polynomial is
+    a good guess.
+    """
     targets = [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]
-    found = [p for label, p in walked(Goal("points", targets, "load", steps=14), 0.3, 0.6) if label == "target"]
+    found = [
+        p
+        for label, p in walked(Goal("points", targets, "load", steps=14), 0.3, 0.6)
+        if label == "target"
+    ]
     x = np.array([p.state.u[1] for p in found])
     exact = [np.sort(np.roots([1, -3, 2, -mu]).real)[k] for mu in targets for k in range(2)]
     assert np.sort(x)[:12] == pytest.approx(np.sort(exact), abs=1e-9)
@@ -255,7 +280,9 @@ def test_modes_too_close_to_part_count_as_one(control: str) -> None:
     assert point.state.mu["load"] == pytest.approx(1.0, abs=1e-5)
 
 
-@pytest.mark.xfail(not has_cholmod(), reason="by MUMPS the bifurcation is found that a force of 1e-5 restores")
+@pytest.mark.xfail(
+    not has_cholmod(), reason="by MUMPS the bifurcation is found that a force of 1e-5 restores"
+)
 def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() -> None:
     """(1 - load) v + v^3 = 1e-5: one path is stable; the other, with one unstable direction, ends
     at a fold."""

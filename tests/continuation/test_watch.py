@@ -1,4 +1,6 @@
-"""What a model excludes, on the path load = x^3 - 3 x^2 + 2 x, in families whose eigenvalues are functions of x."""
+"""What a model excludes, on the path load = x^3 - 3 x^2 + 2 x, in families whose eigenvalues are
+functions of x.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -74,7 +76,11 @@ class Together:
 
 
 def watched(
-    families: Sequence[Diagonal], control: Control = "arc", step: float = 0.05, points: int = 60, start: float = 0.0
+    families: Sequence[Diagonal],
+    control: Control = "arc",
+    step: float = 0.05,
+    points: int = 60,
+    start: float = 0.0,
 ) -> tuple[list[Crossing], list[tuple[float, int]]]:
     """All crossings, and the number of unstable directions that was told at every x."""
     toy, load = snap_through(), start**3 - 3 * start**2 + 2 * start
@@ -110,7 +116,9 @@ def test_far_from_neutral_it_is_not_looked_at_everywhere() -> None:
 
 
 def test_what_was_passed_over_is_looked_at_when_the_next_look_is_another() -> None:
-    """It softens slowly up to x = 1, then all at once: what was foretold is wrong, no crossing is missed."""
+    """It softens slowly up to x = 1, then all at once: what was foretold is wrong, no crossing is
+    missed.
+    """
     family = Diagonal("excluded", lambda x: [1.0 - 0.01 * x if x < 1 else 0.99 - 40 * (x - 1)])
     found, told = watched([family])
     assert places(found) == [("excluded", 1 + 0.99 / 40, 0)]
@@ -118,20 +126,30 @@ def test_what_was_passed_over_is_looked_at_when_the_next_look_is_another() -> No
 
 
 def test_several_crossings_in_one_step_come_in_their_order() -> None:
-    """Two of a family, one of another between them, one that becomes stable; all families are looked at everywhere."""
+    """Two of a family, one of another between them, one that becomes stable; all families are
+    looked at everywhere.
+    """
     families = [
         Diagonal("a", lambda x: [0.501 - x, 0.509 - x]),
         Diagonal("b", lambda x: [0.505 - x, 5.0]),
         Diagonal("c", lambda x: [x - 0.507, 5.0]),
     ]
     found, told = watched(families, step=0.2, points=8)
-    assert places(found) == [("c", 0.0, 1), ("a", 0.501, 1), ("b", 0.505, 2), ("c", 0.507, 2), ("a", 0.509, 2)]
+    assert places(found) == [
+        ("c", 0.0, 1),
+        ("a", 0.501, 1),
+        ("b", 0.505, 2),
+        ("c", 0.507, 2),
+        ("a", 0.509, 2),
+    ]
     assert [unstable for x, unstable in told if x > 0.51] == [3] * sum(x > 0.51 for x, _ in told)
 
 
 @pytest.mark.parametrize("width", [0.03, 0.08])
 def test_what_softens_and_recovers_within_a_step(width: float) -> None:
-    """Unstable only between two points of the path, which is stable at each of them, as is another family."""
+    """Unstable only between two points of the path, which is stable at each of them, as is another
+    family.
+    """
     families = [
         Diagonal("a", lambda x: [(x - 1) ** 2 - (width / 2) ** 2]),
         Diagonal("b", lambda x: [1.0 - x / 10]),

@@ -52,7 +52,8 @@ class Toy:
 def snap_through(p: float = 0.0, length: float = 1.0) -> Toy:
     """Shallow arch, load = x^3 - 3 x^2 + (2 + p) x with u = length x.
 
-    For p < 1 there are folds at x = 1 -+ sqrt((1 - p)/3); for p = 0 the load is +-2/(3 sqrt(3)) there.
+    For p < 1 there are folds at x = 1 -+ sqrt((1 - p)/3); for p = 0 the load is +-2/(3 sqrt(3))
+    there.
     """
 
     def gradient(u: Vector) -> Vector:
@@ -85,7 +86,9 @@ def pitchfork(imperfection: float = 0.0, stiffening: float = 1.0) -> Toy:
 
 
 def closed_loop() -> Toy:
-    """Pi_0 = (u^2 - 1) v + v^3/3: equilibria on the circle u = cos t, v = sin t alone, at the load sin 2t."""
+    """Pi_0 = (u^2 - 1) v + v^3/3: equilibria on the circle u = cos t, v = sin t alone, at the load
+    sin 2t.
+    """
 
     def gradient(x: Vector) -> Vector:
         u, v = x
@@ -99,12 +102,13 @@ def closed_loop() -> Toy:
 
 
 def snap_back(k: float, c: float) -> Toy:
-    """The arch behind a spring, and a column: q = u[0] is loaded, x = u[1] snaps through, v = u[2] bends.
+    """The arch behind a spring, and a column: q = u[0] is loaded, x = u[1] snaps through, v = u[2]
+    bends.
 
-    Pi_0 = k (q - x)^2/2 + x^4/4 - x^3 + x^2 + (c - x) v^2/2 + v^4/4. With f = x^3 - 3x^2 + 2x:
-    load = f(x) and q = x + f/k where v = 0; folds in the load at x = 1 -+ 1/sqrt(3); folds in q, for
-    k < 1, at x = 1 -+ sqrt((1 - k)/3); a pitchfork at x = c, beyond which v^2 = x - c and
-    load = f(x) - (x - c)/2.
+    Pi_0 = k (q - x)^2/2 + x^4/4 - x^3 + x^2 + (c - x) v^2/2 + v^4/4. With f = x^3 - 3x^2 + 2x: load
+    = f(x) and q = x + f/k where v = 0; folds in the load at x = 1 -+ 1/sqrt(3); folds in q, for k <
+    1, at x = 1 -+ sqrt((1 - k)/3); a pitchfork at x = c, beyond which v^2 = x - c and load = f(x) -
+    (x - c)/2.
     """
 
     def gradient(u: Vector) -> Vector:
@@ -168,7 +172,9 @@ class Full:
         return Full(factor * self.D)
 
     def over(self, other: Rest) -> float:
-        return float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
+        return (
+            float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
+        )
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
         n = len(self.D)
@@ -212,7 +218,9 @@ class Stiffening:
     def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
         return True
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False) -> Beside:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False
+    ) -> Beside:
         if not (rough and self.made):
             self.made.append(np.array(u))
         D, K = Full(np.diag(2 * self.made[-1])), dense(np.diag(self.k))

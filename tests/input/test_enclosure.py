@@ -25,15 +25,21 @@ def test_all_values_are_in_the_range(text):
         random.uniform(0, 1, (500, 3)) * 10 ** random.uniform(-4, 0, (500, 1)),
     )
     least, most, bent = of.bounds(middle - half, middle + half)
-    values = of(*np.moveaxis(middle[:, None] + half[:, None] * random.uniform(-1, 1, (500, 100, 3)), -1, 0))
+    values = of(
+        *np.moveaxis(middle[:, None] + half[:, None] * random.uniform(-1, 1, (500, 100, 3)), -1, 0)
+    )
     rounding = 1e-9 * (1 + np.abs(values))
     good = np.isfinite(values)
-    assert ((values >= least[:, None] - rounding) & (values <= most[:, None] + rounding))[good].all()
+    assert ((values >= least[:, None] - rounding) & (values <= most[:, None] + rounding))[
+        good
+    ].all()
     assert (bent >= 0).all()
 
 
 def test_ranges_shrink_with_the_square_of_the_box():
     """x - x**2 at its top: what arithmetic without derivatives loses is linear in the box."""
     for h in (1e-2, 1e-4):
-        least, most, _ = formula("x - x**2").bounds(np.array([[0.5 - h, 0, 0]]), np.array([[0.5 + h, 0, 0]]))
+        least, most, _ = formula("x - x**2").bounds(
+            np.array([[0.5 - h, 0, 0]]), np.array([[0.5 + h, 0, 0]])
+        )
         assert most[0] - least[0] < 5 * h**2

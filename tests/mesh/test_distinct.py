@@ -29,7 +29,14 @@ EDGE = {"plate": "left", "cylinder": "bottom", "cap": "rim"}
 def case(shell: dict[str, Any], points: dict[str, Any], size: float = 0.2, **keys: Any) -> Case:
     edges = EDGE.get(shell["geometry"])
     boundary = {edges: "clamped"} if edges else {}
-    data = {"shell": shell, "boundary": boundary, "points": points, "symmetry": "none", "mesh": {"size": size}, **keys}
+    data = {
+        "shell": shell,
+        "boundary": boundary,
+        "points": points,
+        "symmetry": "none",
+        "mesh": {"size": size},
+        **keys,
+    }
     return Case.from_source(data)
 
 
@@ -49,7 +56,12 @@ def polar(angle: float) -> list[float]:
 def test_a_cantilever_with_two_near_gauges(apart: float) -> None:
     """Under its weight the end sinks by q L^4/(8 D), 1e-4; there were 10 to 17 unstable
     directions."""
-    weight = {"kind": "dead", "control": "load", "loads": [{"over": "all", "per_area": [0, 0, -1e-8]}], "factor": 1}
+    weight = {
+        "kind": "dead",
+        "control": "load",
+        "loads": [{"over": "all", "per_area": [0, 0, -1e-8]}],
+        "factor": 1,
+    }
     gauges = {"tip": [1, 0.25, 0], "A": [0.333, 0.4, 0], "B": [0.333 + apart, 0.1, 0]}
     scene = Scene(case(PLATE, gauges, loading={**weight, "points": 1}))
     start, *_, last = follow(scene)
@@ -58,10 +70,22 @@ def test_a_cantilever_with_two_near_gauges(apart: float) -> None:
 
 
 NEAR = {
-    "a column of gauges": (PLATE, {k: [0.3 + 0.0021 * i, 0.05 * i + 0.05, 0] for i, k in enumerate("ABCDEFGH")}),
-    "rounded coordinates": (CYLINDER, {"A": [0.707107, 0.707107, 1.5], "B": [0.7071068, 0.7071067, 0.75]}),
-    "both sides of a seam": (CYLINDER, {"A": at(1e-5, 1), "B": at(-3e-5, 0.5), "C": at(1.5, 1.001)}),
-    "both seams of a torus": (TORUS, {"A": [1.3 * c for c in at(1e-4, 0)], "B": [0, 1.3 * np.cos(1e-3), 3e-4]}),
+    "a column of gauges": (
+        PLATE,
+        {k: [0.3 + 0.0021 * i, 0.05 * i + 0.05, 0] for i, k in enumerate("ABCDEFGH")},
+    ),
+    "rounded coordinates": (
+        CYLINDER,
+        {"A": [0.707107, 0.707107, 1.5], "B": [0.7071068, 0.7071067, 0.75]},
+    ),
+    "both sides of a seam": (
+        CYLINDER,
+        {"A": at(1e-5, 1), "B": at(-3e-5, 0.5), "C": at(1.5, 1.001)},
+    ),
+    "both seams of a torus": (
+        TORUS,
+        {"A": [1.3 * c for c in at(1e-4, 0)], "B": [0, 1.3 * np.cos(1e-3), 3e-4]},
+    ),
 }
 
 
@@ -88,7 +112,9 @@ def test_near_coordinates_share_a_line(kind: str) -> None:
         (CAP, [0, 0, 1], [3e-7, 0, 1]),
     ],
 )
-def test_a_point_beside_an_edge_is_on_it(shell: dict[str, Any], exact: list[float], typed: list[float]) -> None:
+def test_a_point_beside_an_edge_is_on_it(
+    shell: dict[str, Any], exact: list[float], typed: list[float]
+) -> None:
     """A place with the digits of a message, or of a file, makes the mesh of the exact one."""
     one, other = (meshed(shell, {"A": place}) for place in (exact, typed))
     assert len(one.cells) == len(other.cells)
@@ -102,7 +128,12 @@ def test_two_names_of_a_place() -> None:
 
 
 REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
-    (PLATE, {"A": [0.999998, 0.2, 0]}, "none", "points.A: [0.999998, 0.2, 0]: is 2e-06 from the edge right at [1, 0.2"),
+    (
+        PLATE,
+        {"A": [0.999998, 0.2, 0]},
+        "none",
+        "points.A: [0.999998, 0.2, 0]: is 2e-06 from the edge right at [1, 0.2",
+    ),
     (
         PLATE,
         {"A": [0.4, 0.2, 0], "B": [0.4001, 0.2, 0]},
@@ -121,13 +152,25 @@ REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
         "none",
         "[1, 1e-05, 1]: is 4e-05 from points.B: [1, -3e",
     ),
-    (CAP, {"A": polar(0.5), "B": polar(0.5003)}, "none", "points.A: [0.47943, 0, 0.87758]: is 0.0003 from points.B: ["),
-    (CAP, {"A": polar(np.pi / 3 - 1e-5)}, "none", "points.A: [0.86602, 0, 0.500009]: is 1e-05 from the edge rim at [0"),
+    (
+        CAP,
+        {"A": polar(0.5), "B": polar(0.5003)},
+        "none",
+        "points.A: [0.47943, 0, 0.87758]: is 0.0003 from points.B: [",
+    ),
+    (
+        CAP,
+        {"A": polar(np.pi / 3 - 1e-5)},
+        "none",
+        "points.A: [0.86602, 0, 0.500009]: is 1e-05 from the edge rim at [0",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("shell", "points", "symmetry", "said"), REFUSED)
-def test_places_too_near_are_told(shell: dict[str, Any], points: dict[str, Any], symmetry: str, said: str) -> None:
+def test_places_too_near_are_told(
+    shell: dict[str, Any], points: dict[str, Any], symmetry: str, said: str
+) -> None:
     """With both places, and digits that show where they differ; `check` and `run` make the problem
     first."""
     with pytest.raises(CaseError, match=re.escape(said)):
@@ -135,7 +178,10 @@ def test_places_too_near_are_told(shell: dict[str, Any], points: dict[str, Any],
 
 
 def test_digits_that_tell_apart() -> None:
-    assert told_apart(np.array([1.0, 0.3333333]), np.array([1.0, 0.33333339])) == ("1, 0.3333333", "1, 0.33333339")
+    assert told_apart(np.array([1.0, 0.3333333]), np.array([1.0, 0.33333339])) == (
+        "1, 0.3333333",
+        "1, 0.33333339",
+    )
     assert told_apart(np.array([1.0]), np.array([2.0])) == ("1", "2")
 
 
@@ -154,40 +200,71 @@ def columns(file: Path, width: float) -> Path:
         for b in (0, 1)
         for triple in ((0, 3, 4), (0, 4, 1))
     ]
-    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "4", '1 1 "root"', '1 2 "tip"', '1 3 "sides"']
+    text = [
+        "$MeshFormat",
+        "2.2 0 8",
+        "$EndMeshFormat",
+        "$PhysicalNames",
+        "4",
+        '1 1 "root"',
+        '1 2 "tip"',
+        '1 3 "sides"',
+    ]
     text += ['2 4 "all"', "$EndPhysicalNames", "$Nodes", str(len(nodes))]
     text += [f"{i + 1} {a:.17g} {b} {c}" for i, (a, b, c) in enumerate(nodes)]
     elements = [f"1 2 {tag} {tag} {a + 1} {b + 1}" for tag, a, b in lines]
     elements += [f"2 2 4 4 {a + 1} {b + 1} {c + 1}" for a, b, c in cells]
-    text += ["$EndNodes", "$Elements", str(len(elements)), *(f"{i + 1} {e}" for i, e in enumerate(elements))]
+    text += [
+        "$EndNodes",
+        "$Elements",
+        str(len(elements)),
+        *(f"{i + 1} {e}" for i, e in enumerate(elements)),
+    ]
     file.write_text("\n".join([*text, "$EndElements", ""]))
     return file
 
 
 def of_file(file: Path, **mesh: Any) -> Case:
     shell = {"geometry": "mesh", "file": str(file), "radius": 1, **NU}
-    load = {"kind": "dead", "control": "load", "loads": [{"edge": "tip", "force": [0, 0, 1e-9]}], "factor": 1}
-    data = {"shell": shell, "boundary": {"root": "clamped"}, "loading": {**load, "points": 1}, "mesh": mesh}
+    load = {
+        "kind": "dead",
+        "control": "load",
+        "loads": [{"edge": "tip", "force": [0, 0, 1e-9]}],
+        "factor": 1,
+    }
+    data = {
+        "shell": shell,
+        "boundary": {"root": "clamped"},
+        "loading": {**load, "points": 1},
+        "mesh": mesh,
+    }
     return Case.from_source(data | {"symmetry": "none"})
 
 
 def test_a_flat_triangle_of_a_file(tmp_path: Path) -> None:
     """It is named, with the penalty that helps; with that the end rises by F L^3/(3 D b), a beam's,
     1e-4."""
-    file, said = columns(tmp_path / "a.msh", 1e-3), r"unstable in \d+ directions: the triangle around \(0.400[36]"
+    file, said = (
+        columns(tmp_path / "a.msh", 1e-3),
+        r"unstable in \d+ directions: the triangle around \(0.400[36]",
+    )
     with pytest.raises(Stopped, match=said) as e:
         list(follow(Scene(of_file(file))))
     enough = re.search(r"mesh.penalty: (\d+)", str(e.value))
     assert enough
     scene = Scene(of_file(file, penalty=float(enough[1])))
     *_, last = follow(scene)
-    assert scene.observe(last.point.state)["w_over_h"] * h == pytest.approx(1e-9 / (3 * D * 0.2), rel=1e-4)
+    assert scene.observe(last.point.state)["w_over_h"] * h == pytest.approx(
+        1e-9 / (3 * D * 0.2), rel=1e-4
+    )
 
 
 def test_a_triangle_that_no_penalty_stands(tmp_path: Path) -> None:
     """It was said that the clamped shell is not held."""
     problem = make_problem(of_file(columns(tmp_path / "a.msh", 1e-4)))
-    with pytest.raises(MeshError, match=r"shell.file: the triangle .* \(0.4001, 0.[12], 0\) and \(0.4, 0.[12], 0\)"):
+    with pytest.raises(
+        MeshError, match=r"shell.file: the triangle .* \(0.4001, 0.[12], 0\) and \(0.4, 0.[12], 0\)"
+    ):
         problem.triangulated()
 
 

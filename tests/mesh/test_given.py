@@ -1,4 +1,6 @@
-"""Meshes of programs: what is given with them, parts of other meshes, and the side of their normals."""
+"""Meshes of programs: what is given with them, parts of other meshes, and the side of their
+normals.
+"""
 
 import ast
 import subprocess
@@ -27,13 +29,17 @@ def plate(columns: int, length: float = 1.0) -> tuple[Array, Cells]:
     x, y = np.meshgrid(np.linspace(0, length, columns + 1), [0.0, 0.2, 0.4], indexing="ij")
     nodes = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
     a = (3 * np.arange(columns)[:, None] + np.arange(2)).ravel()
-    return nodes, np.concatenate([np.column_stack([a, a + 3, a + 4]), np.column_stack([a, a + 4, a + 1])])
+    return nodes, np.concatenate(
+        [np.column_stack([a, a + 3, a + 4]), np.column_stack([a, a + 4, a + 1])]
+    )
 
 
 def made(nodes: Array, cells: Cells, comm: MPI.Comm = MPI.COMM_SELF) -> mesh.Mesh:
     if comm.rank > 0:
         nodes, cells = nodes[:0], cells[:0]
-    return mesh.create_mesh(comm, cells, x=nodes, e=basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)))
+    return mesh.create_mesh(
+        comm, cells, x=nodes, e=basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
+    )
 
 
 def sides(domain: mesh.Mesh) -> mesh.MeshTags:
@@ -48,8 +54,14 @@ def sides(domain: mesh.Mesh) -> mesh.MeshTags:
     [
         (np.array([10**6]), r"edges\.rim: 1000000: this process has facets 0 to 29"),
         (np.array([-1]), r"edges\.rim: -1: this process has facets"),
-        (np.array([0.4]), r"edges\.rim: is neither a value of tags nor a list of local numbers of facets$"),
-        (np.ones(30, dtype=bool), r"edges\.rim: is neither .*: np\.flatnonzero\(\.\.\.\) of a mask"),
+        (
+            np.array([0.4]),
+            r"edges\.rim: is neither a value of tags nor a list of local numbers of facets$",
+        ),
+        (
+            np.ones(30, dtype=bool),
+            r"edges\.rim: is neither .*: np\.flatnonzero\(\.\.\.\) of a mask",
+        ),
         (1.0, r"edges\.rim: is neither a value of tags"),
         ("1", r"edges\.rim: is neither a value of tags"),
         (None, r"edges\.rim: is neither a value of tags"),
@@ -61,7 +73,10 @@ def test_parts_that_are_none(part: Any, said: str) -> None:
 
 
 def test_cells_that_are_none() -> None:
-    for part, said in (([-1], "-1: this process has cells 0 to 15"), (np.ones(16, dtype=bool), "is neither a value")):
+    for part, said in (
+        ([-1], "-1: this process has cells 0 to 15"),
+        (np.ones(16, dtype=bool), "is neither a value"),
+    ):
         with pytest.raises(MeshError, match=rf"patches\.a: {said}"):
             Home(made(*plate(4))).triangles({}, {"a": np.array(part)})
     found = Home(made(*plate(4))).triangles({}, {"a": [0, 3]})  # type: ignore[dict-item]
@@ -70,7 +85,9 @@ def test_cells_that_are_none() -> None:
 
 def test_tags_of_another_mesh() -> None:
     domain, other = made(*plate(4)), made(*plate(9))
-    with pytest.raises(MeshError, match=r"edges\.rim: 1: facet_tags belong to another mesh than that of the shell"):
+    with pytest.raises(
+        MeshError, match=r"edges\.rim: 1: facet_tags belong to another mesh than that of the shell"
+    ):
         Home(domain).triangles({"rim": 1}, {}, sides(other))
     assert len(Home(domain).triangles({"rim": 1}, {}, sides(domain)).edges["rim"]) == 12
 
@@ -94,7 +111,9 @@ def test_part_of_another_mesh() -> None:
 @pytest.mark.telling
 @pytest.mark.parametrize("shape", ["flat", "upright", "tube"])
 def test_normals_of_equal_halves_do_not_depend_on_numbers(shape: str) -> None:
-    """Half of the area turned over, as dolfinx refines meshes: up, along e2 where that decides nothing, outwards."""
+    """Half of the area turned over, as dolfinx refines meshes: up, along e2 where that decides
+    nothing, outwards.
+    """
     nodes, cells = plate(12)
     if shape == "upright":
         nodes = nodes[:, [0, 2, 1]]
@@ -110,11 +129,19 @@ def test_normals_of_equal_halves_do_not_depend_on_numbers(shape: str) -> None:
         a, b, c = (nodes[triangles[:, i]] for i in range(3))
         return np.cross(b - a, c - a)
 
-    for order in (np.arange(len(cells)), np.arange(len(cells))[::-1], np.random.default_rng(1).permutation(len(cells))):
+    for order in (
+        np.arange(len(cells)),
+        np.arange(len(cells))[::-1],
+        np.random.default_rng(1).permutation(len(cells)),
+    ):
         for given in (mixed, mixed[:, [0, 2, 1]]):
             found = oriented(nodes, given[order])
             n, middle = normals(found), nodes[found].mean(axis=1)
-            outward = {"flat": n[:, 2], "upright": n[:, 1], "tube": (n * middle)[:, :2].sum(axis=1)}[shape]
+            outward = {
+                "flat": n[:, 2],
+                "upright": n[:, 1],
+                "tube": (n * middle)[:, :2].sum(axis=1),
+            }[shape]
             assert (outward > 0).all()
 
 
@@ -148,9 +175,16 @@ print(MPI.COMM_WORLD.gather((size, said)) or "")
 
 @pytest.mark.slow
 def test_meshes_of_one_process_and_of_two(tmp_path: Path) -> None:
-    """A scene has the processes of its mesh, what one of them finds is said by all, and no part of u is lost."""
+    """A scene has the processes of its mesh, what one of them finds is said by all, and no part of
+    u is lost.
+    """
     (tmp_path / "program.py").write_text(ON_TWO)
-    command = [*mpirun(2), sys.executable, str(tmp_path / "program.py"), *map(str, Path(__file__).parents[:2])]
+    command = [
+        *mpirun(2),
+        sys.executable,
+        str(tmp_path / "program.py"),
+        *map(str, Path(__file__).parents[:2]),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     one, other = ast.literal_eval(done.stdout.strip())

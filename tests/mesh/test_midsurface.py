@@ -26,7 +26,9 @@ def test_nodes_lie_on_the_dimpled_sphere(degree: int) -> None:
     """Interpolation nodes are on the surface, whatever the numbering of the edges' nodes."""
     dimple = Dimple(0.05, 0.5)
     surface = hemisphere(dimple=dimple)
-    r0 = surface.placement(fem.functionspace(surface.mesh, ("Lagrange", degree, (3,)))).x.array.reshape(-1, 3)
+    r0 = surface.placement(
+        fem.functionspace(surface.mesh, ("Lagrange", degree, (3,)))
+    ).x.array.reshape(-1, 3)
     radius = np.linalg.norm(r0, axis=1)
     phi = np.arccos(r0[:, 2] / radius)
     w0 = np.where(phi < 0.5, -0.05 * (1 - (phi / 0.5) ** 2) ** 2, 0)
@@ -48,7 +50,9 @@ def test_area_converges(degree: int, order: int) -> None:
 def test_edges_follow_the_rim_of_the_dimple() -> None:
     """Vertices and edge nodes lie on the circle phi = phi_o: no triangle straddles it."""
     dimple = Dimple(0.05, 0.5)
-    mesh = triangulate(DiscShape(np.pi / 2, False, (0.5,)), lambda x: 0.3, {"pole": np.zeros(2)}, flat)
+    mesh = triangulate(
+        DiscShape(np.pi / 2, False, (0.5,)), lambda x: 0.3, {"pole": np.zeros(2)}, flat
+    )
     phi = np.hypot(*mesh.nodes.T)[mesh.cells[:, :9]]
     inside, outside = phi < dimple.width - 1e-9, phi > dimple.width + 1e-9
     assert not (inside.any(axis=1) & outside.any(axis=1)).any()
@@ -61,7 +65,9 @@ def test_normals_point_outwards() -> None:
     r0 = surface.placement(fem.functionspace(surface.mesh, ("Lagrange", 3, (3,))))
     j = kin.jet(r0, surface.mesh)
     away = ufl.conditional(ufl.gt(ufl.dot(kin.normal(j), j.r), 0.99), 1.0, 0.0)
-    share = fem.assemble_scalar(fem.form(away * ufl.dx)) / fem.assemble_scalar(fem.form(1.0 * ufl.dx(surface.mesh)))
+    share = fem.assemble_scalar(fem.form(away * ufl.dx)) / fem.assemble_scalar(
+        fem.form(1.0 * ufl.dx(surface.mesh))
+    )
     assert share == pytest.approx(1.0)
 
 

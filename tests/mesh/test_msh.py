@@ -37,7 +37,9 @@ def model() -> Iterator[Any]:
 
 
 def panel(model: Any, order: int, size: float = 0.25) -> None:
-    """A quarter of a cylinder of radius 1 and length 1, in two patches, as a script of a user's makes it."""
+    """A quarter of a cylinder of radius 1 and length 1, in two patches, as a script of a user's
+    makes it.
+    """
     geo, edges = model.geo, {}
     axis = [geo.addPoint(0, 0, z) for z in (0, 0.5, 1)]
     left = [geo.addPoint(1, 0, z) for z in (0, 0.5, 1)]
@@ -49,7 +51,13 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
         loop = geo.addCurveLoop([arcs[i], up[1][i], -arcs[i + 1], -up[0][i]])
         faces.append(geo.addSurfaceFilling([loop]))
     geo.synchronize()
-    edges = {"bottom": [arcs[0]], "top": [arcs[2]], "left": up[0], "right": up[1], "middle": [arcs[1]]}
+    edges = {
+        "bottom": [arcs[0]],
+        "top": [arcs[2]],
+        "left": up[0],
+        "right": up[1],
+        "middle": [arcs[1]],
+    }
     for name, tags in edges.items():
         model.addPhysicalGroup(1, tags, name=name)
     for name, face in zip(("lower", "upper"), faces, strict=True):
@@ -59,9 +67,13 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
     model.mesh.setOrder(order)
 
 
-@pytest.mark.parametrize("cells", [[[0, 1, 3], [0, 3, 2], [1, 4, 3]], [[3, 2, 0], [3, 1, 4], [5, 6, 7]]])
+@pytest.mark.parametrize(
+    "cells", [[[0, 1, 3], [0, 3, 2], [1, 4, 3]], [[3, 2, 0], [3, 1, 4], [5, 6, 7]]]
+)
 def test_no_mirror_through_triangles(cells: list[list[int]]) -> None:
-    """A triangle that is its own image, across the plane or in it, lies on neither side: it would be lost."""
+    """A triangle that is its own image, across the plane or in it, lies on neither side: it would
+    be lost.
+    """
     web = [[0.0, 0, 1], [0, 1, 1], [0, 0.5, 2]]
     nodes = np.array([[-1.0, 0, 0], [1, 0, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0], *web])
     nodes = nodes[: np.max(cells) + 1]
@@ -74,20 +86,34 @@ def test_no_mirror_through_triangles(cells: list[list[int]]) -> None:
 def test_a_check_tells_what_was_read() -> None:
     """Extent, names and the outer side of the gripper, whose normals are e3."""
     told = describe(Case.load(CASES / "gripper.yaml"))
-    assert "extent over the radius: 7 x 7 x 0\nedges: outline; patches: hub, east, north, west, south" in told
+    assert (
+        "extent over the radius: 7 x 7 x 0\nedges: outline; patches: hub, east, north, west, south"
+        in told
+    )
     assert "over the radius, is (0, 0, 1)" in told
 
 
 @pytest.mark.parametrize("held", ["clamped", {"held": ["x", "y", "z"]}])
-def test_a_clamped_patch_is_a_clamped_edge_to_the_rest(model: Any, tmp_path: Path, held: Any) -> None:
-    """Upper half of a panel on its clamped lower half: the tip moves as that of a panel of half the length."""
+def test_a_clamped_patch_is_a_clamped_edge_to_the_rest(
+    model: Any, tmp_path: Path, held: Any
+) -> None:
+    """Upper half of a panel on its clamped lower half: the tip moves as that of a panel of half the
+    length.
+    """
     panel(model, 3)
     gmsh.write(str(tmp_path / "part.msh"))
-    loading = {"kind": "dead", "loads": [{"edge": "top", "force": [-1e-6, 0, 0]}], "factor": 1, "points": 1}
+    loading = {
+        "kind": "dead",
+        "loads": [{"edge": "top", "force": [-1e-6, 0, 0]}],
+        "factor": 1,
+        "points": 1,
+    }
     material = {"thickness": 0.02, "poisson_ratio": 0.3, "youngs_modulus": 1}
     common = {"loading": loading, "points": {"tip": [1, 0, 1]}}
     whole = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **material}
-    found = run(Case.from_source(Source("part", {**common, "shell": whole, "boundary": {"lower": held}})))
+    found = run(
+        Case.from_source(Source("part", {**common, "shell": whole, "boundary": {"lower": held}}))
+    )
     lower = found.scene.model.r0.x.array.reshape(-1, 3)[: len(found.last.u) // 3, 2] < 0.5 - 1e-9
     assert not found.last.u.reshape(-1, 3)[lower].any()
     half = {"geometry": "cylinder", "radius": 1, "length": 0.5, "azimuth": [0, 90], **material}
@@ -95,7 +121,16 @@ def test_a_clamped_patch_is_a_clamped_edge_to_the_rest(model: Any, tmp_path: Pat
     points = {"tip": [1, 0, 0.5]}
     alone = run(
         Case.from_source(
-            Source("half", {**common, "points": points, "shell": half, "mesh": mesh, "boundary": {"bottom": "clamped"}})
+            Source(
+                "half",
+                {
+                    **common,
+                    "points": points,
+                    "shell": half,
+                    "mesh": mesh,
+                    "boundary": {"bottom": "clamped"},
+                },
+            )
         )
     )
     assert found.rows[-1]["tip_ux"] == pytest.approx(alone.rows[-1]["tip_ux"], rel=2e-3)
@@ -149,7 +184,9 @@ def built_in() -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("order", "tolerance"), [(1, 0.03), (3, 3e-3)])
-def test_same_answer_as_the_built_in_geometry(model: Any, tmp_path: Path, order: int, tolerance: float) -> None:
+def test_same_answer_as_the_built_in_geometry(
+    model: Any, tmp_path: Path, order: int, tolerance: float
+) -> None:
     """A pinched clamped cylinder in a field; flat facets err by h^2, the others by the mesh."""
     panel(model, order, 0.12)
     gmsh.write(str(tmp_path / "part.msh"))
@@ -164,7 +201,10 @@ def test_remanence_and_thickness_of_patches(model: Any, tmp_path: Path) -> None:
     gmsh.write(str(tmp_path / "part.msh"))
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
     by_name = {"kind": "patches", "patches": {"lower": {"polar": 90}, "rest": {"polar": 0}}}
-    by_place = {"kind": "expression", "components": ["(1 - sign(z - 0.5))/2", "0*x", "(1 + sign(z - 0.5))/2"]}
+    by_place = {
+        "kind": "expression",
+        "components": ["(1 - sign(z - 0.5))/2", "0*x", "(1 + sign(z - 0.5))/2"],
+    }
     found = []
     for remanent in (by_name, by_place):
         magnetic = {"lambda_m": 2e-4, "remanent": remanent, "applied": {"polar": 45}}
@@ -181,7 +221,9 @@ def square(cells: list[list[int]], nodes: list[list[float]] | None = None) -> Pa
     return PatchMesh(np.array(corners, dtype=float), np.array(cells), lambda x: x)
 
 
-def written(cells: list[list[int]], nodes: list[list[float]], lines: list[list[int]], file: Path) -> None:
+def written(
+    cells: list[list[int]], nodes: list[list[float]], lines: list[list[int]], file: Path
+) -> None:
     """A .msh file with these triangles, all its curves named rim."""
     model = gmsh.model
     for dim, kind, elements, name in ((2, 2, cells, "all"), (1, 1, lines, "rim")):
@@ -218,15 +260,30 @@ WRONG = [
         FRAME,
         r"two nodes at \((0, 0|1, 1), 0\), and its parts are not connected",
     ),
-    ([*TWO, [1, 5, 6]], [*CORNERS, [2, 0, 0], [2, -1, 0]], [*FRAME, [1, 5], [5, 6], [6, 1]], "touches itself in"),
-    ([[0, 1, 2], [0, 2, 5]], [*CORNERS, [0.5, 0.5, 0]], [[0, 1], [1, 2], [2, 5], [5, 0]], r"\(0, 0, 0\) has no area"),
+    (
+        [*TWO, [1, 5, 6]],
+        [*CORNERS, [2, 0, 0], [2, -1, 0]],
+        [*FRAME, [1, 5], [5, 6], [6, 1]],
+        "touches itself in",
+    ),
+    (
+        [[0, 1, 2], [0, 2, 5]],
+        [*CORNERS, [0.5, 0.5, 0]],
+        [[0, 1], [1, 2], [2, 5], [5, 0]],
+        r"\(0, 0, 0\) has no area",
+    ),
     (MOEBIUS, STRIP, [], "only one side"),
 ]
 
 
 @pytest.mark.parametrize(("cells", "nodes", "lines", "said"), WRONG)
 def test_unsound_meshes_are_refused(
-    model: Any, tmp_path: Path, cells: list[list[int]], nodes: list[list[float]], lines: list[list[int]], said: str
+    model: Any,
+    tmp_path: Path,
+    cells: list[list[int]],
+    nodes: list[list[float]],
+    lines: list[list[int]],
+    said: str,
 ) -> None:
     written(cells, nodes, lines, tmp_path / "wrong.msh")
     with pytest.raises(MeshError, match=said):
@@ -243,7 +300,9 @@ def test_triangles_the_other_way_round_are_turned(model: Any, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("order", [2, 3])
-def test_curved_triangles_are_turned_with_their_nodes(model: Any, tmp_path: Path, order: int) -> None:
+def test_curved_triangles_are_turned_with_their_nodes(
+    model: Any, tmp_path: Path, order: int
+) -> None:
     """The surface stays the same, its normal changes sides."""
     panel(model, order, 0.5)
     gmsh.write(str(tmp_path / "one.msh"))
@@ -251,7 +310,9 @@ def test_curved_triangles_are_turned_with_their_nodes(model: Any, tmp_path: Path
     model.mesh.reverse()
     gmsh.write(str(tmp_path / "other.msh"))
     other = read_msh(MeshFile(tmp_path / "other.msh", 1.0), {})
-    mine, theirs = (set(map(tuple, np.round(np.sort(p.nodes[p.cells].sum(axis=1)), 9))) for p in (patch, other))
+    mine, theirs = (
+        set(map(tuple, np.round(np.sort(p.nodes[p.cells].sum(axis=1)), 9))) for p in (patch, other)
+    )
     assert mine == theirs
 
 
@@ -272,18 +333,26 @@ def test_what_is_no_mesh_is_refused(model: Any, tmp_path: Path) -> None:
 def test_named_point_must_be_a_vertex(model: Any, tmp_path: Path) -> None:
     panel(model, 1)
     gmsh.write(str(tmp_path / "part.msh"))
-    with pytest.raises(MeshError, match=r"points.A: \(1, 0, 1.01\) in the file's .* nearest is \(1, 0, 1\)"):
+    with pytest.raises(
+        MeshError, match=r"points.A: \(1, 0, 1.01\) in the file's .* nearest is \(1, 0, 1\)"
+    ):
         read_msh(MeshFile(tmp_path / "part.msh", 0.02), {"A": np.array([0.02, 0.0, 0.0202])})
 
 
-@pytest.mark.parametrize(("unit", "times"), [("mm", None), ("m", "1000 times"), ("um", "0.001 times")])
+@pytest.mark.parametrize(
+    ("unit", "times"), [("mm", None), ("m", "1000 times"), ("um", "0.001 times")]
+)
 def test_wrong_unit_is_told(model: Any, tmp_path: Path, unit: str, times: str | None) -> None:
-    """A file in mm that is read as metres is a thousand times as long as its radius; nothing else would say so."""
+    """A file in mm that is read as metres is a thousand times as long as its radius; nothing else
+    would say so.
+    """
     panel(model, 1)
     gmsh.write(str(tmp_path / "part.msh"))
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "unit": unit, "radius": "1 mm"}
     shell |= {"thickness": "10 um", "youngs_modulus": "1 MPa", "poisson_ratio": 0.3}
-    told = make_problem(Case.model_validate({"shell": shell, "boundary": {"bottom": "clamped"}})).warnings
+    told = make_problem(
+        Case.model_validate({"shell": shell, "boundary": {"bottom": "clamped"}})
+    ).warnings
     assert len(told) == (times is not None)
     assert all(str(times) in words for words in told)
 
@@ -305,7 +374,9 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
         ({"boundary": {"top": {"held": ["z"]}}}, "the shell is not held"),
     ):
         with pytest.raises(MeshError, match=said):
-            Scene(Case.from_source({"shell": shell, "mesh": {"degree": 2}, **changed}), MPI.COMM_SELF)
+            Scene(
+                Case.from_source({"shell": shell, "mesh": {"degree": 2}, **changed}), MPI.COMM_SELF
+            )
 
 
 def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
@@ -314,9 +385,17 @@ def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
     model.removePhysicalGroups([(2, 1)])
     gmsh.option.setNumber("Mesh.SaveAll", 1)
     gmsh.write(str(tmp_path / "part.msh"))
-    magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "patches", "patches": {"rest": {"polar": 0}}}}
+    magnetic = {
+        "lambda_m": 1e-3,
+        "remanent": {"kind": "patches", "patches": {"rest": {"polar": 0}}},
+    }
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
-    data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2}}
+    data = {
+        "shell": shell,
+        "boundary": {"rim": "clamped"},
+        "magnetic": magnetic,
+        "mesh": {"degree": 2},
+    }
     data["symmetry"] = "none"  # its two triangles are each other's mirror images
     scene = Scene(Case.from_source(data), MPI.COMM_SELF)
     assert not scene.model.midsurface.patches
@@ -380,9 +459,14 @@ def test_a_sweep_under_dead_loads(case_file: Path, tmp_path: Path) -> None:
     assert [float(factor) for factor in factors if factor] == [0, 1, 0, 1]
 
 
-def test_another_mesh_in_the_same_file_is_another_problem(case_file: Path, tmp_path: Path, no_pictures: None) -> None:
+def test_another_mesh_in_the_same_file_is_another_problem(
+    case_file: Path, tmp_path: Path, no_pictures: None
+) -> None:
     def keys() -> list[str]:
-        return [point.key for point in make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])]
+        return [
+            point.key
+            for point in make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])
+        ]
 
     before = keys()
     run(Case.load(case_file), tmp_path / "out")

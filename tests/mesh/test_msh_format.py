@@ -1,4 +1,6 @@
-"""Mesh files as gmsh reads them, of every version; what is none is refused, and nothing in it ever runs."""
+"""Mesh files as gmsh reads them, of every version; what is none is refused, and nothing in it ever
+runs.
+"""
 
 import os
 import random
@@ -21,7 +23,13 @@ from magshell_fenicsx.mesh.msh_format import parsed
 from magshell_fenicsx.mesh.patch import MeshError
 
 BRACKET = CASES.parent / "meshes" / "bracket.msh"
-VERSIONS = [(2.2, 0), (2.2, 1), (4.0, 0), (4.1, 0), (4.1, 1)]  # and whether it is binary; gmsh writes no binary 4.0
+VERSIONS = [
+    (2.2, 0),
+    (2.2, 1),
+    (4.0, 0),
+    (4.1, 0),
+    (4.1, 1),
+]  # and whether it is binary; gmsh writes no binary 4.0
 
 
 @pytest.fixture
@@ -42,7 +50,9 @@ Places = dict[str, list[tuple[float, ...]]]
 
 
 def by_gmsh(file: Path) -> tuple[Places, Places]:
-    """Names of patches and edges -> the places of the nodes of each element, of which version 2 may have several."""
+    """Names of patches and edges -> the places of the nodes of each element, of which version 2 may
+    have several.
+    """
     gmsh.open(str(file))
     tags, xyz, _ = gmsh.model.mesh.getNodes()
     place = dict(zip(tags.tolist(), xyz.reshape(-1, 3), strict=True))
@@ -53,15 +63,21 @@ def by_gmsh(file: Path) -> tuple[Places, Places]:
             for kind, _, nodes in zip(*gmsh.model.mesh.getElements(dim, entity), strict=True):
                 width = gmsh.model.mesh.getElementProperties(kind)[3]
                 for element in nodes.reshape(-1, width).tolist():
-                    ends = element if dim == 2 else sorted(element[:2], key=lambda n: tuple(place[n]))
-                    found[2 - dim].setdefault(name, []).append(tuple(np.ravel([place[n] for n in ends])))
+                    ends = (
+                        element if dim == 2 else sorted(element[:2], key=lambda n: tuple(place[n]))
+                    )
+                    found[2 - dim].setdefault(name, []).append(
+                        tuple(np.ravel([place[n] for n in ends]))
+                    )
     return tuple({name: sorted(set(rows)) for name, rows in each.items()} for each in found)  # type: ignore[return-value]
 
 
 def by_reader(file: Path) -> tuple[Places, Places]:
     patch = read_msh(MeshFile(file, 1.0), {})
     cells = patch.nodes[patch.cells].reshape(len(patch.cells), -1)
-    patches = {name: sorted(map(tuple, cells[inside].tolist())) for name, inside in patch.patches.items()}
+    patches = {
+        name: sorted(map(tuple, cells[inside].tolist())) for name, inside in patch.patches.items()
+    }
     edges = {
         name: sorted(tuple(np.ravel(sorted(pair))) for pair in patch.nodes[pairs].tolist())
         for name, pairs in patch.edges.items()
@@ -79,8 +95,12 @@ def check_same(file: Path) -> None:
 
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize(("version", "binary"), VERSIONS)
-def test_read_as_gmsh_reads_it(writer: Any, tmp_path: Path, order: int, version: float, binary: int) -> None:
-    """To the last bit: nodes, triangles, patches and edges; a name with a space, one with an accent, one without."""
+def test_read_as_gmsh_reads_it(
+    writer: Any, tmp_path: Path, order: int, version: float, binary: int
+) -> None:
+    """To the last bit: nodes, triangles, patches and edges; a name with a space, one with an
+    accent, one without.
+    """
     panel(writer.model, order)
     writer.model.addPhysicalGroup(1, [1, 3], 77)
     writer.model.setPhysicalName(2, 7, "lower  half, flèche")
@@ -89,7 +109,9 @@ def test_read_as_gmsh_reads_it(writer: Any, tmp_path: Path, order: int, version:
 
 
 @pytest.mark.parametrize(("version", "binary"), VERSIONS)
-def test_nodes_with_parameters_and_parts(writer: Any, tmp_path: Path, version: float, binary: int) -> None:
+def test_nodes_with_parameters_and_parts(
+    writer: Any, tmp_path: Path, version: float, binary: int
+) -> None:
     """What gmsh can write besides: the place on the surface, all elements, a partition."""
     panel(writer.model, 2)
     writer.option.setNumber("Mesh.SaveParametric", float(version > 4))
@@ -128,7 +150,9 @@ SCRIPTS = {
 
 @pytest.mark.parametrize("name", SCRIPTS)
 @pytest.mark.parametrize("end", ["msh", "geo"])
-def test_a_script_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, end: str) -> None:
+def test_a_script_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, end: str
+) -> None:
     """Whatever it is called; gmsh.open runs most of these."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hidden.geo").write_text(RUN, encoding="utf-8")
@@ -139,8 +163,12 @@ def test_a_script_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, na
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize("more", [RUN, f"$Script\n{RUN}$EndScript\n", f"$Comments\n{RUN}", f"$PostFormat\n{RUN}"])
-def test_a_script_at_the_end_of_a_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> None:
+@pytest.mark.parametrize(
+    "more", [RUN, f"$Script\n{RUN}$EndScript\n", f"$Comments\n{RUN}", f"$PostFormat\n{RUN}"]
+)
+def test_a_script_at_the_end_of_a_mesh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: str
+) -> None:
     """Is not looked at, nor is a section that nobody knows."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.msh").write_text(BRACKET.read_text(encoding="utf-8") + more, encoding="utf-8")
@@ -179,9 +207,15 @@ DAMAGED = [
         "is damaged, or of a version that gmsh does not read, which says: Error loading",
     ),
     (MESH.replace("$EndNodes", ""), "it has no triangles, or triangles of several orders"),
-    (MESH.replace("$Elements\n", "$Elements\n9"), "is damaged, or .* which says: Could not read elements"),
+    (
+        MESH.replace("$Elements\n", "$Elements\n9"),
+        "is damaged, or .* which says: Could not read elements",
+    ),
     (MESH.replace("\n0 0.4 0\n", "\n0 nan 0\n"), "a coordinate is not a number"),
-    (MESH.replace("\n0 0.4 0\n", "\n0 O.4 0\n"), "is damaged, or .* which says: Could not read nodes"),
+    (
+        MESH.replace("\n0 0.4 0\n", "\n0 O.4 0\n"),
+        "is damaged, or .* which says: Could not read nodes",
+    ),
     (MESH[: MESH.index("$Nodes")], "there is no mesh in it"),
 ]
 
@@ -205,7 +239,9 @@ def test_a_crash_of_gmsh_is_a_message(tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(("version", "binary"), VERSIONS)
 def test_no_damage_is_a_traceback(writer: Any, tmp_path: Path, version: float, binary: int) -> None:
-    """Cut off, which is never read, overwritten or repeated at random places: a message in words, if it is refused."""
+    """Cut off, which is never read, overwritten or repeated at random places: a message in words,
+    if it is refused.
+    """
     panel(writer.model, 1, 0.5)
     write(tmp_path / "part.msh", version, binary)
     rng, whole = random.Random(1), (tmp_path / "part.msh").read_bytes()
@@ -232,7 +268,11 @@ def test_settings_of_the_user_are_not_run(tmp_path: Path) -> None:
     for text in ("", f'SystemCall "touch {tmp_path}/ran";\nMesh.Algorithm = 8;\n'):
         (tmp_path / ".gmshrc").write_text(text, encoding="utf-8")
         tests = str(CASES.parent / "tests")
-        told = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join([tests, *sys.path])}
+        told = {
+            **os.environ,
+            "HOME": str(tmp_path),
+            "PYTHONPATH": os.pathsep.join([tests, *sys.path]),
+        }
         code = "from conftest import disc; print(disc(0.5).mesh.geometry.x.tolist())"
         found.append(subprocess.check_output([sys.executable, "-c", code], env=told))
     assert found[0] == found[1]

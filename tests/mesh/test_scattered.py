@@ -28,7 +28,9 @@ PLACES, ELSEWHERE = on_sphere(1500), on_sphere(3000)
 
 
 def test_interpolates_and_converges() -> None:
-    """Exact at the places, and between them of third order at least (Wendland 2005, theorem 11.36, less its edge)."""
+    """Exact at the places, and between them of third order at least (Wendland 2005, theorem 11.36,
+    less its edge).
+    """
     inner = ELSEWHERE[ELSEWHERE[:, 2] > 0.3]
     errors = []
     for n in (375, 1500):
@@ -64,18 +66,25 @@ def test_second_derivatives_are_continuous() -> None:
 
 
 def test_a_hole_in_dense_noisy_values_is_bridged() -> None:
-    """The nearest values of a place in it lie on a thin arc, which says little of the slope across it."""
+    """The nearest values of a place in it lie on a thin arc, which says little of the slope across
+    it.
+    """
     many = on_sphere(40000)
     many = many[(many[:, 2] > 0.93) & (np.linalg.norm(many - [0, 0, 1], axis=1) > 0.2)]
     noisy = 0.5 * many[:, 0] + 0.02 * RNG.standard_normal(len(many))
-    found, hole = scattered(many, noisy, ELSEWHERE[ELSEWHERE[:, 2] > 0.94]), ELSEWHERE[ELSEWHERE[:, 2] > 0.98]
+    found, hole = (
+        scattered(many, noisy, ELSEWHERE[ELSEWHERE[:, 2] > 0.94]),
+        ELSEWHERE[ELSEWHERE[:, 2] > 0.98],
+    )
     assert np.sqrt(np.mean((found(hole) - 0.5 * hole[:, 0]) ** 2)) < 0.03
 
 
 def test_a_hole_is_bridged_and_copies_are_the_same() -> None:
     outside = PLACES[np.linalg.norm(PLACES - [0.6, 0, 0.8], axis=1) > 0.15]
     found = scattered(outside, 0.3 * outside[:, 0] ** 2, PLACES[::5], noise=0)
-    assert pickle.loads(pickle.dumps(found))(ELSEWHERE) == pytest.approx(0.3 * ELSEWHERE[:, 0] ** 2, abs=1e-3)
+    assert pickle.loads(pickle.dumps(found))(ELSEWHERE) == pytest.approx(
+        0.3 * ELSEWHERE[:, 0] ** 2, abs=1e-3
+    )
     twice = np.vstack([outside, outside])
     again = scattered(twice, 0.3 * twice[:, 0] ** 2, PLACES[::5], noise=0)
     assert np.array_equal(again(ELSEWHERE[:50]), found(ELSEWHERE[:50]))

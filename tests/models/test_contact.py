@@ -40,13 +40,20 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 def scene(kind: str) -> Scene:
     bodies, sections = KINDS[kind]
     loading = [{"kind": "contact", "body": name, "approach": 1} for name in bodies]
-    data = {"shell": HEMISPHERE, "boundary": {"equator": "clamped"}, "bodies": bodies, "loading": loading}
+    data = {
+        "shell": HEMISPHERE,
+        "boundary": {"equator": "clamped"},
+        "bodies": bodies,
+        "loading": loading,
+    }
     return Scene(Case.model_validate(data | sections))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives(kind: str) -> None:
-    """Central differences of energy, residual and conjugate at a rough state: 1e-6; all change with the approach."""
+    """Central differences of energy, residual and conjugate at a rough state: 1e-6; all change with
+    the approach.
+    """
     model = scene(kind).model
     system, h = model.system, model.material.h
     rng = np.random.default_rng(4)
@@ -83,13 +90,17 @@ def test_derivatives(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["meridian", "full"])
 def test_newton_is_quadratic(kind: str) -> None:
-    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the last one squared."""
+    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the
+    last one squared.
+    """
     system = scene(kind).model.system
     mu = dict.fromkeys(scene(kind).unloaded().mu, 0.2)
     u, sizes = np.zeros(system.size), list[float]()
     for _ in range(25):
         rows, columns, values = system.tangent(u, mu).getValuesCSR()
-        K = scipy.sparse.csc_array(scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size)))
+        K = scipy.sparse.csc_array(
+            scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size))
+        )
         du = scipy.sparse.linalg.spsolve(K, system.residual(u, mu))
         u = u - du
         sizes.append(float(np.abs(du).max()) / system.length)
@@ -102,7 +113,9 @@ def test_newton_is_quadratic(kind: str) -> None:
 
 
 def test_penalty() -> None:
-    """Zero where the gap is open; its derivatives by central differences, also across the end of the soft part."""
+    """Zero where the gap is open; its derivatives by central differences, also across the end of
+    the soft part.
+    """
     s = np.array([-1e-3, 2e-4, 8e-4, 9.99e-4, 1.001e-3, 5e-3])
     value, first, second = penalty(s, 3.0, 1e-3)
     low, high = (penalty(s + side, 3.0, 1e-3) for side in (-1e-7, 1e-7))
@@ -112,10 +125,11 @@ def test_penalty() -> None:
 
 
 def disc_on_ball(w0: float, bend: float) -> tuple[float, float]:
-    """Radius c of the ring and force P/(8 pi D) of a clamped disc of radius 1 that a ball of radius 1/bend lifts by w0.
+    """Radius c of the ring and force P/(8 pi D) of a clamped disc of radius 1 that a ball of radius
+    1/bend lifts by w0.
 
-    Kirchhoff's plate under a ring load is a paraboloid within the ring: it fits the ball there (Timoshenko and
-    Woinowsky-Krieger, Theory of Plates and Shells, art. 19).
+    Kirchhoff's plate under a ring load is a paraboloid within the ring: it fits the ball there
+    (Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, art. 19).
     """
 
     def force(c: float) -> float:

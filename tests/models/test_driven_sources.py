@@ -1,4 +1,6 @@
-"""Sources of the field in every model: derivatives by u, place, angle and strength; force and torque on a rigid cap."""
+"""Sources of the field in every model: derivatives by u, place, angle and strength; force and
+torque on a rigid cap.
+"""
 
 from functools import cache
 from itertools import pairwise
@@ -14,7 +16,13 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 
 MM = 1e-3
-PLATE = {"geometry": "plate", "length": "30 mm", "width": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+PLATE = {
+    "geometry": "plate",
+    "length": "30 mm",
+    "width": "12 mm",
+    "thickness": "1 mm",
+    "youngs_modulus": "1 MPa",
+}
 RING = {
     "geometry": "annulus",
     "radius": "30 mm",
@@ -24,11 +32,22 @@ RING = {
 }
 MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
 ASIDE = {**MAGNET, "position": [0.035, 0.006, -0.02], "axis": {"polar": 25.0}, "name": "magnet"}
-COIL = {"kind": "coil", "diameter": "30 mm", "current": "500 A", "position": [0.01, 0.0, 0.03], "axis": {"polar": 60.0}}
+COIL = {
+    "kind": "coil",
+    "diameter": "30 mm",
+    "current": "500 A",
+    "position": [0.01, 0.0, 0.03],
+    "axis": {"polar": 60.0},
+}
 BELOW = {**MAGNET, "position": [0.0, 0.0, -0.02]}
 STEPS = [
     {"kind": "field"},
-    {"kind": "source", "name": "turn", "source": "magnet", "turn": {"axis": [0, 1, 0.2], "angle": 50}},
+    {
+        "kind": "source",
+        "name": "turn",
+        "source": "magnet",
+        "turn": {"axis": [0, 1, 0.2], "angle": 50},
+    },
     {"kind": "source", "name": "shift", "source": "magnet", "move": [-0.02, 0.0, -0.01]},
     {"kind": "source", "name": "power", "source": "magnet", "strength": 2.5},
     {"kind": "source", "name": "current", "source": 1, "strength": 0.3},
@@ -41,11 +60,18 @@ UP = [
 
 
 def field(sources: list[dict[str, Any]], **applied: Any) -> dict[str, Any]:
-    return {"remanent": {"polar": 90, "flux_density": "100 mT"}, "applied": {"sources": sources, **applied}}
+    return {
+        "remanent": {"polar": 90, "flux_density": "100 mT"},
+        "applied": {"sources": sources, **applied},
+    }
 
 
 def made(shell: dict[str, Any], boundary: dict[str, str], **sections: Any) -> Scene:
-    return Scene(Case.model_validate({"shell": {"poisson_ratio": 0.3, **shell}, "boundary": boundary, **sections}))
+    return Scene(
+        Case.model_validate(
+            {"shell": {"poisson_ratio": 0.3, **shell}, "boundary": boundary, **sections}
+        )
+    )
 
 
 KINDS = {
@@ -68,7 +94,9 @@ def scene(kind: str) -> Scene:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_by_the_amplitudes(kind: str) -> None:
-    """Central differences of energy, residual and conjugates at a rough state; all change with the amplitude."""
+    """Central differences of energy, residual and conjugates at a rough state; all change with the
+    amplitude.
+    """
     system, step = scene(kind).model.system, 1e-4
     u = system.held(2e-4 * np.random.default_rng(1).standard_normal(system.size))
     start = scene(kind).unloaded().mu
@@ -79,12 +107,18 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
         mu |= {name: size * (1 + i / 2) * (-1) ** i for i, name in enumerate(driven)}
 
         def known(mu: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-            """The residual, and all potentials: that of lambda_m times it is the energy that the amplitudes change."""
-            return system.residual(u, mu), np.array([system.potential(u, mu, name) for name in others])
+            """The residual, and all potentials: that of lambda_m times it is the energy that the
+            amplitudes change.
+            """
+            return system.residual(u, mu), np.array(
+                [system.potential(u, mu, name) for name in others]
+            )
 
         for name in driven:
             a, b, c, d = (known({**mu, name: mu[name] + side * step}) for side in (-2, -1, 1, 2))
-            rates = [(p - 8 * q + 8 * r - s) / (12 * step) for p, q, r, s in zip(a, b, c, d, strict=True)]
+            rates = [
+                (p - 8 * q + 8 * r - s) / (12 * step) for p, q, r, s in zip(a, b, c, d, strict=True)
+            ]
             slope, column = system.potential(u, mu, name), system.load(u, mu, name)
             assert slope == pytest.approx(mu["lambda_m"] * rates[1][0], rel=1e-6)
             np.testing.assert_allclose(column, rates[0], atol=1e-6 * np.abs(column).max())
@@ -98,7 +132,9 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_tangent(kind: str) -> None:
-    """Central differences of the energy and of the residual along a direction; the tangent changes with a magnet."""
+    """Central differences of the energy and of the residual along a direction; the tangent changes
+    with a magnet.
+    """
     system, rng, e = scene(kind).model.system, np.random.default_rng(2), 1e-5
     u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
     moved = []
@@ -127,19 +163,36 @@ def _times(K: Any, v: np.ndarray) -> np.ndarray:
 
 
 def test_force_and_torque_on_a_magnetised_cap() -> None:
-    """Those of magpylib, of the magnet on the dipoles of a rigid cap: 20 x 40 of them, by Gauss's rule."""
+    """Those of magpylib, of the magnet on the dipoles of a rigid cap: 20 x 40 of them, by Gauss's
+    rule.
+    """
     R, h, polar, J = 25 * MM, 0.25 * MM, np.pi / 6, np.array([0.06, 0.0, 0.08])
     here = np.array([6 * MM, -3 * MM, 40 * MM])
     axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
     steps = [{"kind": "field"}]
-    steps += [{"kind": "source", "name": f"move_{k}", "move": [5e-3 * x for x in e]} for k, e in axes.items()]
-    steps += [{"kind": "source", "name": f"turn_{k}", "turn": {"axis": e, "angle": 20}} for k, e in axes.items()]
+    steps += [
+        {"kind": "source", "name": f"move_{k}", "move": [5e-3 * x for x in e]}
+        for k, e in axes.items()
+    ]
+    steps += [
+        {"kind": "source", "name": f"turn_{k}", "turn": {"axis": e, "angle": 20}}
+        for k, e in axes.items()
+    ]
     magnet = {**MAGNET, "position": here.tolist(), "axis": {"polar": 35, "azimuth": 70}}
     cap = made(
-        {"geometry": "cap", "radius": "25 mm", "polar": 30, "thickness": "0.25 mm", "youngs_modulus": "1 TPa"},
+        {
+            "geometry": "cap",
+            "radius": "25 mm",
+            "polar": 30,
+            "thickness": "0.25 mm",
+            "youngs_modulus": "1 TPa",
+        },
         {"rim": "clamped"},
         magnetic={
-            "remanent": {"polar": float(np.degrees(np.arctan2(0.6, 0.8))), "flux_density": "100 mT"},
+            "remanent": {
+                "polar": float(np.degrees(np.arctan2(0.6, 0.8))),
+                "flux_density": "100 mT",
+            },
             "applied": {"sources": [magnet]},
         },
         loading=steps,
@@ -153,12 +206,17 @@ def test_force_and_torque_on_a_magnetised_cap() -> None:
     s, weights = np.polynomial.legendre.leggauss(20)
     theta, weight = (s + 1) * polar / 2, weights * polar / 2
     phi = 2 * np.pi * np.arange(40) / 40
-    places = R * np.array([[np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)] for t in theta for p in phi])
+    places = R * np.array(
+        [[np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)] for t in theta for p in phi]
+    )
     volumes = np.repeat(h * R**2 * np.sin(theta) * weight * 2 * np.pi / 40, 40)
     body = [
-        magpylib.misc.Dipole(moment=v * J / magpylib.mu_0, position=x) for v, x in zip(volumes, places, strict=True)
+        magpylib.misc.Dipole(moment=v * J / magpylib.mu_0, position=x)
+        for v, x in zip(volumes, places, strict=True)
     ]
-    own = magpylib.magnet.Cylinder(dimension=(20 * MM, 10 * MM), polarization=(0, 0, 1.3), position=here)
+    own = magpylib.magnet.Cylinder(
+        dimension=(20 * MM, 10 * MM), polarization=(0, 0, 1.3), position=here
+    )
     own.orientation = Rotation.from_euler("ZY", [70, 35], degrees=True)
     F, T = np.sum(magpylib.getFT(own, body, pivot=here), axis=1)
     assert np.linalg.norm(force + F) <= 1e-3 * np.linalg.norm(F)
@@ -167,7 +225,9 @@ def test_force_and_torque_on_a_magnetised_cap() -> None:
 
 @pytest.mark.parametrize("kind", ["shell", "solid"])
 def test_newton_is_quadratic(kind: str) -> None:
-    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the last one squared."""
+    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the
+    last one squared.
+    """
     system = scene(kind).model.system
     mu = dict.fromkeys(scene(kind).unloaded().mu, 0.3) | {"lambda_m": 3e-4}
     u, sizes = np.zeros(system.size), list[float]()
@@ -186,7 +246,9 @@ def test_newton_is_quadratic(kind: str) -> None:
 
 
 def test_models_agree() -> None:
-    """A magnet below a rigid disc, moved: meridian and half shell have the same force on it; a solid is thick."""
+    """A magnet below a rigid disc, moved: meridian and half shell have the same force on it; a
+    solid is thick.
+    """
     disc = {"geometry": "disc", "radius": "25 mm", "thickness": "0.5 mm", "youngs_modulus": "1 MPa"}
     coarse = {"mesh": {"degree": 3, "refinement": 0.5}}
     found = []
@@ -200,7 +262,10 @@ def test_models_agree() -> None:
             {"rim": "clamped"},
             symmetry=symmetry,
             magnetic={"remanent": {"flux_density": "60 mT"}, "applied": {"sources": [BELOW]}},
-            loading=[{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, -0.01], "points": 1}],
+            loading=[
+                {"kind": "field", "points": 1},
+                {"kind": "source", "move": [0, 0, -0.01], "points": 1},
+            ],
             **sections,
         )
         mu = dict.fromkeys(one.unloaded().mu, 0.5) | {"lambda_m": one.problem.lambda_m}

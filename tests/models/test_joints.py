@@ -1,4 +1,6 @@
-"""Joints of plates: a hinge and a rigid joint against beams, a crease with a spring against two bars."""
+"""Joints of plates: a hinge and a rigid joint against beams, a crease with a spring against two
+bars.
+"""
 
 import re
 from pathlib import Path
@@ -20,7 +22,14 @@ D = h**3 / 12
 
 
 def plate(position: list[float], polar: float = 0.0, **keys: Any) -> dict[str, Any]:
-    shell = {"geometry": "plate", "length": 1, "width": 0.25, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
+    shell = {
+        "geometry": "plate",
+        "length": 1,
+        "width": 0.25,
+        "thickness": h,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0,
+    }
     return {"shell": shell, "place": {"position": position, "axis": {"polar": polar}}, **keys}
 
 
@@ -47,7 +56,9 @@ def test_hinge() -> None:
 
 def test_rigid_and_stiff() -> None:
     """One beam of twice the length, clamped and supported, loaded on half of it: Macaulay, 1e-4."""
-    R = (1 / 8 + 1 / 6) / (8 / 3)  # of the support, over q L: the free end would sink by q L^4 (1/8 + 1/6)/D
+    R = (1 / 8 + 1 / 6) / (
+        8 / 3
+    )  # of the support, over q L: the free end would sink by q L^4 (1/8 + 1/6)/D
     at_joint = 1 / 8 - R * 5 / 6  # a force at the end lifts the middle by R L^3 (3 2 - 1)/(6 D)
     rigid = deflected({"kind": "rigid"})
     assert rigid == pytest.approx(1e-8 * at_joint / D, rel=1e-4)
@@ -68,17 +79,23 @@ def test_unlike_materials() -> None:
     }  # fmt: skip
     scene = Scene(Case.from_source(data))
     *_, last = follow(scene)
-    exact = 1e-9 / 0.25 * (7 / 3 / D + 1 / 3 / (5 * D))  # the curvature F (2 - x)/D, times 2 - x, over both parts
+    exact = (
+        1e-9 / 0.25 * (7 / 3 / D + 1 / 3 / (5 * D))
+    )  # the curvature F (2 - x)/D, times 2 - x, over both parts
     assert -scene.observe(last.point.state)["right_tip_uz"] == pytest.approx(exact, rel=1e-4)
 
 
 def test_angle_of_a_crease() -> None:
-    """A weak spring between stiff plates: with the ends held apart it rests where two bars have its angle: 1e-4."""
+    """A weak spring between stiff plates: with the ends held apart it rests where two bars have its
+    angle: 1e-4.
+    """
     angle = 60.0
     at = np.radians(angle / 2)
     left = plate([0, 0, 0], -29.0, boundary={"left": {"held": ["x", "y", "z"]}})
     x, z = np.cos(np.radians(29.0)), np.sin(np.radians(29.0))
-    right = plate([x, 0, z], 29.0, boundary={"right": {"held": ["y", "z"]}}, points={"end": [1, 0.125, 0]})
+    right = plate(
+        [x, 0, z], 29.0, boundary={"right": {"held": ["y", "z"]}}, points={"end": [1, 0.125, 0]}
+    )
     data = {
         "shells": {"left": left, "right": right},
         "joints": [{"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 0.01 * D, "angle": -angle}],
@@ -94,20 +111,37 @@ def test_angle_of_a_crease() -> None:
 
 def test_messages() -> None:
     caps = {
-        name: {"shell": {"geometry": "cap", "radius": 1, "polar": 40, "thickness": 0.02, "poisson_ratio": 0.3}}
+        name: {
+            "shell": {
+                "geometry": "cap",
+                "radius": 1,
+                "polar": 40,
+                "thickness": 0.02,
+                "poisson_ratio": 0.3,
+            }
+        }
         for name in "ab"
     }
     caps["b"] |= {"place": {"position": [0, 0, 2 * np.cos(np.radians(40))], "axis": {"polar": 180}}}
     caps["a"] |= {"boundary": {"rim": {"held": ["z"]}}}
-    lens = {"shells": caps, "joints": [{"edges": ["a.rim", "b.rim"], "kind": "hinge"}], "loading": {"kind": "pressure"}}
+    lens = {
+        "shells": caps,
+        "joints": [{"edges": ["a.rim", "b.rim"], "kind": "hinge"}],
+        "loading": {"kind": "pressure"},
+    }
     with pytest.raises(
-        MeshError, match=r"boundary.a_rim: is joined, by joints.0, and no edge of the surface; its edges"
+        MeshError,
+        match=r"boundary.a_rim: is joined, by joints.0, and no edge of the surface; its edges",
     ):
         Case.from_source(lens).problem()
-    with pytest.raises(MeshError, match=r"joints.0.edges: left.right and right.left do not meet, by 0.1 R at \(1.1, "):
+    with pytest.raises(
+        MeshError,
+        match=r"joints.0.edges: left.right and right.left do not meet, by 0.1 R at \(1.1, ",
+    ):
         deflected({"kind": "hinge"}, gap=0.1)
     with pytest.raises(
-        CaseError, match=r"stiffness belongs to kind: spring, and must be given there; the kind is hinge"
+        CaseError,
+        match=r"stiffness belongs to kind: spring, and must be given there; the kind is hinge",
     ):
         deflected({"kind": "hinge", "stiffness": 1})
 
@@ -115,17 +149,30 @@ def test_messages() -> None:
 def test_an_edge_joins_another_shell() -> None:
     """An edge lies on its own shell always: that joint would join nothing."""
     with pytest.raises(CaseError, match="stiffener: is the shell of the edge itself"):
-        Case.load(CASES / "stiffened_plate.yaml", ["joints=[{edges: [stiffener.bottom, stiffener]}]"])
+        Case.load(
+            CASES / "stiffened_plate.yaml", ["joints=[{edges: [stiffener.bottom, stiffener]}]"]
+        )
 
 
-BEAM = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
+BEAM = {
+    "geometry": "plate",
+    "length": 1,
+    "width": 0.2,
+    "thickness": 0.01,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0.3,
+}
 LINE = {
     "shells": {
         "beam": {"shell": BEAM, "boundary": {"left": "clamped"}},
         "arm": {"shell": BEAM, "place": {"position": [1, 0, 0]}, "points": {"end": [1, 0, 0]}},
     },
     "joints": [{"edges": ["beam.right", "arm.left"]}],
-    "loading": {"kind": "dead", "loads": [{"edge": "beam.right", "per_length": [0, 0, 1e-9]}], "factor": 1},
+    "loading": {
+        "kind": "dead",
+        "loads": [{"edge": "beam.right", "per_length": [0, 0, 1e-9]}],
+        "factor": 1,
+    },
 }
 
 
@@ -138,7 +185,9 @@ LINE = {
         ("shells.beam.boundary.right=clamped", "shells.beam.boundary.right: is joined, by joints.0, and no edge"),
     ],
 )  # fmt: skip
-def test_names_in_messages_are_those_of_the_case(tmp_path: Path, setting: str, message: str) -> None:
+def test_names_in_messages_are_those_of_the_case(
+    tmp_path: Path, setting: str, message: str
+) -> None:
     (tmp_path / "line.yaml").write_text(yaml.safe_dump(LINE), encoding="utf-8")
     with pytest.raises(CaseError, match=re.escape(message)):
         describe(Case.load(tmp_path / "line.yaml", [setting]))
@@ -147,6 +196,8 @@ def test_names_in_messages_are_those_of_the_case(tmp_path: Path, setting: str, m
 @pytest.mark.parametrize("stiffness", [2e6 * D / h, 1e9])
 def test_a_joint_too_stiff_is_refused(stiffness: float) -> None:
     """A spring may be 1e6 times as stiff as the shell over its thickness, E h^2/(12 (1 - nu^2))."""
-    said = r"joints.0.stiffness: .* = 3.333e-05; allowed up to 1e\+06 times, 33.33: .* use kind: rigid"
+    said = (
+        r"joints.0.stiffness: .* = 3.333e-05; allowed up to 1e\+06 times, 33.33: .* use kind: rigid"
+    )
     with pytest.raises(CaseError, match=said):
         deflected({"kind": "spring", "stiffness": stiffness})

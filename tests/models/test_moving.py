@@ -20,7 +20,13 @@ UP = move("up", "inner", shift=[0, 0, 0.3])
 FIELD = {"magnetic": {"lambda_m": 1.0, "remanent": {"polar": 90}, "applied": {"polar": 0}}}
 TIP = {"left": "clamped", "right": {"held": ["z"]}}
 CAP = {"geometry": "cap", "radius": 1.0, "thickness": 0.1, "polar": 60, "youngs_modulus": 1.0}
-TUBE = {"geometry": "cylinder", "radius": 1.0, "length": 1.0, "thickness": 0.1, "youngs_modulus": 1.0}
+TUBE = {
+    "geometry": "cylinder",
+    "radius": 1.0,
+    "length": 1.0,
+    "thickness": 0.1,
+    "youngs_modulus": 1.0,
+}
 ROLL = move("roll", "rim", shift=[0.1, 0.2, 0.3], turn=[0.4, -0.7, 0.2], centre=[0, 0.1, 0.2])
 FALL = move("fall", "rim", shift=[0, 0, -0.3], turn=[0, 0.5, 0])
 RIM = {"rim": "clamped"}
@@ -53,7 +59,9 @@ def scene(kind: str) -> Scene:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_by_the_amplitudes(kind: str) -> None:
-    """Central differences of energy, residual and conjugates at a rough state; all change with the amplitude."""
+    """Central differences of energy, residual and conjugates at a rough state; all change with the
+    amplitude.
+    """
     system, step = scene(kind).model.system, 1e-5
     rng = np.random.default_rng(1)
     u = system.held(1e-3 * rng.standard_normal(system.size))
@@ -65,7 +73,8 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
         def energy(mu: dict[str, float]) -> float:
             placed = system.placed(State(u, mu)).u
             return sum(
-                (mu[t.amplitude] if t.amplitude else 1.0) * system.energies(placed, mu)[t.name] for t in system.terms
+                (mu[t.amplitude] if t.amplitude else 1.0) * system.energies(placed, mu)[t.name]
+                for t in system.terms
             )
 
         for name in moving:
@@ -79,22 +88,34 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
             found.append((slope, np.abs(column).max()))
             for other in mu:
                 bend = system.curvature(u, mu, name, other)
-                mixed = (system.potential(u, high, other) - system.potential(u, low, other)) / (2 * step)
+                mixed = (system.potential(u, high, other) - system.potential(u, low, other)) / (
+                    2 * step
+                )
                 assert bend == pytest.approx(mixed, rel=1e-5, abs=1e-8 * abs(slope))
-                assert bend == pytest.approx(system.curvature(u, mu, other, name), rel=1e-9, abs=1e-12 * abs(slope))
+                assert bend == pytest.approx(
+                    system.curvature(u, mu, other, name), rel=1e-9, abs=1e-12 * abs(slope)
+                )
     first, second = np.array(found).reshape(2, -1)
     assert (np.abs(second / first - 1) > 1e-2).all()
 
 
 @pytest.mark.parametrize("kind", ["shell", "solid"])
 def test_rigid_motion_of_everything(kind: str) -> None:
-    """Both ends and all other nodes carried along by a rotation of 130 degrees: no energy, no force, no conjugate."""
-    both = move("turn", "left", "right", shift=[0.2, 0.1, -0.4], turn=[1.0, -1.5, 1.4], centre=[0.3, 0, 0])
+    """Both ends and all other nodes carried along by a rotation of 130 degrees: no energy, no
+    force, no conjugate.
+    """
+    both = move(
+        "turn", "left", "right", shift=[0.2, 0.1, -0.4], turn=[1.0, -1.5, 1.4], centre=[0.3, 0, 0]
+    )
     sections = SMALL if kind == "shell" else SOLID
-    model = moving_scene((both,), SHORT if kind == "shell" else {**SHORT, "thickness": 0.1}, **sections).model
+    model = moving_scene(
+        (both,), SHORT if kind == "shell" else {**SHORT, "thickness": 0.1}, **sections
+    ).model
     places, mu = in_space(model.r0.x.array, 3), {"turn": 1.0}
     Q = both.motion.rotation(1.0)[0]
-    u = ((places - both.motion.centre) @ Q.T + both.motion.centre + both.motion.shift - places).ravel()
+    u = (
+        (places - both.motion.centre) @ Q.T + both.motion.centre + both.motion.shift - places
+    ).ravel()
     state = model.system.placed(State(u, mu))
     np.testing.assert_allclose(state.u, u, atol=1e-14)
     bent = model.system.placed(State(0.0 * u, mu))

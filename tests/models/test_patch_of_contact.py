@@ -16,8 +16,12 @@ h, P = 0.02, 4e-3  # thickness, and the pressure over E h/R
 SOFT = 1.0  # foundation, over E/R, which holds what nothing touches yet
 
 
-def square(size: float, angle: float, shift: tuple[float, float]) -> tuple[Array, NDArray[np.int64]]:
-    """Corners and triangles of a unit square: inside a lattice of a size that is turned and shifted, and its edge."""
+def square(
+    size: float, angle: float, shift: tuple[float, float]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Corners and triangles of a unit square: inside a lattice of a size that is turned and
+    shifted, and its edge.
+    """
     n = round(1 / size)
     t = np.arange(n) / n
     sides = (t, 0 * t), (0 * t + 1, t), (1 - t, 0 * t + 1), (0 * t, 1 - t)
@@ -42,17 +46,34 @@ def write(file: Path, lower: tuple[Any, ...], upper: tuple[Any, ...]) -> Path:
         elements += [f"2 2 {number + 1} {number + 1} {a} {b} {c}" for a, b, c in triangles + first]
         around = zip(edge + first, np.roll(edge, -1) + first, strict=True)
         elements += [f"1 2 {number + 3} {number + 3} {a} {b}" for a, b in around]
-    text = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "4", '2 1 "lower"', '2 2 "upper"']
+    text = [
+        "$MeshFormat",
+        "2.2 0 8",
+        "$EndMeshFormat",
+        "$PhysicalNames",
+        "4",
+        '2 1 "lower"',
+        '2 2 "upper"',
+    ]
     text += ['1 3 "lower_edge"', '1 4 "upper_edge"', "$EndPhysicalNames"]
     for name, lines in (("Nodes", nodes), ("Elements", elements)):
-        text += [f"${name}", str(len(lines)), *(f"{i} {line}" for i, line in enumerate(lines, 1)), f"$End{name}"]
+        text += [
+            f"${name}",
+            str(len(lines)),
+            *(f"{i} {line}" for i, line in enumerate(lines, 1)),
+            f"$End{name}",
+        ]
     file.write_text("\n".join(text) + "\n", encoding="utf-8")
     return file
 
 
 def test_pressure_is_uniform(tmp_path: Path) -> None:
     """To 1e-3 at all points and in all cells: that of the load less the foundation's."""
-    file = write(tmp_path / "two.msh", square(1 / 2, 0.0, (0.0, 0.0)), square(1 / 3, np.radians(30), (0.37, 0.21)))
+    file = write(
+        tmp_path / "two.msh",
+        square(1 / 2, 0.0, (0.0, 0.0)),
+        square(1 / 3, np.radians(30), (0.37, 0.21)),
+    )
     case = {
         "shell": {
             "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0
@@ -69,7 +90,9 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
     scene = Scene(Case.model_validate(case))
     state, (touching,) = scene.unloaded(), scene.model.touchings
     for factor in (0.01, 0.1, 1.0):
-        outcome = scene.newton.solve(state.with_(state.u, "load", factor), "load", GivenLoad("load", factor))
+        outcome = scene.newton.solve(
+            state.with_(state.u, "load", factor), "load", GivenLoad("load", factor)
+        )
         assert outcome.converged, outcome.reason
         state = outcome.state
     at = scene.model.system.at(state)

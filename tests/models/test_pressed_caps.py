@@ -18,21 +18,35 @@ CAP = {
 }  # fmt: skip
 HELD = {"rim": "clamped", "left": "symmetry", "right": "symmetry"}
 MESH = {"degree": 3, "size": 0.04}
-TURNED, MOVED = np.diag([1.0, -1, -1]), np.array([0, 0, 2 * TOP + h])  # the upper cap: the lower one about the x axis
+TURNED, MOVED = (
+    np.diag([1.0, -1, -1]),
+    np.array([0, 0, 2 * TOP + h]),
+)  # the upper cap: the lower one about the x axis
 
 
 def pressed(**moves: float) -> dict[str, Any]:
     """Rims that move along e3 by so many thicknesses for a factor of one, to one."""
-    moving = [{"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]} for name, z in moves.items()]
-    return {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moving}
+    moving = [
+        {"supports": [name.replace("_", ".")], "translation": [0, 0, z * h]}
+        for name, z in moves.items()
+    ]
+    return {
+        "kind": "edge",
+        "name": "w",
+        "control": "load",
+        "factor": 1,
+        "points": 1,
+        "moves": moving,
+    }
 
 
 @pytest.mark.slow
 def test_two_caps_are_one_on_a_plane() -> None:
     """F at h to 1e-3.
 
-    The equilibrium of two begins as that of one and its image, and is solved. Two share a penetration, so that the same
-    law has half the stiffness. The meshes do not match: one is the other turned, and a plane would mirror it.
+    The equilibrium of two begins as that of one and its image, and is solved. Two share a
+    penetration, so that the same law has half the stiffness. The meshes do not match: one is the
+    other turned, and a plane would mirror it.
     """
     plane = {
         "kind": "plane",
@@ -46,11 +60,19 @@ def test_two_caps_are_one_on_a_plane() -> None:
     place = {"position": list(MOVED), "axis": {"polar": 180}, "turn": 180}
     shells = {"lower": cap, "upper": {**cap, "place": place}}
     loading = pressed(lower_rim=1, upper_rim=-1)
-    data = {"shells": shells, "contact": [["upper", "lower"]], "symmetry": "none", "mesh": MESH, "loading": loading}
+    data = {
+        "shells": shells,
+        "contact": [["upper", "lower"]],
+        "symmetry": "none",
+        "mesh": MESH,
+        "loading": loading,
+    }
     two = Scene(Case.from_source(data))
     (touching,) = two.model.touchings
     r, of_one = (scene.model.r0.x.array.reshape(-1, 3) for scene in (two, one))
-    (far, i), (far_turned, j) = (cKDTree(nodes).query(r) for nodes in (of_one, of_one @ TURNED.T + MOVED))
+    (far, i), (far_turned, j) = (
+        cKDTree(nodes).query(r) for nodes in (of_one, of_one @ TURNED.T + MOVED)
+    )
     lower = far < far_turned
     assert np.minimum(far, far_turned).max() < 1e-12
     compared = 0

@@ -1,4 +1,6 @@
-"""The edge of a sheet pressed on the face of another one: it does not sink in, and the force is that of a beam."""
+"""The edge of a sheet pressed on the face of another one: it does not sink in, and the force is
+that of a beam.
+"""
 
 from itertools import pairwise
 from pathlib import Path
@@ -26,8 +28,8 @@ BOUND = 1e-3  # of h, the penetration that is allowed
 def standing(folder: Path, angle: float, floor_at: float = -0.3) -> dict[str, Any]:
     """A strip that stands on a floor, inclined by an angle, and is pressed down at its upper end.
 
-    The floor's cells are larger than h, and the strip's edge lies inside them, or along a side of them where the floor
-    begins at -0.35.
+    The floor's cells are larger than h, and the strip's edge lies inside them, or along a side of
+    them where the floor begins at -0.35.
     """
     up = np.array([np.cos(angle), 0, np.sin(angle)])
     floor = Sheet("floor", (floor_at, -0.05, 0), (0.7, 0, 0), (0, 0.2, 0), (4, 1))
@@ -49,9 +51,11 @@ def standing(folder: Path, angle: float, floor_at: float = -0.3) -> dict[str, An
 
 
 def beam() -> dict[str, float]:
-    """Force over width and D, and place of the tip, of a beam that stretches, clamped above, on a smooth floor.
+    """Force over width and D, and place of the tip, of a beam that stretches, clamped above, on a
+    smooth floor.
 
-    D theta' = N x from the tip, which has moved to x = 0; along it the strain is -N sin(theta)/(E h).
+    D theta' = N x from the tip, which has moved to x = 0; along it the strain is -N sin(theta)/(E
+    h).
     """
     D = h**3 / 12
 
@@ -71,7 +75,9 @@ def beam() -> dict[str, float]:
 
 @pytest.mark.parametrize(("angle", "floor_at"), [(80, -0.3), (90, -0.3), (90, -0.35), (60, -0.35)])
 def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
-    """Central differences of energy and forces where an edge has sunk in, on a side of cells too: 1e-6."""
+    """Central differences of energy and forces where an edge has sunk in, on a side of cells too:
+    1e-6.
+    """
     scene = Scene(Case.model_validate(standing(tmp_path, np.radians(angle), floor_at)))
     model, (term,), mu = scene.model, scene.model.touchings, scene.unloaded().mu
     system, rng = model.system, np.random.default_rng(angle)
@@ -85,12 +91,14 @@ def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
     assert at.of(term.penetration) > 2e-3 * h
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
     energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
-    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-5)
+    assert energies[1] - energies[0] == pytest.approx(
+        100 * system.forces(u, mu, term.name) @ v, rel=1e-5
+    )
 
 
 def test_a_corner(tmp_path: Path) -> None:
-    """A strip turned in its plane onto a corner, as a rigid body: the corner is as deep as it is, 0.01 h times the
-    slope, and differences are as those of an edge.
+    """A strip turned in its plane onto a corner, as a rigid body: the corner is as deep as it is,
+    0.01 h times the slope, and differences are as those of an edge.
     """
     scene = Scene(Case.model_validate(standing(tmp_path, STEEP)))
     model, (term,), mu = scene.model, scene.model.touchings, scene.unloaded().mu
@@ -99,7 +107,10 @@ def test_a_corner(tmp_path: Path) -> None:
     along, up = np.array([0, 1.0, 0]), np.array([np.cos(STEEP), 0, np.sin(STEEP)])
     of_strip, off = r[:, 2] > 0, r - [0, 0, (1 + GAP) * h]
     u = np.zeros_like(r)
-    for way, to in ((along, np.cos(tilt) * along + np.sin(tilt) * up), (up, np.cos(tilt) * up - np.sin(tilt) * along)):
+    for way, to in (
+        (along, np.cos(tilt) * along + np.sin(tilt) * up),
+        (up, np.cos(tilt) * up - np.sin(tilt) * along),
+    ):
         u[of_strip] += np.outer(off[of_strip] @ way, to - way)
     u[of_strip, 2] -= GAP * h + deep
     assert (r + u)[of_strip, 2].min() == pytest.approx(h - deep)
@@ -112,7 +123,8 @@ def test_a_corner(tmp_path: Path) -> None:
 
 
 def test_a_steep_edge(tmp_path: Path) -> None:
-    """The strip's ends sink in by less than the bound; force and sliding are those of the beam, 2e-3.
+    """The strip's ends sink in by less than the bound; force and sliding are those of the beam,
+    2e-3.
 
     Newton's method is quadratic there: each error is of the order of the square of the one before.
     """

@@ -1,4 +1,6 @@
-"""Random pushes of a sheet that folds on itself: it intersects itself at no accepted point, by a test of triangles."""
+"""Random pushes of a sheet that folds on itself: it intersects itself at no accepted point, by a
+test of triangles.
+"""
 
 from pathlib import Path
 
@@ -19,7 +21,9 @@ def test_the_test_of_triangles() -> None:
 
 def test_the_distance_of_triangles() -> None:
     """Against the nearest of many places of both."""
-    one, other = np.random.default_rng(1).uniform(0, 1, (2, 8, 3, 3)) + np.array([0, 0, 1.5])[None, None] * [
+    one, other = np.random.default_rng(1).uniform(0, 1, (2, 8, 3, 3)) + np.array([0, 0, 1.5])[
+        None, None
+    ] * [
         [[[0]]],
         [[[1]]],
     ]
@@ -33,7 +37,9 @@ def test_the_distance_of_triangles() -> None:
 
 @pytest.mark.slow
 def test_faces_do_not_pass_through_each_other(tmp_path: Path) -> None:
-    """It folds so tightly that cells that have a corner in common touch each other: once faces overlapped by 0.1 h."""
+    """It folds so tightly that cells that have a corner in common touch each other: once faces
+    overlapped by 0.1 h.
+    """
     pushed = push(tmp_path, 21)
     assert pushed.why in ("target", "fold")
     assert pushed.intersections == 0

@@ -14,7 +14,9 @@ from magshell_fenicsx.models.shell.parameters import Move
 from magshell_fenicsx.parts.supports.reactions import Reaction, reactions
 
 SMALL = 1e-5  # displacement over the length: the nonlinear part is of its square over h^2
-ROUNDING = 5e-8  # of strains, 2e-16, over those of such displacements, h^2 SMALL = 1e-9: 2e-7 at a point, less in a sum
+# of strains, 2e-16, over those of such displacements, h^2 SMALL = 1e-9: 2e-7 at a point, less in a
+# sum
+ROUNDING = 5e-8
 LIFT = move("lift", "right", shift=[0, 0, SMALL])
 TURN = move("turn", "right", turn=[0, -SMALL, 0], centre=[1, 0, 0])
 EI = PLATE["width"] * 1e-6 / 12  # type: ignore[operator]  # over E
@@ -42,7 +44,9 @@ def unbalanced(named: dict[str, Reaction]) -> float:
 
 
 def test_beam() -> None:
-    """Clamped at both ends: F = 12 EI/L^3 and M = 6 EI/L^2 of a deflection, M = 4 and 2 EI/L of a rotation."""
+    """Clamped at both ends: F = 12 EI/L^3 and M = 6 EI/L^2 of a deflection, M = 4 and 2 EI/L of a
+    rotation.
+    """
     strip = {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1}
     ends = {"root": "clamped", "tip": "clamped"}
     moves = tuple(Move(("tip",), m.motion) for m in (LIFT, TURN))
@@ -59,7 +63,9 @@ def test_beam() -> None:
 
 
 def test_solid_beam() -> None:
-    """Timoshenko's beam, F = 12 EI/(L^3 (1 + phi)) with phi = 12 EI/(5/6 G A L^2); the ends' faces are held."""
+    """Timoshenko's beam, F = 12 EI/(L^3 (1 + phi)) with phi = 12 EI/(5/6 G A L^2); the ends' faces
+    are held.
+    """
     thick = {**PLATE, "thickness": 0.05}
     scene = moving_scene((LIFT,), thick, CLAMPED, model="solid", mesh={"size": 0.1})
     lifted = found(scene, at_end(scene, "lift"))
@@ -70,7 +76,9 @@ def test_solid_beam() -> None:
 
 
 def test_ring() -> None:
-    """An annular plate, clamped at both edges, one lifted: w = a + b ln r + c r^2 + d r^2 ln r, F = 8 pi d D."""
+    """An annular plate, clamped at both edges, one lifted: w = a + b ln r + c r^2 + d r^2 ln r, F =
+    8 pi d D.
+    """
     scene = moving_scene(
         (move("lift", "inner", shift=[0, 0, SMALL]),),
         {**RING, "poisson_ratio": 0.3},
@@ -88,7 +96,9 @@ def test_ring() -> None:
 
 
 def test_large_motion() -> None:
-    """An end pushed, lifted and turned by 60 degrees: forces and moments balance, and their power is the conjugate."""
+    """An end pushed, lifted and turned by 60 degrees: forces and moments balance, and their power
+    is the conjugate.
+    """
     push = move("push", "right", shift=[0.02, 0, 0.2])
     turn = move("turn", "right", shift=[0, 0, 0.1], turn=[0.2, -1.0, 0.1], centre=[0.9, 0, 0.1])
     scene = moving_scene((push, turn), boundary=CLAMPED, mesh={"degree": 3})
@@ -106,12 +116,16 @@ def test_large_motion() -> None:
 
 @pytest.mark.slow
 def test_half_and_whole() -> None:
-    """The same grid, cut along its middle and whole: the reactions agree, those of the edge that is lost too."""
+    """The same grid, cut along its middle and whole: the reactions agree, those of the edge that is
+    lost too.
+    """
     moves = move("push", "left", shift=[0.01, 0, 0]), move("push", "right", shift=[-0.01, 0, 0])
     dead = {"kind": "dead", "loads": [{"over": "all", "per_area": [0, 0, 100.0]}], "factor": 1.0}
     each = []
     for symmetry in ("half", "none"):
-        scene = moving_scene(moves, symmetry=symmetry, loading=dead, mesh={"degree": 3, "size": 0.1})
+        scene = moving_scene(
+            moves, symmetry=symmetry, loading=dead, mesh={"degree": 3, "size": 0.1}
+        )
         *_, last = ms.trace(scene, "load", control="load", targets=[1.0])
         *_, last = ms.trace(scene, "push", last, control="load", targets=[1.0])
         each.append(found(scene, last.point.state))
@@ -146,7 +160,9 @@ def hinged_plate(names: Sequence[str], **sections: Any) -> dict[str, Reaction]:
     return found(scene, last.point.state)
 
 
-@pytest.mark.parametrize("order", [("bottom", "top", "left", "right"), ("left", "right", "bottom", "top")])
+@pytest.mark.parametrize(
+    "order", [("bottom", "top", "left", "right"), ("left", "right", "bottom", "top")]
+)
 def test_edges_that_meet_share_a_corner(order: tuple[str, ...]) -> None:
     """By symmetry a quarter on each edge, in any order."""
     of_edge = hinged_plate(order, mesh={"size": 0.5, "degree": 3})
@@ -155,10 +171,16 @@ def test_edges_that_meet_share_a_corner(order: tuple[str, ...]) -> None:
 
 
 def test_corner_force_of_a_hinged_plate() -> None:
-    """Timoshenko and Woinowsky-Krieger, table 8: 0.065 q a^2 holds each corner down, where a point takes it."""
+    """Timoshenko and Woinowsky-Krieger, table 8: 0.065 q a^2 holds each corner down, where a point
+    takes it.
+    """
     corner = {"points": {"corner": [1, 1, 0]}, "boundary": {"corner": {"held": ["x", "y", "z"]}}}
-    named = hinged_plate(("bottom", "top", "left", "right"), mesh={"size": 0.125, "degree": 4}, **corner)
+    named = hinged_plate(
+        ("bottom", "top", "left", "right"), mesh={"size": 0.125, "degree": 4}, **corner
+    )
     force = {name: reaction.force[2] for name, reaction in named.items()}
     assert force["corner"] / sum(force.values()) == pytest.approx(-0.065, rel=1e-2)
-    assert force["left"] / sum(force.values()) == pytest.approx(0.25, rel=1e-6), "it has its corner forces still"
+    assert force["left"] / sum(force.values()) == pytest.approx(0.25, rel=1e-6), (
+        "it has its corner forces still"
+    )
     assert force["top"] == pytest.approx(force["right"], rel=1e-6)

@@ -1,4 +1,6 @@
-"""T-junctions: a stiffened plate against its beam, a plate that a web twists, derivatives, ranks, and messages."""
+"""T-junctions: a stiffened plate against its beam, a plate that a web twists, derivatives, ranks,
+and messages.
+"""
 
 import re
 from pathlib import Path
@@ -31,7 +33,9 @@ def stiffened(length: float, height: float, modulus: float = 1.0) -> dict[str, A
     place = {"position": [0, WIDTH / 2, 0], "axis": {"polar": 90, "azimuth": -90}, "turn": 90}
     web = plate(length, height, place=place, boundary={"left": "clamped"})
     web["shell"]["youngs_modulus"] = modulus
-    base = plate(length, WIDTH, boundary={"left": "clamped"}, points={"tip": [length, WIDTH / 2, 0]})
+    base = plate(
+        length, WIDTH, boundary={"left": "clamped"}, points={"tip": [length, WIDTH / 2, 0]}
+    )
     return {
         "shells": {"base": base, "web": web},
         "joints": [{"edges": ["web.bottom", "base"]}],
@@ -69,7 +73,9 @@ def end(data: dict[str, Any]) -> tuple[Scene, State, dict[str, float]]:
 
 
 def test_stiffened_plate() -> None:
-    """F L^3/(3 EI) of the T-shaped section, 3e-3; the tip is that of the plate, not of the web at the same place."""
+    """F L^3/(3 EI) of the T-shaped section, 3e-3; the tip is that of the plate, not of the web at
+    the same place.
+    """
     length, height, modulus = 4.0, 0.1, 4.0
     flange, web = WIDTH * h, modulus * height * h
     axis = web * height / 2 / (flange + web)
@@ -80,7 +86,9 @@ def test_stiffened_plate() -> None:
 
 @pytest.mark.parametrize("height", [0.1, pytest.param(-0.1, marks=pytest.mark.slow)])
 def test_a_mesh_file_in_which_edges_have_three_triangles(tmp_path: Path, height: float) -> None:
-    """The same plate, read: the beam's deflection, 3e-3; with a web on both sides too, as an edge with four."""
+    """The same plate, read: the beam's deflection, 3e-3; with a web on both sides too, as an edge
+    with four.
+    """
     length, parts = 4.0, (16, 2)
     sheets = [
         Sheet("base", (0, 0, 0), (length, 0, 0), (0, WIDTH, 0), parts),
@@ -120,7 +128,11 @@ def test_a_web_that_turns_a_plate() -> None:
 
 def test_derivatives() -> None:
     """Central differences at a rough state: of the energy, and of the forces to 1e-6."""
-    scene = Scene(Case.from_source(pushed({"kind": "spring", "stiffness": 1.0}) | {"mesh": {"degree": 3, "size": 0.2}}))
+    scene = Scene(
+        Case.from_source(
+            pushed({"kind": "spring", "stiffness": 1.0}) | {"mesh": {"degree": 3, "size": 0.2}}
+        )
+    )
     system, mu = scene.model.system, scene.unloaded().mu
     (term,) = (each for each in system.terms if isinstance(each, Tee))
     rng = np.random.default_rng(0)
@@ -140,10 +152,13 @@ def test_a_hinge_lets_the_web_fall() -> None:
 
 def test_messages() -> None:
     with pytest.raises(
-        MeshError, match=r"joints.0.edges: the edge web_right is not on the mid-surface of base, by 0.01 R"
+        MeshError,
+        match=r"joints.0.edges: the edge web_right is not on the mid-surface of base, by 0.01 R",
     ):
         Scene(Case.from_source(pushed({}, off=0.01)))
-    with pytest.raises(MeshError, match=r"joints.0.edges: web.rim: is no edge; an edge stands first"):
+    with pytest.raises(
+        MeshError, match=r"joints.0.edges: web.rim: is no edge; an edge stands first"
+    ):
         Scene(Case.from_source(pushed({}) | {"joints": [{"edges": ["web.rim", "base"]}]}))
 
 
@@ -162,8 +177,14 @@ def ringed(radius: float) -> dict[str, Any]:
     }
 
 
-LYING = {"position": [0.2, 0, 0], "axis": {"polar": 0}}  # in the plane of the base, its right edge in the middle
-ASLANT = {"position": [0.5 - 0.3 * np.cos(0.1), 0, 0.3 * np.sin(0.1)], "axis": {"polar": 180 * 0.1 / np.pi}}
+LYING = {
+    "position": [0.2, 0, 0],
+    "axis": {"polar": 0},
+}  # in the plane of the base, its right edge in the middle
+ASLANT = {
+    "position": [0.5 - 0.3 * np.cos(0.1), 0, 0.3 * np.sin(0.1)],
+    "axis": {"polar": 180 * 0.1 / np.pi},
+}
 
 
 @pytest.mark.parametrize(
@@ -174,7 +195,10 @@ ASLANT = {"position": [0.5 - 0.3 * np.cos(0.1), 0, 0.3 * np.sin(0.1)], "axis": {
             pushed({}) | {"joints": [{"edges": ["web.left", "base"]}]},
             "the edge web.left is not on the mid-surface of base, by more",
         ),
-        (ringed(0.99), "the edge rib.outer is not on the mid-surface of wall, by 0.01 R at (0.99, 0, 0.5)"),
+        (
+            ringed(0.99),
+            "the edge rib.outer is not on the mid-surface of wall, by 0.01 R at (0.99, 0, 0.5)",
+        ),
         (
             placed(LYING),
             "the shell of the edge web.right lies in the mid-surface of base, where both take the same place",

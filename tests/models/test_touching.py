@@ -52,7 +52,8 @@ def flattened(
     across: int = 1,
     wide: float = 0.4,
 ) -> Array:
-    """The ring with walls at +-half h (1 + tilt x) where |x| < 0.5, and wide ends, with noise over h.
+    """The ring with walls at +-half h (1 + tilt x) where |x| < 0.5, and wide ends, with noise over
+    h.
 
     Across x in place of y the wall in the east stays.
     """
@@ -61,7 +62,9 @@ def flattened(
     u = np.zeros_like(r)
     along, far = r[:, 1 - across], r[:, across]
     width = half * h * (1 + tilt * along) + wide * np.maximum(np.abs(along) - 0.5, 0) ** 2
-    u[:, across] = np.tanh(far / 0.2) * width - far + (1 - across) * (1 - np.tanh(1 / 0.2) * half * h)
+    u[:, across] = (
+        np.tanh(far / 0.2) * width - far + (1 - across) * (1 - np.tanh(1 / 0.2) * half * h)
+    )
     rough = np.random.default_rng(seed).standard_normal(u.size)
     return model.system.held((u.ravel() + noise * h * rough)[: model.system.size])
 
@@ -70,8 +73,8 @@ def flattened(
 def test_derivatives(seed: int) -> None:
     """Central differences of the energy and of the forces at a rough state, some points open: 1e-6.
 
-    With the first number the cuts are those of the undeformed ring, of which no place faces another; with the others
-    cells are cut where the walls have slid along each other.
+    With the first number the cuts are those of the undeformed ring, of which no place faces
+    another; with the others cells are cut where the walls have slid along each other.
     """
     system, h, mu = ring().model.system, ring().model.material.h, ring().unloaded().mu
     u, term = flattened(0.497, 0.02, 0.002, seed), touching()
@@ -87,9 +90,13 @@ def test_derivatives(seed: int) -> None:
     Kv = times([(1.0, entries)], v)
     assert np.abs(forces[1] - forces[0] - Kv).max() < 1e-6 * np.abs(Kv).max()
     energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
-    assert energies[1] - energies[0] == pytest.approx(100 * system.forces(u, mu, term.name) @ v, rel=1e-5)
+    assert energies[1] - energies[0] == pytest.approx(
+        100 * system.forces(u, mu, term.name) @ v, rel=1e-5
+    )
     other = system.held(np.random.default_rng(seed).standard_normal(system.size))
-    assert other @ Kv == pytest.approx(v @ times([(1.0, entries)], other), rel=1e-9)  # it is symmetric
+    assert other @ Kv == pytest.approx(
+        v @ times([(1.0, entries)], other), rel=1e-9
+    )  # it is symmetric
     assert at.of(term.least_gap) < 0
 
 
@@ -134,7 +141,11 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
     points = {name: RING["points"][name] for name in ("east", "west")}
     held.pop("north")
     half, whole = (
-        Scene(Case.model_validate(RING | {"shell": shell, "boundary": held, "points": points, "symmetry": symmetry}))
+        Scene(
+            Case.model_validate(
+                RING | {"shell": shell, "boundary": held, "points": points, "symmetry": symmetry}
+            )
+        )
         for symmetry in ("half", "none")
     )
     plane, other = half.problem.mirror, half.model.excluded_modes
@@ -142,10 +153,15 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
     assert isinstance(other, AntisymmetricModes)
     places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
     beyond = plane.beyond(all_places) < -1e-9
-    far, node = cKDTree(places).query(np.where(beyond[:, None], plane.image(all_places), all_places))
+    far, node = cKDTree(places).query(
+        np.where(beyond[:, None], plane.image(all_places), all_places)
+    )
     assert far.max() < 1e-12
     (own,), (of_whole,) = (scene.model.touchings for scene in (half, whole))
-    system, state = half.model.system, State(flattened(0.497, of=half, **pressed), half.unloaded().mu)
+    system, state = (
+        half.model.system,
+        State(flattened(0.497, of=half, **pressed), half.unloaded().mu),
+    )
     system_of_whole, state_of_whole = (
         whole.model.system,
         State(flattened(0.497, of=whole, **pressed), whole.unloaded().mu),
@@ -161,7 +177,8 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
     )
     entries_of_whole = system_of_whole.at(state_of_whole).of(of_whole.entries)
     forces, forces_of_whole = (
-        each.forces(at.u, at.mu, own.name) for each, at in ((system, state), (system_of_whole, state_of_whole))
+        each.forces(at.u, at.mu, own.name)
+        for each, at in ((system, state), (system_of_whole, state_of_whole))
     )
     for of, sign in ((system, 1.0), (other.system, -1.0)):
         v = of.held(np.random.default_rng(4).standard_normal(of.size))
@@ -169,9 +186,13 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         v_of_whole = np.where(beyond[:, None], image, v.reshape(-1, 3)[node]).ravel()
         (term,) = (each for each in of.terms if isinstance(each, Mirrored))
         second = v @ times([(1.0, of.at(state).of(term.entries))], v)
-        assert v_of_whole @ times([(1.0, entries_of_whole)], v_of_whole) == pytest.approx(2 * second, rel=1e-9)
+        assert v_of_whole @ times([(1.0, entries_of_whole)], v_of_whole) == pytest.approx(
+            2 * second, rel=1e-9
+        )
         first = forces @ v if sign > 0 else 0.0
-        assert forces_of_whole @ v_of_whole == pytest.approx(2 * first, rel=1e-9, abs=1e-9 * abs(forces @ v))
+        assert forces_of_whole @ v_of_whole == pytest.approx(
+            2 * first, rel=1e-9, abs=1e-9 * abs(forces @ v)
+        )
 
 
 def test_the_material_around_a_point_does_not_touch_it() -> None:
@@ -207,18 +228,40 @@ def test_nearest_places() -> None:
 def test_the_least_gap_of_shells_that_are_apart() -> None:
     """As of the search for all places within the reach, in few of these; with the images of a
     sector."""
-    cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "poisson_ratio": 0.3, "youngs_modulus": 1}
-    lower, upper = ({"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, 0.024))
+    cap = {
+        "geometry": "cap",
+        "radius": 1,
+        "polar": 20,
+        "hole": 2,
+        "poisson_ratio": 0.3,
+        "youngs_modulus": 1,
+    }
+    lower, upper = (
+        {"shell": cap | {"thickness": h}, "boundary": {"rim": "hinged"}} for h in (0.036, 0.024)
+    )
     shells = {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}}
-    loading = {"kind": "dead", "loads": [{"edge": "upper.hole", "force": [0, 0, -1]}], "until": "target", "factor": 1}
-    case = {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": 0.08, "degree": 3}, "loading": loading}
+    loading = {
+        "kind": "dead",
+        "loads": [{"edge": "upper.hole", "force": [0, 0, -1]}],
+        "until": "target",
+        "factor": 1,
+    }
+    case = {
+        "shells": shells,
+        "contact": [["upper", "lower"]],
+        "mesh": {"size": 0.08, "degree": 3},
+        "loading": loading,
+    }
     scene = Scene(Case.model_validate(case | {"symmetry": 6}))
     (term,), system = scene.model.touchings, scene.model.system
     assert isinstance(term, Mirrored)
     u = system.held(2e-3 * np.random.default_rng(3).standard_normal(system.size))
     at = system.at(State(u, scene.unloaded().mu))
     facing, far, points = term._facing, term._far, at.of(lambda: term._pressed() and term._points)
-    every, few = (at.of(lambda least=least: facing.found(term._now(), far, points, least=least)) for least in (0, 1))
+    every, few = (
+        at.of(lambda least=least: facing.found(term._now(), far, points, least=least))
+        for least in (0, 1)
+    )
     assert len(few.point) < 3 * len(points.cell) < len(every.point)
     nearest = np.full((2, len(points.cell)), np.inf)
     for distance, places in zip(nearest, (every, few), strict=True):
@@ -230,7 +273,9 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
 
 @pytest.mark.parametrize("deep", [3e-3, 0.2])
 def test_folds_between_cells_have_no_jump(deep: float) -> None:
-    """On large cells some points are opposite a side, where their nearest place changes cells: differences 1e-6."""
+    """On large cells some points are opposite a side, where their nearest place changes cells:
+    differences 1e-6.
+    """
     thick = {**RING["shell"], "thickness": 0.08}
     scene = Scene(Case.model_validate(RING | {"shell": thick, "mesh": {"size": 0.3, "degree": 3}}))
     model, (term,) = scene.model, scene.model.touchings
@@ -261,7 +306,10 @@ def test_a_step_that_passes_through() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"contact": [["shell", "other"]]}, "other: allowed: shell; parts are the patches of a mesh file"),
+        (
+            {"contact": [["shell", "other"]]},
+            "other: allowed: shell; parts are the patches of a mesh file",
+        ),
         ({"contact": [["shell", "shell"], ["shell", "shell"]]}, "a pair that stands twice"),
     ],
 )

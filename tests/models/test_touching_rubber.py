@@ -1,4 +1,6 @@
-"""Rubber that touches rubber, other shells and itself: faces are half the deformed thickness from mid-surfaces."""
+"""Rubber that touches rubber, other shells and itself: faces are half the deformed thickness from
+mid-surfaces.
+"""
 
 from itertools import pairwise
 from typing import Any
@@ -19,12 +21,23 @@ TENSION, PRESSURE = 0.2, 2.0  # over E h, and over E h/R
 
 
 def sheets(
-    *, laws: tuple[str, str] = ("neo-hookean", "neo-hookean"), thick: float = 1.0, grown: float | None = None
+    *,
+    laws: tuple[str, str] = ("neo-hookean", "neo-hookean"),
+    thick: float = 1.0,
+    grown: float | None = None,
 ) -> Scene:
-    """Two unit squares whose faces meet, pulled in both directions and pressed together; the upper one h `thick`."""
+    """Two unit squares whose faces meet, pulled in both directions and pressed together; the upper
+    one h `thick`.
+    """
 
     def sheet(law: str, thickness: float, z: float) -> dict[str, Any]:
-        shell = {"geometry": "plate", "length": 1, "width": 1, "youngs_modulus": 1, "poisson_ratio": 0.5}
+        shell = {
+            "geometry": "plate",
+            "length": 1,
+            "width": 1,
+            "youngs_modulus": 1,
+            "poisson_ratio": 0.5,
+        }
         return {
             "shell": shell | {"thickness": thickness, "law": law},
             "boundary": {"left": "symmetry", "bottom": "symmetry"},
@@ -35,14 +48,26 @@ def sheets(
     pulls = [{"edge": f"{name}.right", "per_length": [T, 0, 0]} for name in names]
     pulls += [{"edge": f"{name}.top", "per_length": [0, T, 0]} for name in names]
     pushes = [
-        {"over": name, "per_area": [0, 0, side * PRESSURE * h]} for name, side in zip(names, (1, -1), strict=True)
+        {"over": name, "per_area": [0, 0, side * PRESSURE * h]}
+        for name, side in zip(names, (1, -1), strict=True)
     ]
     case = {
-        "shells": {"lower": sheet(laws[0], h, 0), "upper": sheet(laws[1], thick * h, (1 + thick) / 2 * h)},
+        "shells": {
+            "lower": sheet(laws[0], h, 0),
+            "upper": sheet(laws[1], thick * h, (1 + thick) / 2 * h),
+        },
         "contact": [["upper", "lower"]],
         "foundation": {"stiffness": FOUNDATION},
         "mesh": {"degree": 2, "size": 0.7},
-        "loading": [{"kind": "dead", "control": "load", "factor": 1, "points": 1, "loads": [*pulls, *pushes]}],
+        "loading": [
+            {
+                "kind": "dead",
+                "control": "load",
+                "factor": 1,
+                "points": 1,
+                "loads": [*pulls, *pushes],
+            }
+        ],
     }
     if grown:
         case |= {"natural": {"stretch": grown}}
@@ -51,7 +76,9 @@ def sheets(
 
 
 def test_gap_of_stretched_sheets() -> None:
-    """Rubber that is 1.5 h thick has h 1.5/(1.3 1.2) when stretched, a sheet of Koiter's law h as before."""
+    """Rubber that is 1.5 h thick has h 1.5/(1.3 1.2) when stretched, a sheet of Koiter's law h as
+    before.
+    """
     scene = sheets(laws=("koiter", "neo-hookean"), thick=1.5)
     model, r0 = scene.model, scene.model.r0.x.array.reshape(-1, 3)
     u = (r0 * [0.3, 0.2, 0.1]).ravel()
@@ -62,7 +89,8 @@ def test_gap_of_stretched_sheets() -> None:
 def test_pressed_sheets() -> None:
     """Newton's method is quadratic; mid-surfaces are h/l^2 apart, and pressing stretches: h 1e-6.
 
-    With the pressure q per undeformed area, the tension T and the penetration s, of each sheet that has grown to g
+    With the pressure q per undeformed area, the tension T and the penetration s, of each sheet that
+    has grown to g
 
         (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT h/2).
     """
@@ -87,15 +115,25 @@ def test_pressed_sheets() -> None:
     stretch, d = r[upper, 0].max() / g, r[upper, 2].mean() - r[~upper, 2].mean()
     assert stretch > 1.1
     q = system.at(State(u, mu)).of(term.force)  # over E h/R, of an area of one
-    assert q == pytest.approx(PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h, rel=1e-9)
-    assert g**2 * (stretch - stretch**-5) / 3 == pytest.approx(TENSION + q * h / (2 * stretch**3), rel=1e-6)
+    assert q == pytest.approx(
+        PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h, rel=1e-9
+    )
+    assert g**2 * (stretch - stretch**-5) / 3 == pytest.approx(
+        TENSION + q * h / (2 * stretch**3), rel=1e-6
+    )
     s = q / term.stiffness.value + SOFT * h / 2
     assert d == pytest.approx(g * h / stretch**2 - s, abs=1e-6 * h)
 
 
 def ring(**more: Any) -> Scene:
     """A tube between mirrors that can be pressed flat."""
-    shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
+    shell = {
+        "geometry": "cylinder",
+        "radius": 1,
+        "length": 0.12,
+        "thickness": h,
+        "youngs_modulus": 1,
+    }
     held = {"east": {"held": ["y"]}, "west": {"held": ["y"]}, "north": {"held": ["x"]}}
     return Scene(
         Case.model_validate(
@@ -123,20 +161,26 @@ def flattened(scene: Scene) -> Array:
 
 
 def test_derivatives() -> None:
-    """Of a tube that is pressed flat and stretched, at a rough state: differences of energy and forces, 1e-6."""
+    """Of a tube that is pressed flat and stretched, at a rough state: differences of energy and
+    forces, 1e-6.
+    """
     scene = ring()
     check_derivatives(scene, flattened(scene), (0.05 * h, 0.3 * h), h)
 
 
 @pytest.mark.slow
 def test_derivatives_by_the_natural_stretch() -> None:
-    """The slope of the energy, of the forces and of the slope itself: differences of fourth order, 1e-6."""
+    """The slope of the energy, of the forces and of the slope itself: differences of fourth order,
+    1e-6.
+    """
     load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]
     scene = ring(natural={"stretch": ["1.2 + 0.1*x", 0.9], "along": [0, 0, 1]}, loading=load)
     system, (term,), flat = scene.model.system, scene.model.touchings, flattened(scene).ravel()
     u = system.held(flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size))
     slope, step = system.parameters["natural_stretch"].slopes[-1], 1e-6
-    (twice,) = system.parameters["natural_stretch"].bends(system.parameters["natural_stretch"].constant)[-1:]
+    (twice,) = system.parameters["natural_stretch"].bends(
+        system.parameters["natural_stretch"].constant
+    )[-1:]
 
     def mu(n: int) -> dict[str, float]:
         return scene.unloaded().mu | {"natural_stretch": 0.6 + n * step}
@@ -148,7 +192,9 @@ def test_derivatives_by_the_natural_stretch() -> None:
     assert at.of(term.penetration) > 0.05 * h
     force = np.zeros_like(u)
     at.of(lambda: slope.add_residual(force, 1.0))
-    assert at.of(slope.energy) == pytest.approx(differed(lambda n: system.energies(u, mu(n))[term.name]), rel=1e-6)
+    assert at.of(slope.energy) == pytest.approx(
+        differed(lambda n: system.energies(u, mu(n))[term.name]), rel=1e-6
+    )
     forces = differed(lambda n: system.forces(u, mu(n), term.name))
     assert np.abs(force - forces).max() < 1e-6 * np.abs(forces).max()
     assert at.of(twice.energy) == pytest.approx(

@@ -18,15 +18,26 @@ PRESSURE, FOUNDATION = 0.2, 1.0  # over E h/R; over E/R
 
 
 def sheets(factors: tuple[str | None, str | None], apart: float = h, thick: float = 1.0) -> Scene:
-    """Two unit squares on a soft foundation whose mid-surfaces are this far apart, pressed together."""
+    """Two unit squares on a soft foundation whose mid-surfaces are this far apart, pressed
+    together.
+    """
 
     def sheet(factor: str | None, z: float) -> dict[str, Any]:
-        shell = {"geometry": "plate", "length": 1, "width": 1, "youngs_modulus": 1, "poisson_ratio": 0}
+        shell = {
+            "geometry": "plate",
+            "length": 1,
+            "width": 1,
+            "youngs_modulus": 1,
+            "poisson_ratio": 0,
+        }
         shell |= {"thickness": h * thick} | ({"thickness_factor": factor} if factor else {})
         held = {"left": {"held": ["x"]}, "right": {"held": ["x"]}, "bottom": "symmetry"}
         return {"shell": shell, "boundary": held, "place": {"position": [0, 0, z]}}
 
-    pushes = [{"over": name, "per_area": [0, 0, way * PRESSURE * h]} for name, way in (("lower", 1), ("upper", -1))]
+    pushes = [
+        {"over": name, "per_area": [0, 0, way * PRESSURE * h]}
+        for name, way in (("lower", 1), ("upper", -1))
+    ]
     case = {
         "shells": {"lower": sheet(factors[0], 0), "upper": sheet(factors[1], apart)},
         "contact": [["upper", "lower"]],
@@ -42,21 +53,31 @@ def gap_of(scene: Scene) -> float:
 
 
 def test_gap_of_wedges() -> None:
-    """At the thick ends of equal wedges; of opposite ones, whose faces are parallel and inclined, everywhere."""
-    assert gap_of(sheets(("1 + 0.6*x", "1 + 0.6*x"), 2 * h)) == pytest.approx(2 * h - 1.6 * h, abs=1e-5 * h)
+    """At the thick ends of equal wedges; of opposite ones, whose faces are parallel and inclined,
+    everywhere.
+    """
+    assert gap_of(sheets(("1 + 0.6*x", "1 + 0.6*x"), 2 * h)) == pytest.approx(
+        2 * h - 1.6 * h, abs=1e-5 * h
+    )
     opposite = sheets(("0.7 + 0.6*x", "1.3 - 0.6*x"), 2 * h)
     assert gap_of(opposite) == pytest.approx(2 * h * np.sqrt(1 - (0.3 * h) ** 2) - h, abs=1e-14)
 
 
 def test_pressed_wedges() -> None:
-    """Newton's method is quadratic; opposite wedges press on each other uniformly, as faces that are parallel.
+    """Newton's method is quadratic; opposite wedges press on each other uniformly, as faces that
+    are parallel.
 
-    Forces are across the faces, so that the foundation bears the couple of what holds the sheets along.
+    Forces are across the faces, so that the foundation bears the couple of what holds the sheets
+    along.
     """
     inclined = np.sqrt(1 - (0.03 * h) ** 2)
     scene = sheets(("0.97 + 0.06*x", "1.03 - 0.06*x"), h / inclined)
     model, (term,) = scene.model, scene.model.touchings
-    system, r0, mu = model.system, model.r0.x.array.reshape(-1, 3), scene.unloaded().mu | {"load": 1.0}
+    system, r0, mu = (
+        model.system,
+        model.r0.x.array.reshape(-1, 3),
+        scene.unloaded().mu | {"load": 1.0},
+    )
     upper = r0[:, 2] > h / 2
     guess = np.zeros_like(r0)
     guess[upper, 2] = -2e-3 * h
@@ -80,7 +101,13 @@ def test_pressed_wedges() -> None:
 
 def ring(**more: Any) -> Scene:
     """A tube between mirrors that can be pressed flat, thicker on one side."""
-    shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
+    shell = {
+        "geometry": "cylinder",
+        "radius": 1,
+        "length": 0.12,
+        "thickness": h,
+        "youngs_modulus": 1,
+    }
     held = {"east": {"held": ["y"]}, "west": {"held": ["y"]}, "north": {"held": ["x"]}}
     data = {
         "shell": shell | {"poisson_ratio": 0, "thickness_factor": "1 + 0.5*x + 0.1*y"},
@@ -108,7 +135,15 @@ RUBBER = {"law": "mooney-rivlin", "mooney": 0.1, "poisson_ratio": 0.5}
 
 @pytest.mark.parametrize(("law", "flat"), [({}, (0.0, 0.495)), (RUBBER, (0.3, 0.4, 2.5))])
 def test_derivatives(law: dict[str, Any], flat: tuple[float, ...]) -> None:
-    """Of a tube that is pressed flat, also of rubber, at a rough state: differences of energy and forces, 1e-6."""
-    shell = {"geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1}
+    """Of a tube that is pressed flat, also of rubber, at a rough state: differences of energy and
+    forces, 1e-6.
+    """
+    shell = {
+        "geometry": "cylinder",
+        "radius": 1,
+        "length": 0.12,
+        "thickness": h,
+        "youngs_modulus": 1,
+    }
     scene = ring(shell=shell | {"poisson_ratio": 0, "thickness_factor": "1 + 0.5*x + 0.1*y"} | law)
     check_derivatives(scene, flattened(scene, *flat), (0.01 * h, 0.3 * h), h)

@@ -1,4 +1,6 @@
-"""Sheets of one mesh file that are not connected: they are oriented and held one by one, and pressed together."""
+"""Sheets of one mesh file that are not connected: they are oriented and held one by one, and
+pressed together.
+"""
 
 from itertools import pairwise
 from pathlib import Path
@@ -22,12 +24,16 @@ h = 0.02
 SOFT = 1.0  # foundation, over E/R, which holds what nothing touches yet
 
 
-def pair(folder: Path, below: tuple[int, int], above: tuple[int, int], gap: float = 0.0) -> dict[str, Any]:
+def pair(
+    folder: Path, below: tuple[int, int], above: tuple[int, int], gap: float = 0.0
+) -> dict[str, Any]:
     """Two unit squares whose faces are a gap (over h) apart; both are free to move across."""
     low = Sheet("lower", (0, 0, 0), (1, 0, 0), (0, 1, 0), below)
     high = Sheet("upper", (0, 0, (1 + gap) * h), (0, 1, 0), (1, 0, 0), above)  # the other way round
     file = write(folder / "two.msh", [low, high])
-    edges = {f"{name}_{i}": {"held": ["x", "y"]} for name in ("lower", "upper") for i in range(1, 5)}
+    edges = {
+        f"{name}_{i}": {"held": ["x", "y"]} for name in ("lower", "upper") for i in range(1, 5)
+    }
     return {
         "shell": {
             "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0
@@ -40,10 +46,17 @@ def pair(folder: Path, below: tuple[int, int], above: tuple[int, int], gap: floa
     }  # fmt: skip
 
 
-def pressed(folder: Path, below: tuple[int, int], above: tuple[int, int]) -> tuple[Scene, dict[str, float], Array, Any]:
-    """Pressed together by 0.004 h E/R on both; the scene, what is observed, the pressures of all cells, the end."""
+def pressed(
+    folder: Path, below: tuple[int, int], above: tuple[int, int]
+) -> tuple[Scene, dict[str, float], Array, Any]:
+    """Pressed together by 0.004 h E/R on both; the scene, what is observed, the pressures of all
+    cells, the end.
+    """
     data, p = pair(folder, below, above), 4e-3 * h
-    data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -p]}, {"over": "lower", "per_area": [0, 0, p]}]
+    data["loading"]["loads"] = [
+        {"over": "upper", "per_area": [0, 0, -p]},
+        {"over": "lower", "per_area": [0, 0, p]},
+    ]
     scene = Scene(Case.model_validate(data))
     *_, last = follow(scene)
     (touching,) = scene.model.touchings
@@ -58,20 +71,27 @@ def test_patch_test_of_equal_meshes(tmp_path: Path) -> None:
     assert 0 < deep < 1e-3 * h
     assert np.ptp(pressure) < 1e-3 * pressure.mean()
     assert pressure.mean() == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=1e-3)
-    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=1e-3)
+    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(
+        4e-3 - SOFT * deep / (2 * h), rel=1e-3
+    )
 
 
 def test_newton_is_quadratic(tmp_path: Path) -> None:
-    """Beside the equilibrium of pressed sheets whose meshes do not match, to whose force the pressure adds up.
+    """Beside the equilibrium of pressed sheets whose meshes do not match, to whose force the
+    pressure adds up.
 
     Each error is of the order of the square of the one before.
     """
     scene, seen, pressure, last = pressed(tmp_path, (2, 2), (3, 2))
     deep = -seen["contact_gap_over_h"] * h
-    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(4e-3 - SOFT * deep / (2 * h), rel=2e-3)
+    assert seen["contact_force"] * scene.model.force_unit == pytest.approx(
+        4e-3 - SOFT * deep / (2 * h), rel=2e-3
+    )
     assert pressure.min() > 0
     system, exact, mu = scene.model.system, last.point.state.u, last.point.state.mu
-    exact = exact - spsolve(csr(system.tangent(exact, mu)).tocsc(), system.residual(exact, mu))  # which was near enough
+    exact = exact - spsolve(
+        csr(system.tangent(exact, mu)).tocsc(), system.residual(exact, mu)
+    )  # which was near enough
     rough = system.held(np.random.default_rng(0).standard_normal(system.size))
     u, errors = exact + 2e-5 * h * rough, list[float]()
     for _ in range(5):
@@ -95,23 +115,33 @@ def test_a_piece_that_is_not_held(tmp_path: Path) -> None:
 def test_pieces_that_overlap(tmp_path: Path) -> None:
     data = pair(tmp_path, (1, 1), (1, 1), -0.1)
     data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
-    with pytest.raises(MeshError, match=r"contact: upper and lower overlap undeformed, by 0.1 h at \("):
+    with pytest.raises(
+        MeshError, match=r"contact: upper and lower overlap undeformed, by 0.1 h at \("
+    ):
         Scene(Case.model_validate(data))
     data["contact"] = [["upper", "other"]]
-    with pytest.raises(MeshError, match="contact: other: the surface has no such part, only lower, shell, upper"):
+    with pytest.raises(
+        MeshError, match="contact: other: the surface has no such part, only lower, shell, upper"
+    ):
         Scene(Case.model_validate(data))
 
 
 def test_check_knows_the_parts(tmp_path: Path) -> None:
-    """`magshell check` builds no model, and finds a pair with a wrong name, or that shares cells with another."""
+    """`magshell check` builds no model, and finds a pair with a wrong name, or that shares cells
+    with another.
+    """
     data = pair(tmp_path, (1, 1), (1, 1), 1.0)
     data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-5]}]
     describe(Case.model_validate(data))
     data["contact"] = [["upper", "lover"]]
-    with pytest.raises(CaseError, match="contact: lover: the surface has no such part, only lower, shell, upper"):
+    with pytest.raises(
+        CaseError, match="contact: lover: the surface has no such part, only lower, shell, upper"
+    ):
         describe(Case.model_validate(data))
     data["contact"] = [["upper", "lower"], ["shell", "upper"]]
-    with pytest.raises(CaseError, match="contact: shell and upper: shares cells with upper and lower"):
+    with pytest.raises(
+        CaseError, match="contact: shell and upper: shares cells with upper and lower"
+    ):
         describe(Case.model_validate(data))
 
 
@@ -120,14 +150,18 @@ def test_sheets_far_apart(tmp_path: Path) -> None:
     """Each bends as it does alone: 1e-10."""
     data = pair(tmp_path, (2, 2), (3, 2), 50.0)
     del data["foundation"]
-    data["boundary"] = {f"{name}_{i}": "clamped" for name in ("lower", "upper") for i in range(1, 5)}
+    data["boundary"] = {
+        f"{name}_{i}": "clamped" for name in ("lower", "upper") for i in range(1, 5)
+    }
     data["loading"]["loads"] = [{"over": "upper", "per_area": [0, 0, -1e-6]}]
     tips = []
     for names in (("lower", "upper"), ("upper",)):
         sheets = [Sheet("lower", (0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 2)),
                   Sheet("upper", (0, 0, 51 * h), (0, 1, 0), (1, 0, 0), (3, 2))]  # fmt: skip
         write(tmp_path / "two.msh", [sheet for sheet in sheets if sheet.name in names])
-        alone = data | {"boundary": {k: v for k, v in data["boundary"].items() if k.split("_")[0] in names}}
+        alone = data | {
+            "boundary": {k: v for k, v in data["boundary"].items() if k.split("_")[0] in names}
+        }
         alone |= {"points": {"tip": [0.5, 1 / 3, 51 * h]}, "contact": [["shell", "shell"]]}
         scene = Scene(Case.model_validate(alone))
         *_, last = follow(scene)

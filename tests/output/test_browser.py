@@ -1,4 +1,6 @@
-"""Reports in a real browser: headless Chromium opens them as a reader would, on a screen and on a phone."""
+"""Reports in a real browser: headless Chromium opens them as a reader would, on a screen and on a
+phone.
+"""
 
 import csv
 import shutil
@@ -33,10 +35,19 @@ STRIP = {
     "boundary": {"root": "clamped"},
     "mesh": {"degree": 3, "size": 0.5},
 }
-IN_UNITS = {"geometry": "strip", "radius": "30 mm", "width": 0.2, "thickness": "0.5 mm", "poisson_ratio": 0.0}
+IN_UNITS = {
+    "geometry": "strip",
+    "radius": "30 mm",
+    "width": 0.2,
+    "thickness": "0.5 mm",
+    "poisson_ratio": 0.0,
+}
 MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
 CASES: dict[str, dict[str, Any]] = {
-    "indentation": {**SPHERE, "loading": {"kind": "indentation", "at": {"polar": 0}, "depth": 3, "points": 3}},
+    "indentation": {
+        **SPHERE,
+        "loading": {"kind": "indentation", "at": {"polar": 0}, "depth": 3, "points": 3},
+    },
     "body": {
         **SPHERE,
         "bodies": {"plate": {"kind": "plane"}},
@@ -47,14 +58,24 @@ CASES: dict[str, dict[str, Any]] = {
         "shell": {**IN_UNITS, "youngs_modulus": "1 MPa"},
         "magnetic": {
             "remanent": {"polar": 90, "flux_density": "3 mT"},
-            "applied": {"sources": [{**MAGNET, "axis": {"polar": -90}, "position": ["55 mm", 0, "-30 mm"]}]},
+            "applied": {
+                "sources": [{**MAGNET, "axis": {"polar": -90}, "position": ["55 mm", 0, "-30 mm"]}]
+            },
         },
-        "loading": [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "12 mm"], "points": 2}],
+        "loading": [
+            {"kind": "field", "points": 1},
+            {"kind": "source", "move": [0, 0, "12 mm"], "points": 2},
+        ],
     },
     "time": {
         **STRIP,
         "loading": [
-            {"kind": "time", "duration": 1000.0, "points": 12, "push": {"mode": 1, "displacement": 0.5}},
+            {
+                "kind": "time",
+                "duration": 1000.0,
+                "points": 12,
+                "push": {"mode": 1, "displacement": 0.5},
+            },
         ],
     },
 }
@@ -99,12 +120,18 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return make
 
 
-PANES = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().toJSON())"
+PANES = (
+    "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().toJSON())"
+)
 
 
-@pytest.mark.parametrize("kind", ["magnet", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "magnet")])
+@pytest.mark.parametrize(
+    "kind", ["magnet", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "magnet")]
+)
 def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, report: Any) -> None:
-    """No error, nothing wider than the window; the shell in its true proportions, neither tiny nor cut off."""
+    """No error, nothing wider than the window; the shell in its true proportions, neither tiny nor
+    cut off.
+    """
     page.open(report(kind), 1200)
     page.wait("document.body.dataset.ready === 'yes'")
     assert page.value("document.documentElement.scrollWidth") <= 1200
@@ -113,7 +140,9 @@ def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, rep
     assert left["right"] <= right["left"]
     proportions_are_true(page)
     page.resize(400)
-    page.wait("['shell3d', 'curve2d'].every(n => document.getElementById(n)._fullLayout.width <= 400)")
+    page.wait(
+        "['shell3d', 'curve2d'].every(n => document.getElementById(n)._fullLayout.width <= 400)"
+    )
     assert page.value("document.documentElement.scrollWidth") <= 400
     above, below = page.value(PANES)
     assert min(above["width"], below["width"]) >= 320
@@ -123,15 +152,21 @@ def test_a_report_is_whole_on_a_screen_and_on_a_phone(kind: str, page: Page, rep
 
 
 def proportions_are_true(page: Page) -> None:
-    """The ranges of the axes are finite, have one scale, and hold all that is drawn without much around it."""
+    """The ranges of the axes are finite, have one scale, and hold all that is drawn without much
+    around it.
+    """
     ranges = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}[c + 'axis'].range)"), float)
     ratio = np.array(page.value(f"['x', 'y', 'z'].map(c => {SCENE}.aspectratio[c])"), float)
     assert np.isfinite(ranges).all()
     assert page.value(f"{SCENE}.aspectmode") == "manual"
     sizes = np.ptp(ranges, axis=1)
-    assert ratio / ratio.max() == pytest.approx(sizes / sizes.max(), rel=1e-6)  # a sphere is a sphere
+    assert ratio / ratio.max() == pytest.approx(
+        sizes / sizes.max(), rel=1e-6
+    )  # a sphere is a sphere
     traces = f"{DRAWN}.slice(0, -1).flatMap(t => [...t[c]].filter(v => v !== null))"
-    places = page.value(f"['x', 'y', 'z'].map(c => {{const v = {traces}; return [Math.min(...v), Math.max(...v)];}})")
+    places = page.value(
+        f"['x', 'y', 'z'].map(c => {{const v = {traces}; return [Math.min(...v), Math.max(...v)];}})"
+    )
     drawn = np.array(places)
     assert (drawn[:, 0] >= ranges[:, 0]).all()
     assert (drawn[:, 1] <= ranges[:, 1]).all()
@@ -139,24 +174,34 @@ def proportions_are_true(page: Page) -> None:
 
 
 def test_the_curve_is_that_of_the_picture(page: Page, report: Any) -> None:
-    """Between the points too: JavaScript's cubics against SciPy's, of a fold, a turn and a vibration."""
+    """Between the points too: JavaScript's cubics against SciPy's, of a fold, a turn and a
+    vibration.
+    """
     page.open(report("time"), 800)
     page.wait("document.body.dataset.ready === 'yes'")
     x, y, t = [0.0, 0.5, 1.1, 0.8, 0.9], [0.0, 2.0, 2.5, 1.0, 1.5], [0.0, 0.5, 1.0, 2.0, 2.5]
     located = [False, False, True, False, False]
     texts = ", ".join(str(v).lower() for v in (x, y, located))
-    assert np.array(page.value(f"magshell.joined({texts}, null)")) == pytest.approx(smooth(x, y, located), abs=1e-12)
+    assert np.array(page.value(f"magshell.joined({texts}, null)")) == pytest.approx(
+        smooth(x, y, located), abs=1e-12
+    )
     level = [(1, -1), (0, 0)]  # the load of a fold at the end, and a displacement at the beginning
-    found = np.array(page.value(f"magshell.joined({texts}, null, {[list(each) for each in level]})"))
+    found = np.array(
+        page.value(f"magshell.joined({texts}, null, {[list(each) for each in level]})")
+    )
     assert found == pytest.approx(smooth(x, y, located, level), abs=1e-12)
     found = np.array(page.value(f"magshell.joined({texts}, {t})"))
     assert found == pytest.approx(splined(x, y, t), abs=1e-12)
-    assert found[1] == pytest.approx(CubicSpline(t, y)(np.interp(np.arange(4 * FINE + 1) / FINE, range(5), t)))
+    assert found[1] == pytest.approx(
+        CubicSpline(t, y)(np.interp(np.arange(4 * FINE + 1) / FINE, range(5), t))
+    )
     assert page.value("magshell.about.steps[0].lines[0].in_time") is True
 
 
 def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
-    """The field is not joined to the way of the magnet; labels have the units of the case; a click moves the slider."""
+    """The field is not joined to the way of the magnet; labels have the units of the case; a click
+    moves the slider.
+    """
     page.open(report("magnet"), 1200)
     page.wait("document.body.dataset.ready === 'yes'")
     about = page.value("magshell.about")
@@ -172,7 +217,9 @@ def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
 
 
 @pytest.mark.slow
-def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report: Any, tmp_path: Path) -> None:
+def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
+    page: Page, report: Any, tmp_path: Path
+) -> None:
     """Two folds 1 % of the curve apart: an inset around them as in curve.png, and none far apart."""
     for gap, drawn in ((0.01, True), (0.5, False)):
         folder = tmp_path / f"{gap}"
@@ -183,7 +230,10 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report:
         for i, row in enumerate(rows):
             x = 1.0 * i if i < middle else (1 - gap) * (middle - 1) if i == middle else i + 1.0
             located = i in (middle - 1, middle)
-            row |= {"amplitude": "force" if i else "", "label": "fold" if located else "step" if i else "start"}
+            row |= {
+                "amplitude": "force" if i else "",
+                "label": "fold" if located else "step" if i else "start",
+            }
             row |= {
                 "w_over_h": f"{x}",
                 "w_pole_over_h": f"{x}",
@@ -198,7 +248,9 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report:
         write_report(folder)
         page.open(folder / "report.html", 1200)
         page.wait("document.body.dataset.ready === 'yes'")
-        ranges = page.value("['x', 'y'].map(c => document.getElementById('curve2d')._fullLayout[`${c}axis2`]?.range)")
+        ranges = page.value(
+            "['x', 'y'].map(c => document.getElementById('curve2d')._fullLayout[`${c}axis2`]?.range)"
+        )
         if drawn:
             low, high = np.array([[w, load(w)] for w in ((1 - gap) * (middle - 1), middle - 1)])
             around = np.array([low - AROUND * (high - low), high + AROUND * (high - low)])
@@ -211,7 +263,9 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(page: Page, report:
 
 
 def test_a_turn_between_points_is_smooth() -> None:
-    """A parabola through six points, its top between two: within 0.03, where a monotone curve is cut off."""
+    """A parabola through six points, its top between two: within 0.03, where a monotone curve is
+    cut off.
+    """
     x = np.linspace(-1.0, 1.0, 6)
     drawn = smooth(x.tolist(), (1 - x**2).tolist())
     assert np.abs(drawn[1] - (1 - drawn[0] ** 2)).max() < 0.03
@@ -220,9 +274,13 @@ def test_a_turn_between_points_is_smooth() -> None:
 
 
 def test_a_curve_ends_level_at_a_fold() -> None:
-    """Five points of a sine up to its top, the last step the longest: within 0.008, 3 times better than without."""
+    """Five points of a sine up to its top, the last step the longest: within 0.008, 3 times better
+    than without.
+    """
     x = np.array([0.0, 0.2, 0.4, 0.6, 1.0]) * np.pi / 2
-    drawn, guessed = (smooth(x.tolist(), np.sin(x).tolist(), [], level) for level in ([(1, -1)], []))
+    drawn, guessed = (
+        smooth(x.tolist(), np.sin(x).tolist(), [], level) for level in ([(1, -1)], [])
+    )
     wrong, without = (np.abs(curve[1] - np.sin(curve[0])).max() for curve in (drawn, guessed))
     assert wrong < 0.008
     assert without > 3 * wrong
@@ -234,4 +292,7 @@ def test_a_vibration_keeps_its_form() -> None:
     drawn = splined(t.tolist(), np.sin(2 * np.pi * t).tolist(), t.tolist())
     inner = drawn[:, 2 * FINE : -2 * FINE]
     assert np.abs(inner[1] - np.sin(2 * np.pi * inner[0])).max() < 0.05
-    assert np.abs(np.interp(inner[0], t, np.sin(2 * np.pi * t)) - np.sin(2 * np.pi * inner[0])).max() > 0.29
+    assert (
+        np.abs(np.interp(inner[0], t, np.sin(2 * np.pi * t)) - np.sin(2 * np.pi * inner[0])).max()
+        > 0.29
+    )

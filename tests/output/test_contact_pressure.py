@@ -1,4 +1,6 @@
-"""The contact pressure in pictures: that of the points, or a statement where cells are too wide for it."""
+"""The contact pressure in pictures: that of the points, or a statement where cells are too wide for
+it.
+"""
 
 from dataclasses import replace
 
@@ -32,7 +34,9 @@ def end_of(name: str, *settings: str) -> tuple[Scene, State, Surface]:
 
 @pytest.mark.slow
 def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
-    """The rod's edge presses on a ring of 0.02 of a cell; its mean over the cell was drawn, 50 times too small."""
+    """The rod's edge presses on a ring of 0.02 of a cell; its mean over the cell was drawn, 50
+    times too small.
+    """
     _, _, surface = end_of("rod_contact.yaml", "loading.approach=0.5", "loading.points=1")
     assert np.isnan(surface.fields[PRESSURE]).any()
     assert not (surface.fields[PRESSURE] > 0).any()
@@ -42,7 +46,9 @@ def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
 
 @pytest.mark.slow
 def test_a_flat_contact_has_the_pressure_of_its_points() -> None:
-    """What is drawn is what the quadrature points have, within the variation of one cell; outside it is zero."""
+    """What is drawn is what the quadrature points have, within the variation of one cell; outside
+    it is zero.
+    """
     few = "loading.approach=0.8", "loading.points=1", "mesh.refinement=4"
     scene, state, surface = end_of("plate_contact.yaml", "bodies.plate.stiffness=2e6", *few)
     pressing, _ = scene.model.contacts["approach"]
@@ -53,7 +59,9 @@ def test_a_flat_contact_has_the_pressure_of_its_points() -> None:
 
 
 def test_pressure_of_cells_pressed_in_part() -> None:
-    """A row of cells: by itself such a cell has none, beside one that is pressed all over it is its edge."""
+    """A row of cells: by itself such a cell has none, beside one that is pressed all over it is its
+    edge.
+    """
     cells = np.array([[i, i + 1, i + 1] for i in range(6)])
     even, of_cells = np.array([0, 1, 0, 0, 0, 0.0]), np.array([0.2, 1, 0.3, 0, 0, 0.7])
 

@@ -9,8 +9,12 @@ import pytest
 from magshell_fenicsx.output.store import durable
 
 
-def test_the_disk_is_waited_for_now_and_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the first piece, a second later and at the end; each piece is in the file at once, as a kill leaves it."""
+def test_the_disk_is_waited_for_now_and_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first piece, a second later and at the end; each piece is in the file at once, as a
+    kill leaves it.
+    """
     lengths, clock = list[int](), [0.0]
     monkeypatch.setattr(os, "fsync", lambda number: lengths.append(os.fstat(number).st_size))
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
@@ -24,7 +28,9 @@ def test_the_disk_is_waited_for_now_and_then(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_disk_that_fails_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was written since the last wait may be lost: the file ends where it is known to be whole."""
+    """What was written since the last wait may be lost: the file ends where it is known to be
+    whole.
+    """
 
     def full(number: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

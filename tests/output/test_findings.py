@@ -15,7 +15,13 @@ VECTOR = np.linspace(0, 1, 7) / 3
 
 
 def made_once() -> Finding:
-    values = {"counts": [np.int64(2)], "size": np.inf, "gap": np.nan, "said": "", "part": np.float64(0.1)}
+    values = {
+        "counts": [np.int64(2)],
+        "size": np.inf,
+        "gap": np.nan,
+        "said": "",
+        "part": np.float64(0.1),
+    }
     return Finding(values, VECTOR)
 
 

@@ -1,4 +1,6 @@
-"""The part of a report to play with: read back as a browser would, it has the numbers of the folder."""
+"""The part of a report to play with: read back as a browser would, it has the numbers of the
+folder.
+"""
 
 import base64
 import csv
@@ -32,7 +34,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dimpled hemisphere in a field, up to its fold."""
     defect = {"kind": "dimple", "amplitude": 0.5, "width": 3.2}
     sections = {
-        "shell": {"geometry": "hemisphere", "radius_to_thickness": 90, "poisson_ratio": 0.5, "defect": defect},
+        "shell": {
+            "geometry": "hemisphere",
+            "radius_to_thickness": 90,
+            "poisson_ratio": 0.5,
+            "defect": defect,
+        },
         "boundary": {"equator": "clamped"},
         "magnetic": {"lambda_m": 1e-4, "remanent": {"polar": 0}, "applied": {"polar": 180}},
         "loading": {"kind": "pressure", "until": "limit"},
@@ -72,7 +79,10 @@ def test_numbers_are_those_of_the_path(folder: Path) -> None:
     before, pressed = about["steps"]
     assert before["title"] == "field"
     assert pressed["axes"] == ["volume_change", "p_over_pc"]
-    assert {name: about["columns"][name]["sign"] for name in pressed["axes"]} == {"volume_change": -1, "p_over_pc": 1}
+    assert {name: about["columns"][name]["sign"] for name in pressed["axes"]} == {
+        "volume_change": -1,
+        "p_over_pc": 1,
+    }
     assert about["columns"]["volume_change"]["label"] == "change of volume −ΔV/R³"
     assert sorted({*before["rows"], *pressed["rows"]}) == list(range(len(rows)))
     assert about["frames"][0] == 0
@@ -110,19 +120,30 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
 @needs_plotly
 def test_one_page_below_six_megabytes(folder: Path, tmp_path: Path) -> None:
     """Nothing is looked for elsewhere; large pictures are reduced to the page's width."""
-    noise = np.random.default_rng(0).integers(0, 255, (60, 60, 3), np.uint8).repeat(60, axis=0).repeat(60, axis=1)
-    Image.fromarray(noise + np.random.default_rng(1).integers(0, 9, noise.shape, np.uint8)).save(folder / "shell.png")
+    noise = (
+        np.random.default_rng(0)
+        .integers(0, 255, (60, 60, 3), np.uint8)
+        .repeat(60, axis=0)
+        .repeat(60, axis=1)
+    )
+    Image.fromarray(noise + np.random.default_rng(1).integers(0, 9, noise.shape, np.uint8)).save(
+        folder / "shell.png"
+    )
     assert (folder / "shell.png").stat().st_size > 6e6
     write_report(folder)
     assert (folder / "report.html").stat().st_size < 6e6
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"<(script|img|link|iframe)[^>]*(src|href)=.(?!data:)", page)
-    assert "plotly.js v" in zlib.decompress(base64.b64decode(parts(folder)["library"])).decode()[:200]
+    assert (
+        "plotly.js v" in zlib.decompress(base64.b64decode(parts(folder)["library"])).decode()[:200]
+    )
     (folder / "shell.png").unlink()
 
 
 def test_frames_are_few_and_have_the_instabilities() -> None:
-    rows: list[dict[str, Any]] = [{"point": i, "label": "fold" if i in (71, 72) else "step"} for i in range(300)]
+    rows: list[dict[str, Any]] = [
+        {"point": i, "label": "fold" if i in (71, 72) else "step"} for i in range(300)
+    ]
     chosen = [row["point"] for row in chosen_frames(rows, 24)]
     assert len(chosen) == 24
     assert {0, 71, 72, 299} <= set(chosen)
@@ -135,7 +156,10 @@ def test_large_meshes_are_thinned() -> None:
     r = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
     low = (np.arange(199)[:, None] * 200 + np.arange(199)).ravel()
     cells = np.concatenate(
-        [np.column_stack([low, low + 1, low + 200]), np.column_stack([low + 1, low + 201, low + 200])]
+        [
+            np.column_stack([low, low + 1, low + 200]),
+            np.column_stack([low + 1, low + 201, low + 200]),
+        ]
     )
     mesh = thinned(Surface(r, 0 * r, r, cells, {}), 5000)
     a, b, c = np.moveaxis(mesh.at(r)[mesh.triangles], 1, 0)
@@ -170,7 +194,9 @@ def test_options_are_keys_of_the_case(folder: Path) -> None:
     assert {"shell_0001.png", "shell_0001.pdf", "fields_0001.pdf"} <= set(drawn)
     with Image.open(folder / "shell_0001.png") as image:
         assert image.width == pytest.approx(50 / 25.4 * 60, abs=2)
-    with pytest.raises(CaseError, match=r"--dpi: output\.dpi: 5: must be greater than or equal to 50"):
+    with pytest.raises(
+        CaseError, match=r"--dpi: output\.dpi: 5: must be greater than or equal to 50"
+    ):
         plot(folder, 1, options={"dpi": 5})
     with pytest.raises(CaseError, match=r"E_3: no field with colours; there are w_over_h"):
         plot(folder, 1, options={"ranges": {"E_3": [0.0, 1.0]}})

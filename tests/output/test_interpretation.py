@@ -67,7 +67,10 @@ def test_torque_of_a_swelling_sphere() -> None:
 
 
 def test_first_order_energy_is_the_work_of_the_loads() -> None:
-    """U1 = lambda_m E integral of f_mag . u - p_mag u . n0, for u = 0 on the edge; paper Eq. (eq:um1)."""
+    """U1 = lambda_m E integral of f_mag . u - p_mag u . n0, for u = 0 on the edge; paper Eq.
+
+    (eq:um1).
+    """
     Ba = np.array([0.48, 0.36, 0.8])
     shell = model(Magnetisation(UP, Ba, "first"))
     x, y, z = shell.r0.x.array.reshape(-1, 3).T
@@ -79,12 +82,18 @@ def test_first_order_energy_is_the_work_of_the_loads() -> None:
     # on the unit sphere b = -P, tr b = -2: f/h = -(n . Ba) P Br - 2 (n . Br) P Ba, p/h = P Br . Ba
     f = -ufl.dot(n0, A) * ufl.dot(P, Br) - 2 * ufl.dot(n0, Br) * ufl.dot(P, A)
     p = ufl.dot(ufl.dot(P, Br), A)
-    work = (ufl.dot(f, v) - p * ufl.dot(v, n0)) * kin.area_ratio(r0) * ufl.dx(metadata={"quadrature_degree": 8})
+    work = (
+        (ufl.dot(f, v) - p * ufl.dot(v, n0))
+        * kin.area_ratio(r0)
+        * ufl.dx(metadata={"quadrature_degree": 8})
+    )
     assert fem.assemble_scalar(fem.form(work)) == pytest.approx(U1, rel=1e-4)
 
 
 def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
-    """U1 = integral of f_mag . u for u = 0 on the edge: f/h is half of that above less that of exchanged fields."""
+    """U1 = integral of f_mag . u for u = 0 on the edge: f/h is half of that above less that of
+    exchanged fields.
+    """
     Ba = np.array([0.48, 0.36, 0.8])
     shell = model(Magnetisation(UP, Ba, "first", law="rotation"))
     surface = SurfaceGatherer(shell).gather(shell.zero())
@@ -97,8 +106,14 @@ def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
     x, y, z = shell.r0.x.array.reshape(-1, 3).T
     u = (z[:, None] * np.column_stack([x * z, y + z, 0.5 + x])).ravel()
     U1 = shell.system.potential(u, {}, "lambda_m")
-    n0, Br, A = kin.normal(kin.jet(shell.r0, shell.V.mesh)), ufl.as_vector(UP.tolist()), ufl.as_vector(Ba.tolist())
-    f = (ufl.dot(n0, A) * (Br - ufl.dot(n0, Br) * n0) - ufl.dot(n0, Br) * (A - ufl.dot(n0, A) * n0)) / 2
+    n0, Br, A = (
+        kin.normal(kin.jet(shell.r0, shell.V.mesh)),
+        ufl.as_vector(UP.tolist()),
+        ufl.as_vector(Ba.tolist()),
+    )
+    f = (
+        ufl.dot(n0, A) * (Br - ufl.dot(n0, Br) * n0) - ufl.dot(n0, Br) * (A - ufl.dot(n0, A) * n0)
+    ) / 2
     area = kin.area_ratio(kin.jet(shell.r0, shell.V.mesh))
     work = ufl.dot(f, shell.u) * area * ufl.dx(metadata={"quadrature_degree": 8})
     assert fem.assemble_scalar(fem.form(work)) == pytest.approx(U1, rel=1e-4)
@@ -106,8 +121,14 @@ def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
 
 def test_springs_and_torques_of_a_remanence_that_does_not_stretch() -> None:
     """Of a plate: k is the mean over all axes in it; U_tau = q . tau where no area changes."""
-    Br, Ba, D = np.array([0.6, 0.0, 0.8]), np.array([0.48, 0.36, 0.8]), np.array([[0.1, 0.3], [-0.2, -0.1]])
-    flat = ShellModel(disc(0.8), Material(0.3, H), 2, {}, Loads(magnetic=Magnetisation(Br, Ba, law="rotation")))
+    Br, Ba, D = (
+        np.array([0.6, 0.0, 0.8]),
+        np.array([0.48, 0.36, 0.8]),
+        np.array([[0.1, 0.3], [-0.2, -0.1]]),
+    )
+    flat = ShellModel(
+        disc(0.8), Material(0.3, H), 2, {}, Loads(magnetic=Magnetisation(Br, Ba, law="rotation"))
+    )
     q = np.array([0.05, -0.08])
     u = (flat.r0.x.array.reshape(-1, 3)[:, :2] @ np.vstack([D, q]).T).ravel()
     surface = SurfaceGatherer(flat).gather(u)
@@ -121,7 +142,9 @@ def test_springs_and_torques_of_a_remanence_that_does_not_stretch() -> None:
         parts |= other.system.energies(u)
     area = 3 * flat.volume_change(np.tile(E3, len(u) // 3))
     assert surface.fields["tau"] @ [*q, 0.0] == pytest.approx(parts["Utau"] / area, rel=1e-10)
-    assert parts["Uq"] / area != pytest.approx(-surface.fields["k"][0] / 2 * (q @ q))  # it differs between axes
+    assert parts["Uq"] / area != pytest.approx(
+        -surface.fields["k"][0] / 2 * (q @ q)
+    )  # it differs between axes
 
 
 def test_springs_of_a_radial_remanence() -> None:
@@ -134,12 +157,26 @@ def test_springs_of_a_radial_remanence() -> None:
 
 
 def test_thickness_that_varies() -> None:
-    """p_mag = h b0:B0 with the thickness that is there; f_mag, whose divergence takes that of h too, is not told."""
+    """p_mag = h b0:B0 with the thickness that is there; f_mag, whose divergence takes that of h
+    too, is not told.
+    """
     pressures = []
     for factor in ({}, {"thickness_factor": "1 + z"}):
-        shell = {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3, **factor}
+        shell = {
+            "geometry": "cylinder",
+            "radius": 1,
+            "length": 1,
+            "thickness": 0.02,
+            "poisson_ratio": 0.3,
+            **factor,
+        }
         magnetic = {"lambda_m": 1e-3, "remanent": {"polar": 90}, "applied": {"polar": 90}}
-        data = {"shell": shell, "boundary": {"bottom": "clamped"}, "magnetic": magnetic, "symmetry": "none"}
+        data = {
+            "shell": shell,
+            "boundary": {"bottom": "clamped"},
+            "magnetic": magnetic,
+            "symmetry": "none",
+        }
         scene = Scene(Case.from_source({**data, "mesh": {"degree": 2, "size": 0.5}}))
         surface = SurfaceGatherer(scene.model).gather(scene.model.zero())  # type: ignore[arg-type]
         assert surface

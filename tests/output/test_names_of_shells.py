@@ -21,7 +21,9 @@ def plate(x: float, **boundary: str) -> dict[str, Any]:
 
 
 def test_names_of_shells(tmp_path: Path) -> None:
-    """Halves of two plates joined in one plane: files tell the shell of each node, and a picture has a name on each."""
+    """Halves of two plates joined in one plane: files tell the shell of each node, and a picture
+    has a name on each.
+    """
     data = {
         "shells": {"left": plate(0, left="clamped"), "right": plate(1, right="clamped")},
         "joints": [{"edges": ["left.right", "right.left"]}],
@@ -37,7 +39,10 @@ def test_names_of_shells(tmp_path: Path) -> None:
     number, x = np.rint(read.fields[SHELL]), read.r0[:, 0]
     assert (number[x < 0.999] == 0).all()
     assert (number[x > 1.001] == 1).all()
-    assert np.bincount(number[np.abs(x - 1) < 1e-9].astype(int)).tolist() == [6, 6]  # nodes of two shells are double
+    assert np.bincount(number[np.abs(x - 1) < 1e-9].astype(int)).tolist() == [
+        6,
+        6,
+    ]  # nodes of two shells are double
     view = Background(read, Camera(np.array([0.0, -0.1, 1.0])), 300)
     names = view.panel(shell(read, about.h)[0], OutputSection()).names
     camera = Camera(np.array([0.0, -0.1, 1.0]))

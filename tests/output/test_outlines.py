@@ -9,7 +9,14 @@ from conftest import CASES
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, solids, vtp_content
+from magshell_fenicsx.output.fields.outlines import (
+    DRIVEN,
+    STILL,
+    outlines,
+    read_outlines,
+    solids,
+    vtp_content,
+)
 from magshell_fenicsx.shape.solids import cylinder, globe
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
@@ -18,7 +25,9 @@ POSITION = np.array([40.0, 0, -60]) / 30
 
 
 def test_outlines(tmp_path: Path) -> None:
-    """A cylinder of 20 x 10 mm: still, then half way up and lying on its side; the files hold the same lines."""
+    """A cylinder of 20 x 10 mm: still, then half way up and lying on its side; the files hold the
+    same lines.
+    """
     still = outlines(make_problem(Case.load(CASES / "magnet_strip.yaml")).loads, {}, 0.0)
     size = np.ptp(np.concatenate(still) - POSITION, axis=0) * 30
     np.testing.assert_allclose(size, [20, 20, 10], atol=1e-12)
@@ -31,8 +40,12 @@ def test_outlines(tmp_path: Path) -> None:
     assert magnet.name == "cylinder magnet"
     assert magnet.poles is not None
     assert np.ptp(magnet.points, axis=0) * 30 == pytest.approx([10, 20, 20])
-    north = magnet.points[magnet.poles > 0].mean(axis=0) - magnet.points[magnet.poles < 0].mean(axis=0)
-    assert north / np.linalg.norm(north) == pytest.approx([1, 0, 0], abs=1e-12)  # it was e3 before the quarter turn
+    north = magnet.points[magnet.poles > 0].mean(axis=0) - magnet.points[magnet.poles < 0].mean(
+        axis=0
+    )
+    assert north / np.linalg.norm(north) == pytest.approx(
+        [1, 0, 0], abs=1e-12
+    )  # it was e3 before the quarter turn
     (tmp_path / STILL).write_bytes(vtp_content(still))
     (tmp_path / DRIVEN.format(3)).write_bytes(vtp_content(lying, [magnet]))
     for number, lines in ((2, still), (3, lying)):
@@ -75,6 +88,11 @@ def test_a_sphere_has_no_creases() -> None:
     ball = globe(2.0)
     assert ball.creases == []
     corners = ball.points[ball.triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    areas = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        / 2
+    )
     assert areas.sum() == pytest.approx(16 * np.pi, rel=1e-2)
     assert len(cylinder(1.0, 2.0).creases) > 0

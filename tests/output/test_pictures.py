@@ -19,12 +19,26 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.tessellation import tessellated
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu, write_whole_shells
+from magshell_fenicsx.output.fields.vtu import (
+    About,
+    FieldSeries,
+    point_file,
+    read_vtu,
+    write_whole_shells,
+)
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import Coloured, loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png, written
-from magshell_fenicsx.output.pictures.picture import PICTURES, Background, apart, drawn_arrows, figures, rims, spread
+from magshell_fenicsx.output.pictures.picture import (
+    PICTURES,
+    Background,
+    apart,
+    drawn_arrows,
+    figures,
+    rims,
+    spread,
+)
 from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
 from magshell_fenicsx.output.pictures.view import (
     LAMP,
@@ -49,13 +63,25 @@ ABOVE = np.array([0.0, -1e-6, 1.0])
 def plate(w: float) -> Surface:
     """A flat square in two triangles, displaced by w along -e3."""
     down = np.array([0.0, 0.0, -1.0])
-    return Surface(SQUARE, np.tile(w * down, (4, 1)), np.tile(-down, (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), {})
+    return Surface(
+        SQUARE,
+        np.tile(w * down, (4, 1)),
+        np.tile(-down, (4, 1)),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        {},
+    )
 
 
 def test_axes_on_the_screen() -> None:
-    """Seen along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to the left."""
-    assert axes_on_screen(np.array([2.0, 0, 0])) == pytest.approx(np.array([[0, 0], [1, 0], [0, 1]]))
-    assert axes_on_screen(np.array([0, 3.0, 0])) == pytest.approx(np.array([[-1, 0], [0, 0], [0, 1]]))
+    """Seen along -e1 (the eye on e1): e1 points to the eye, e2 to the right, e3 up; from e2, e1 to
+    the left.
+    """
+    assert axes_on_screen(np.array([2.0, 0, 0])) == pytest.approx(
+        np.array([[0, 0], [1, 0], [0, 1]])
+    )
+    assert axes_on_screen(np.array([0, 3.0, 0])) == pytest.approx(
+        np.array([[-1, 0], [0, 0], [0, 1]])
+    )
 
 
 def test_a_place_is_seen_from_its_side() -> None:
@@ -72,7 +98,10 @@ def seen(surface: Surface, width: int = 300) -> InView:
 def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
     """Of a plate that faces the eye, pixel by pixel; what is not the plate is transparent."""
     colours = colour_map(SIGNED)
-    for value, expected in ((0.0, (255, 255, 255)), (1.0, np.rint(255 * np.array(colours(256)[:3])))):
+    for value, expected in (
+        (0.0, (255, 255, 255)),
+        (1.0, np.rint(255 * np.array(colours(256)[:3]))),
+    ):
         image = seen(plate(0.0)).coloured(np.full(4, value), (-1.0, 1.0), colours)
         assert image[150, 150, :3] == pytest.approx(expected, abs=1)
         assert image[150, 150, 3] == 255
@@ -81,7 +110,9 @@ def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
 
 
 def slopes(rise: float) -> Surface:
-    """Two rectangles beside each other, the left one rising, the right one falling: a roof, or a valley."""
+    """Two rectangles beside each other, the left one rising, the right one falling: a roof, or a
+    valley.
+    """
     left = np.array([[-1.0, -1, 0], [0, -1, rise], [0, 1, rise], [-1, 1, 0]])
     right = left * [-1.0, 1, 1]
     r = np.concatenate([left, right])
@@ -90,9 +121,17 @@ def slopes(rise: float) -> Surface:
 
 
 def test_light_comes_from_the_upper_left() -> None:
-    """A roof is light on its left, a valley on its right, so that a dent is no bump; by hand, and without a hue."""
-    shown = {rise: seen(slopes(rise)).coloured(np.zeros(8), (-1.0, 1.0), colour_map(SIGNED)) for rise in (0.5, -0.5)}
-    normal, lamp = np.array([0.5, 0, 1]) / np.hypot(0.5, 1), np.array(LAMP) / np.linalg.norm(LAMP)  # of the right one
+    """A roof is light on its left, a valley on its right, so that a dent is no bump; by hand, and
+    without a hue.
+    """
+    shown = {
+        rise: seen(slopes(rise)).coloured(np.zeros(8), (-1.0, 1.0), colour_map(SIGNED))
+        for rise in (0.5, -0.5)
+    }
+    normal, lamp = (
+        np.array([0.5, 0, 1]) / np.hypot(0.5, 1),
+        np.array(LAMP) / np.linalg.norm(LAMP),
+    )  # of the right one
     away = lamp[2] - normal @ lamp
     dark = 255 * (1 - RELIEF * away / (1 + away / 2) - RIM * (1 - normal[2]) ** 2)
     for image, right in ((shown[0.5], 225), (shown[-0.5], 75)):
@@ -111,24 +150,32 @@ def test_a_plate_has_the_colours_of_its_bar() -> None:
 
 
 def test_no_light_makes_one_colour_of_another() -> None:
-    """A tenth of a red limit on the slope that is lit best: the colour of the bar, where it once was white."""
+    """A tenth of a red limit on the slope that is lit best: the colour of the bar, where it once
+    was white.
+    """
     colours = colour_map(SIGNED, (0.0, 1.0))
     image = seen(slopes(0.5)).coloured(np.full(8, 0.1), (0.0, 1.0), colours)
     assert image[150, 75, :3] == pytest.approx(255 * np.array(colours(0.1)[:3]), abs=2.5)
     bright = seen(slopes(0.5)).coloured(np.full(8, 0.9), (0.0, 1.0), colours)[150, 75, :3]
-    assert bright / bright.max() == pytest.approx(np.array(colours(0.9)[:3]) / max(colours(0.9)[:3]), abs=0.02)
+    assert bright / bright.max() == pytest.approx(
+        np.array(colours(0.9)[:3]) / max(colours(0.9)[:3]), abs=0.02
+    )
 
 
 def two_squares() -> Surface:
     """One above the other, the upper one half as wide."""
     low, high = plate(0.0), plate(-0.5)  # -w is up
     half = replace(high, r0=high.r0 * [0.5, 0.5, 1.0])
-    joined = (np.concatenate([getattr(low, name), getattr(half, name)]) for name in ("r0", "u", "n0"))
+    joined = (
+        np.concatenate([getattr(low, name), getattr(half, name)]) for name in ("r0", "u", "n0")
+    )
     return Surface(*joined, np.concatenate([low.cells, low.cells + 4]), {})
 
 
 def test_edges_are_drawn_in_front_of_the_shell_itself() -> None:
-    """Those of one triangle alone: no diagonal, no ridge with double nodes; the rim of the upper of two squares."""
+    """Those of one triangle alone: no diagonal, no ridge with double nodes; the rim of the upper of
+    two squares.
+    """
     edges = rims(plate(0.0)).reshape(4, -1, 3)[:, :-1]
     assert (np.abs(edges[..., :2]).max(axis=-1) == 1).all()
     on_ridge = np.abs(rims(slopes(0.5))[:, 0]) < 1e-9
@@ -144,7 +191,9 @@ def plain() -> Coloured:
 
 
 def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
-    """Two squares that move up and to the right: the outline is dashed only where they are not; crumbs are left out."""
+    """Two squares that move up and to the right: the outline is dashed only where they are not;
+    crumbs are left out.
+    """
     before = two_squares()
     after = replace(before, u=np.add(before.u, (0.7, 0.0, 0.5)))
     panel = Background(after, Camera(ABOVE), 300).panel(plain(), STYLE)
@@ -158,7 +207,9 @@ def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
-    """Two squares, one above the other, and linear values between nodes, as an independent formula has them."""
+    """Two squares, one above the other, and linear values between nodes, as an independent formula
+    has them.
+    """
     both = two_squares()
     view = seen(both)
     image = view.coloured(np.array([0.0, 1, 1, 0, 1, 1, 1, 1]), (0.0, 1.0), colour_map("gray"))
@@ -167,12 +218,20 @@ def test_what_is_in_front_hides_what_is_behind() -> None:
     for x in (20, 60, 250):
         place = left + (x + 0.5) / view.window.scale
         assert image[150, x, 0] == pytest.approx(255 * (place + 1) / 2, abs=2)
-    assert view.shows(np.array([[0, 0, 0.5], [0, 0, 0.0], [0.9, 0, 0]]), 0.01).tolist() == [True, False, True]
+    assert view.shows(np.array([[0, 0, 0.5], [0, 0, 0.0], [0.9, 0, 0]]), 0.01).tolist() == [
+        True,
+        False,
+        True,
+    ]
 
 
 def test_curved_cells_are_smooth() -> None:
-    """A quarter of a circular arc in one cubic hexahedral face, and a quadratic triangle: normals of the true shape."""
-    nodes = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)  # VTK: corners, edges
+    """A quarter of a circular arc in one cubic hexahedral face, and a quadratic triangle: normals
+    of the true shape.
+    """
+    nodes = np.array(
+        [[0, 0, 0], [2, 0, 0], [0, 2, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float
+    )  # VTK: corners, edges
     bent = nodes + np.column_stack([0 * nodes[:, 0], 0 * nodes[:, 0], nodes[:, 0] ** 2 / 4])
     surface = Surface(bent, 0 * bent, np.tile([0.0, 0, 1], (6, 1)), np.arange(6)[None], {})
     pieces = tessellated(surface)
@@ -184,7 +243,9 @@ def test_curved_cells_are_smooth() -> None:
 
 def test_a_body_has_its_outer_faces_only() -> None:
     """Two cubes beside each other: ten faces."""
-    at = np.array(np.meshgrid([0, 0.5, 1], [0, 0.5, 1], [0, 0.5, 1], indexing="ij")).reshape(3, -1).T
+    at = (
+        np.array(np.meshgrid([0, 0.5, 1], [0, 0.5, 1], [0, 0.5, 1], indexing="ij")).reshape(3, -1).T
+    )
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     )
@@ -211,7 +272,9 @@ def test_what_there_is_is_drawn() -> None:
     surface.fields.update(dict.fromkeys(("E_1", "E_2", "M_1", "M_2"), np.arange(4.0)))
     surface.fields.update({"Br": np.eye(4)[:, :3], "Ba": np.zeros((4, 3))})
     found = drawn(surface)
-    assert list(found) == [name for name in PICTURES if name not in ("contact", "magnetic_loads", "stretches")]
+    assert list(found) == [
+        name for name in PICTURES if name not in ("contact", "magnetic_loads", "stretches")
+    ]
     assert list(drawn(surface, "strains")) == ["strains"]
     said = [text.get_text() for text in found["fields"].texts]
     assert any("remanence" in text for text in said)
@@ -224,21 +287,32 @@ def test_sizes_and_formats() -> None:
     figure = figures(plate(0.1), 0.01, style, Camera(ABOVE), ["shell"])["shell"]
     files = dict(written(figure, style, "shell"))
     assert list(files) == ["shell.png", "shell.svg", "shell.pdf"]
-    assert matplotlib.image.imread(io.BytesIO(files["shell.png"])).shape[1] == pytest.approx(60 / 25.4 * 150, abs=2)
+    assert matplotlib.image.imread(io.BytesIO(files["shell.png"])).shape[1] == pytest.approx(
+        60 / 25.4 * 150, abs=2
+    )
     svg = ElementTree.fromstring(files["shell.svg"])
-    texts = ["".join(each.itertext()).strip() for each in svg.iter("{http://www.w3.org/2000/svg}text")]
+    texts = [
+        "".join(each.itertext()).strip() for each in svg.iter("{http://www.w3.org/2000/svg}text")
+    ]
     assert {"0", "10"} <= set(texts)  # the ends of the bar
-    letters = {"".join(sorted(re.sub(r"\s", "", text))) for text in texts}  # mathematics has its own order
+    letters = {
+        "".join(sorted(re.sub(r"\s", "", text))) for text in texts
+    }  # mathematics has its own order
     assert "".join(sorted("inwardnormaldisplacementw/h")) in letters
     assert len(list(svg.iter("{http://www.w3.org/2000/svg}image"))) >= 1
     assert files["shell.pdf"].startswith(b"%PDF-")
     assert files["shell.pdf"].rstrip().endswith(b"%%EOF")
-    assert b"/Type42" in files["shell.pdf"] or b"/CIDFontType2" in files["shell.pdf"]  # fonts, no outlines
+    assert (
+        b"/Type42" in files["shell.pdf"] or b"/CIDFontType2" in files["shell.pdf"]
+    )  # fonts, no outlines
 
 
 def test_ranges_of_colours() -> None:
     """Those of the values and zero, or those asked for."""
-    bars = [drawn(plate(0.1), "shell", ranges=ranges)["shell"].axes[1] for ranges in ({}, {"w_over_h": [0.0, 2.0]})]
+    bars = [
+        drawn(plate(0.1), "shell", ranges=ranges)["shell"].axes[1]
+        for ranges in ({}, {"w_over_h": [0.0, 2.0]})
+    ]
     assert [tuple(bar.get_xlim()) for bar in bars] == [(0.0, 10.0), (0.0, 2.0)]
 
 
@@ -250,17 +324,25 @@ def test_opposite_fields_are_opposite_arrows() -> None:
     assert first.vectors == pytest.approx(-second.vectors)
     middle = (first.feet + second.feet) / 2
     places = Camera(ABOVE)(SQUARE)
-    assert sorted(map(tuple, np.round(middle[:, :2], 6))) == sorted(map(tuple, np.round(places[:, :2], 6)))
+    assert sorted(map(tuple, np.round(middle[:, :2], 6))) == sorted(
+        map(tuple, np.round(places[:, :2], 6))
+    )
     across = first.feet - second.feet
     assert np.abs(across[:, 0]).max() < 1e-9
     assert (np.abs(across[:, 1]) > 0.01).all()
 
 
 def test_magnetic_loads_tell_what_is_zero() -> None:
-    """In-plane remanence in a normal field: a couple of size one, all else is rounding and is said to be zero."""
+    """In-plane remanence in a normal field: a couple of size one, all else is rounding and is said
+    to be zero.
+    """
     surface = plate(0.0)
-    surface.fields.update({"Br": np.tile([1.0, 0, 0], (4, 1)), "Ba": np.tile([0, 0, -3e-4], (4, 1))})
-    surface.fields.update({"p_mag": 1e-17 * np.arange(4), "k": 1e-16 * np.arange(4), "tau": 1e-18 * np.ones((4, 3))})
+    surface.fields.update(
+        {"Br": np.tile([1.0, 0, 0], (4, 1)), "Ba": np.tile([0, 0, -3e-4], (4, 1))}
+    )
+    surface.fields.update(
+        {"p_mag": 1e-17 * np.arange(4), "k": 1e-16 * np.arange(4), "tau": 1e-18 * np.ones((4, 3))}
+    )
     (layer,), note = loads(surface, 0.01)
     assert layer.name == "couple"
     assert layer.values == pytest.approx(np.ones(4))
@@ -280,7 +362,9 @@ def limits(E_1: Array, E_2: Array) -> list[tuple[float, float]]:
 
 
 def test_rounding_is_no_pattern() -> None:
-    """Strains that are zero are white, those of one value one colour, one that is zero beside the other is left out."""
+    """Strains that are zero are white, those of one value one colour, one that is zero beside the
+    other is left out.
+    """
     noise = np.array([1.0, -1, 0.5, 0])
     assert limits(1e-15 * noise, 1e-15 * noise) == [(-1, 1), (-1, 1)]
     ((low, high),) = limits(0.02 + 1e-12 * noise, 1e-15 * noise)
@@ -290,7 +374,9 @@ def test_rounding_is_no_pattern() -> None:
 
 
 def test_strains_of_the_mesh_are_no_picture() -> None:
-    """In pure bending: those of 1e-6 that differ by 14 % between cells are named; resolved or larger ones are drawn."""
+    """In pure bending: those of 1e-6 that differ by 14 % between cells are named; resolved or
+    larger ones are drawn.
+    """
     wave = np.array([1.0, 0.5, 0.2, 0.1])
     surface = plate(0.0)
     surface.fields.update({"E_1": 1e-6 * wave, "E_2": -1e-6 * wave, "M_1": wave, "M_2": 0 * wave})
@@ -306,7 +392,9 @@ def test_strains_of_the_mesh_are_no_picture() -> None:
 
 
 def test_what_the_mesh_leaves_is_no_second_moment() -> None:
-    """Three per cent at one corner, where moments differ by ten per cent between cells, are named; more are drawn."""
+    """Three per cent at one corner, where moments differ by ten per cent between cells, are named;
+    more are drawn.
+    """
     for second, drawn in ((0.03, 1), (0.5, 2)):
         fields = {"M_1": np.ones(4), "M_2": np.array([second, 0.0, 0.0, 0.0])}
         shown, said = moments(replace(plate(0.0), fields=fields, jump=0.1), 0.01)
@@ -331,7 +419,13 @@ def test_arrows_are_apart() -> None:
 
 
 def test_captions_tell_the_load() -> None:
-    row: Row = {"lambda_m": 0.0, "field_angle": 0.0, "p_over_pc": 0.0, "amplitude": "load", "load_factor": 0.5}
+    row: Row = {
+        "lambda_m": 0.0,
+        "field_angle": 0.0,
+        "p_over_pc": 0.0,
+        "amplitude": "load",
+        "load_factor": 0.5,
+    }
     assert "load factor = 0.5, $w/h$ = 3" in caption(0.01, 0.3, row | {"w_over_h": 3.0})
     row |= {"field_angle": 45.0, "amplitude": "force", "force": 2.5, "w_over_h": 7.0}
     assert caption(0.01, 0.3, row).count("45") == 1
@@ -341,7 +435,9 @@ def test_captions_tell_the_load() -> None:
 
 
 def test_names_are_no_mathematics() -> None:
-    """A point's name is drawn as it is written; as mathematics this one would end a run with a traceback."""
+    """A point's name is drawn as it is written; as mathematics this one would end a run with a
+    traceback.
+    """
     row: Row = {
         "point": 0,
         "label": "field",
@@ -351,7 +447,9 @@ def test_names_are_no_mathematics() -> None:
         "negative_pivots": 0,
         "A$x_y^$_ux": 0.0,
     }
-    figure = curve_figure([row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)], "lambda_m", STYLE)
+    figure = curve_figure(
+        [row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)], "lambda_m", STYLE
+    )
     png(figure)
     assert figure.axes[0].get_xlabel() == r"displacement of A\$x_y^\$  $w/h$"
 
@@ -367,21 +465,38 @@ def test_moments_have_no_displacement_of_their_own() -> None:
         "negative_pivots": 0,
         "A_ux": 0.0,
     }
-    for pole, said in ((1.0, "displacement of A  $w/h$"), (0.5, "displacement along the loads  $w/h$")):
-        path = [row | {"load_factor": x, "w_over_h": x, "w_pole_over_h": pole * x} for x in (0.0, 1.0)]
+    for pole, said in (
+        (1.0, "displacement of A  $w/h$"),
+        (0.5, "displacement along the loads  $w/h$"),
+    ):
+        path = [
+            row | {"load_factor": x, "w_over_h": x, "w_pole_over_h": pole * x} for x in (0.0, 1.0)
+        ]
         assert curve_figure(path, "load", STYLE).axes[0].get_xlabel() == said
 
 
 def test_unstable_from_the_first_bifurcation_on() -> None:
-    """A mode that the model excludes crosses between two points: the curve is dashed from there, and solid before."""
-    row: Row = {"amplitude": "pressure", "label": "step", "mode": "", "branch": 0, "negative_pivots": 0}
+    """A mode that the model excludes crosses between two points: the curve is dashed from there,
+    and solid before.
+    """
+    row: Row = {
+        "amplitude": "pressure",
+        "label": "step",
+        "mode": "",
+        "branch": 0,
+        "negative_pivots": 0,
+    }
     places = [("", 0, 0.0), ("", 0, 0.1), ("m = 3", 0, 0.15), ("m = 4", 1, 0.16), ("", 2, 0.2)]
     path = [
         row | {"point": i, "mode": mode, "excluded_pivots": count, "p_over_pc": x, "volume_change": -x}
         | ({"label": "bifurcation"} if mode else {})
         for i, (mode, count, x) in enumerate(places)
     ]  # fmt: skip
-    lines = [line for line in curve_figure(path, "pressure", STYLE).axes[0].lines if len(line.get_xdata()) > 2]
+    lines = [
+        line
+        for line in curve_figure(path, "pressure", STYLE).axes[0].lines
+        if len(line.get_xdata()) > 2
+    ]
     ends = {line.get_linestyle(): (line.get_xdata()[0], line.get_xdata()[-1]) for line in lines[:2]}
     assert ends["-"] == pytest.approx((0.0, 0.15), abs=0.005)
     assert ends["--"] == pytest.approx((0.15, 0.2), abs=0.005)
@@ -389,10 +504,21 @@ def test_unstable_from_the_first_bifurcation_on() -> None:
 
 def test_instabilities_are_numbered_along_the_whole_path() -> None:
     """On the curve of the last step too; the legend is above the axes, and nothing is cut off."""
-    row: Row = {"amplitude": "pressure", "mode": "", "branch": 0, "negative_pivots": 0, "p_over_pc": 0.0}
+    row: Row = {
+        "amplitude": "pressure",
+        "mode": "",
+        "branch": 0,
+        "negative_pivots": 0,
+        "p_over_pc": 0.0,
+    }
     labels = ["start", "fold", "field", "step", "bifurcation", "target"]
-    path = [row | {"point": i, "label": label, "volume_change": -0.1 * i} for i, label in enumerate(labels)]
-    figure = curve_figure([each | {"amplitude": "lambda_m"} for each in path[:3]] + path[3:], "pressure", STYLE)
+    path = [
+        row | {"point": i, "label": label, "volume_change": -0.1 * i}
+        for i, label in enumerate(labels)
+    ]
+    figure = curve_figure(
+        [each | {"amplitude": "lambda_m"} for each in path[:3]] + path[3:], "pressure", STYLE
+    )
     axes = figure.axes[0]
     assert [text.get_text() for text in axes.texts] == ["2"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["bifurcation"]
@@ -408,9 +534,18 @@ def test_instabilities_are_numbered_along_the_whole_path() -> None:
 HOLE = {"geometry": "cap", "hole": 5}
 
 
-@pytest.mark.parametrize(("shape", "said"), [({"geometry": "strip"}, "the tip"), (HOLE, "the watched point")])
+@pytest.mark.parametrize(
+    ("shape", "said"), [({"geometry": "strip"}, "the tip"), (HOLE, "the watched point")]
+)
 def test_there_is_a_pole_only_where_there_is_one(shape: dict[str, Any], said: str) -> None:
-    row: Row = {"point": 0, "label": "field", "amplitude": "lambda_m", "mode": "", "branch": 0, "negative_pivots": 0}
+    row: Row = {
+        "point": 0,
+        "label": "field",
+        "amplitude": "lambda_m",
+        "mode": "",
+        "branch": 0,
+        "negative_pivots": 0,
+    }
     path = [row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)]
     label = curve_figure(path, "lambda_m", STYLE, pole_of({"shell": shape})).axes[0].get_xlabel()
     assert label == f"displacement of {said}  $w/h$"
@@ -419,7 +554,9 @@ def test_there_is_a_pole_only_where_there_is_one(shape: dict[str, Any], said: st
 def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
     surface = plate(0.1)
     T = np.random.default_rng(0).random((4, 3, 3))
-    surface.fields.update({"E": T + np.swapaxes(T, 1, 2), "k": np.arange(4.0), "Br": T[0, [0, 1, 2, 0]]})
+    surface.fields.update(
+        {"E": T + np.swapaxes(T, 1, 2), "k": np.arange(4.0), "Br": T[0, [0, 1, 2, 0]]}
+    )
     mirror = np.array([0.6, 0.8, 0.0])
     series = FieldSeries(tmp_path, About(0.01, 0.3, mirror))
     series.write(0, surface)
@@ -445,12 +582,19 @@ def _mirrored(T: Array, m: Array) -> Array:
 
 
 def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path) -> None:
-    """The pressure where it rises, the points where it turns back; a half and its image in one file."""
+    """The pressure where it rises, the points where it turns back; a half and its image in one
+    file.
+    """
     mirror, surface = np.array([0.0, 1.0, 0.0]), plate(0.1)
     surface = replace(surface, r0=surface.r0 + np.array([0.0, 1.0, 0.0]))
     (tmp_path / "fields").mkdir()
-    rows: list[Row] = [dict.fromkeys(COLUMNS, 0) | dict.fromkeys(TEXTS, "") | {"point": i} for i in range(3)]
-    rows = [row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i} for i, row in enumerate(rows)]
+    rows: list[Row] = [
+        dict.fromkeys(COLUMNS, 0) | dict.fromkeys(TEXTS, "") | {"point": i} for i in range(3)
+    ]
+    rows = [
+        row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i}
+        for i, row in enumerate(rows)
+    ]
     series = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03))
     table = PathTable(tmp_path / "path.csv")
     for i, row in enumerate(rows):
@@ -463,7 +607,12 @@ def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path)
     assert again.kept == 2
     again.write(2, surface, {**rows[2], "p_over_pc": 0.1})
     assert pyvista.get_reader(tmp_path / "fields/path.pvd").time_values == [0.0, 1.0, 2.0]
-    assert write_whole_shells(tmp_path) == ["whole_0000.vtu", "whole_0001.vtu", "whole_0002.vtu", "whole.pvd"]
+    assert write_whole_shells(tmp_path) == [
+        "whole_0000.vtu",
+        "whole_0001.vtu",
+        "whole_0002.vtu",
+        "whole.pvd",
+    ]
     whole = pyvista.read(tmp_path / "fields/whole_0001.vtu")
     assert whole.n_cells == 2 * len(surface.cells)
     assert whole.bounds[2:4] == pytest.approx((-2.0, 2.0))

@@ -17,7 +17,14 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.picture import PICTURES
-from magshell_fenicsx.output.pictures.plot import Drawn, draw, draw_animation, in_true_time, plot, plot_runs
+from magshell_fenicsx.output.pictures.plot import (
+    Drawn,
+    draw,
+    draw_animation,
+    in_true_time,
+    plot,
+    plot_runs,
+)
 from magshell_fenicsx.output.pictures.readings import readings_figure
 from magshell_fenicsx.output.pictures.several import _free, add_shapes, runs_figure
 from magshell_fenicsx.output.store.table import read_rows
@@ -29,7 +36,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dimpled hemisphere in a field, up to its fold: meridian, seconds."""
     defect = {"kind": "dimple", "amplitude": 0.5, "width": 3.2}
     sections = {
-        "shell": {"geometry": "hemisphere", "radius_to_thickness": 90, "poisson_ratio": 0.5, "defect": defect},
+        "shell": {
+            "geometry": "hemisphere",
+            "radius_to_thickness": 90,
+            "poisson_ratio": 0.5,
+            "defect": defect,
+        },
         "boundary": {"equator": "clamped"},
         "magnetic": {"lambda_m": 1e-4},
         "loading": {"kind": "pressure", "until": "limit"},
@@ -52,7 +64,14 @@ def pixels(file: Path) -> np.ndarray:
 def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) -> None:
     """Without summary, as a killed run is: the same files with the same pixels."""
     there = {file.name for file in run.glob("*.png")}
-    wanted = {"shell.png", "curve.png", "magnetic_loads.png", "strains.png", "moments.png", "fields.png"}
+    wanted = {
+        "shell.png",
+        "curve.png",
+        "magnetic_loads.png",
+        "strains.png",
+        "moments.png",
+        "fields.png",
+    }
     assert there == wanted | {"instabilities.png"}
     again = copied(run, tmp_path, "*.png", "summary.json")
     assert set(draw(again)) == there
@@ -66,12 +85,20 @@ def test_whole_shells_of_a_half(tmp_path: Path) -> None:
         "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
         "boundary": {"rim": "clamped"},
         "symmetry": "half",
-        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-4, "points": 1},
+        "loading": {
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 1e-4,
+            "points": 1,
+        },
         "mesh": {"degree": 2, "refinement": 0.3},
         "output": {"whole": True},
     }
     ms.run(ms.Case.from_source(sections), tmp_path)
-    half, whole = (pyvista.get_reader(tmp_path / f"fields/{name}.pvd") for name in ("path", "whole"))
+    half, whole = (
+        pyvista.get_reader(tmp_path / f"fields/{name}.pvd") for name in ("path", "whole")
+    )
     assert half.time_values == whole.time_values == [0.0, 1e-4]
     for reader, share in ((half, 0.5), (whole, 1.0)):
         reader.set_active_time_value(1e-4)
@@ -106,7 +133,12 @@ def test_another_point(run: Path, tmp_path: Path) -> None:
 def test_a_turning_field(tmp_path: Path) -> None:
     """Its amplitudes are NumPy's numbers, whose repr no reader of path.csv understands."""
     sections = {
-        "shell": {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0},
+        "shell": {
+            "geometry": "strip",
+            "radius_to_thickness": 100,
+            "width": 0.1,
+            "poisson_ratio": 0,
+        },
         "boundary": {"root": "clamped"},
         "magnetic": {"lambda_m": 3.3e-6, "remanent": {"polar": 90}, "applied": {"polar": 90}},
         "loading": {"kind": "rotation", "to": {"polar": 0}, "points": 1},
@@ -128,9 +160,14 @@ def test_nothing_there(tmp_path: Path, name: str) -> None:
 
 
 def test_frames_at_equal_times() -> None:
-    """Two steps in time, the second with rows ten times as close: as many frames to each unit of time."""
+    """Two steps in time, the second with rows ten times as close: as many frames to each unit of
+    time.
+    """
     times = [*range(1, 11), *(10 + 0.1 * i for i in range(1, 101))]
-    rows = [{"amplitude": "pressure", "time": 0.0}, *({"amplitude": "time", "time": t} for t in times)]
+    rows = [
+        {"amplitude": "pressure", "time": 0.0},
+        *({"amplitude": "time", "time": t} for t in times),
+    ]
     chosen = [row["time"] for row in in_true_time(rows)]
     assert len(chosen) == 40
     assert np.diff(chosen) == pytest.approx(np.full(39, 19 / 39), abs=1.0)
@@ -140,7 +177,9 @@ def test_frames_at_equal_times() -> None:
 
 @pytest.mark.slow
 def test_animation(run: Path, tmp_path: Path) -> None:
-    """A frame for every point of the pressure's path; what does not move has the same pixels in all."""
+    """A frame for every point of the pressure's path; what does not move has the same pixels in
+    all.
+    """
     again = copied(run, tmp_path)
     assert draw_animation(again) == "animation.gif"
     content = (again / "animation.gif").read_bytes()
@@ -160,7 +199,9 @@ def test_animation(run: Path, tmp_path: Path) -> None:
 
 
 def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
-    """The labels say in what the cases differ; marks and lines of each; curves over other quantities are refused."""
+    """The labels say in what the cases differ; marks and lines of each; curves over other
+    quantities are refused.
+    """
     again = copied(run, tmp_path)
     summary = again / "summary.json"
     summary.write_text(summary.read_text().replace('"lambda_m": 0.0001', '"lambda_m": 0.0002'))
@@ -181,14 +222,26 @@ def test_runs_in_one_picture(run: Path, tmp_path: Path) -> None:
 
 
 def test_what_sensors_read_is_a_curve(run: Path) -> None:
-    """In mT over the load, through the values of path.csv in T; a component that is zero has no line."""
+    """In mT over the load, through the values of path.csv in T; a component that is zero has no
+    line.
+    """
     rows = read_rows(run / "path.csv")
-    read = [row | {"hall_Bx": 1e-12, "hall_By": -2e-3, "hall_Bz": 1e-3 * float(row["p_over_pc"])} for row in rows]
+    read = [
+        row | {"hall_Bx": 1e-12, "hall_By": -2e-3, "hall_Bz": 1e-3 * float(row["p_over_pc"])}
+        for row in rows
+    ]
     case = {"sensors": {"hall": {}}, "magnetic": {"remanent": {"flux_density": 0.08}}}
     (axes,) = readings_figure(read, "pressure", case, OutputSection()).axes
-    assert (axes.get_xlabel(), axes.get_ylabel()) == (r"pressure  $p/p_\mathrm{c}$", "field at hall  (mT)")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (
+        r"pressure  $p/p_\mathrm{c}$",
+        "field at hall  (mT)",
+    )
     assert axes.get_legend_handles_labels()[1] == ["fold", "$B_y$", "$B_z$"]
-    last = [line.get_xydata()[-1] for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xydata()) > 2]
+    last = [
+        line.get_xydata()[-1]
+        for line in axes.lines
+        if line.get_linestyle() == "-" and len(line.get_xydata()) > 2
+    ]
     load = float(rows[-1]["p_over_pc"])
     assert np.array(last) == pytest.approx(np.array([[load, -2.0], [load, load]]))
 
@@ -197,10 +250,15 @@ def test_a_displacement_by_rounding_is_no_curve(run: Path) -> None:
     """A step in which nothing moves, and one in which it does a little, before the path."""
     (path,) = worth_drawing(drawn_parts(read_rows(run / "path.csv"), "pressure"))
     still, little = (
-        replace(path, rows=[{**row, "volume_change": size * i**2} for i, row in enumerate(path.rows)])
+        replace(
+            path, rows=[{**row, "volume_change": size * i**2} for i, row in enumerate(path.rows)]
+        )
         for size in (1e-17, 1e-9)
     )
-    assert [part.rows[-1] for part in worth_drawing([still, little, path])] == [little.rows[-1], path.rows[-1]]
+    assert [part.rows[-1] for part in worth_drawing([still, little, path])] == [
+        little.rows[-1],
+        path.rows[-1],
+    ]
 
 
 def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
@@ -225,7 +283,9 @@ def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(0.26, 0.1), (0.1, 0.34)])
 def test_a_shell_beside_a_curve_covers_nothing(size: tuple[float, float]) -> None:
-    """Wide or tall, five of them at points of a wave: within the axes, beside the curve and beside each other."""
+    """Wide or tall, five of them at points of a wave: within the axes, beside the curve and beside
+    each other.
+    """
     figure = Figure()
     axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
     x = np.linspace(0, 1, 400)

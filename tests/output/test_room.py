@@ -18,7 +18,14 @@ from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.colours import contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel
 from magshell_fenicsx.output.pictures.picture import figures
-from magshell_fenicsx.output.pictures.view import Camera, Window, deflected_place, near_outlines, run_camera, towards
+from magshell_fenicsx.output.pictures.view import (
+    Camera,
+    Window,
+    deflected_place,
+    near_outlines,
+    run_camera,
+    towards,
+)
 from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
@@ -30,12 +37,16 @@ def grid(n: int = 41) -> Surface:
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
     r = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    cells = np.concatenate([np.column_stack([a, a + 1, a + n + 1]), np.column_stack([a, a + n + 1, a + n])])
+    cells = np.concatenate(
+        [np.column_stack([a, a + 1, a + n + 1]), np.column_stack([a, a + n + 1, a + n])]
+    )
     return Surface(r, 0 * r, np.tile([0.0, 0, 1], (len(r), 1)), cells, {})
 
 
 def test_numbers_cover_no_other_numbers_and_no_marks() -> None:
-    """Of forty marks, half of them crowded; those without room are left out, all others are inside the axes."""
+    """Of forty marks, half of them crowded; those without room are left out, all others are inside
+    the axes.
+    """
     figure = Figure(figsize=(3.5, 2.6), dpi=100)
     axes = figure.subplots()
     x = np.concatenate([np.linspace(0, 0.1, 20), np.linspace(0.15, 1, 20)])
@@ -43,7 +54,9 @@ def test_numbers_cover_no_other_numbers_and_no_marks() -> None:
     marks = [((float(v), float(1 / (1 + 20 * v))), str(i)) for i, v in enumerate(x, 1)]
     write_numbers(axes, marks, [np.array([x, 1 / (1 + 20 * x)])])
     renderer = FigureCanvasAgg(figure).get_renderer()
-    boxes = [text.get_window_extent(renderer).expanded(1.0, 0.7) for text in axes.texts]  # digits have no tails
+    boxes = [
+        text.get_window_extent(renderer).expanded(1.0, 0.7) for text in axes.texts
+    ]  # digits have no tails
     assert 20 < len(boxes) < 40
     assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     at = axes.transData.transform(np.array([place for place, _ in marks]))
@@ -53,7 +66,9 @@ def test_numbers_cover_no_other_numbers_and_no_marks() -> None:
 
 
 def test_a_source_is_drawn_whole_or_not_at_all() -> None:
-    """A cylinder of two circles, one beyond the picture, and a line that joins them; a ring that is near."""
+    """A cylinder of two circles, one beyond the picture, and a line that joins them; a ring that is
+    near.
+    """
     t = np.linspace(0, 2 * np.pi, 49)
     circle = np.column_stack([np.cos(t), np.sin(t), 0 * t])
     up = np.array([0.0, 0, 1])
@@ -61,18 +76,25 @@ def test_a_source_is_drawn_whole_or_not_at_all() -> None:
     joining = np.linspace(near[12], far[12], 2)
     surface = grid(3)
     drawn = near_outlines(
-        Surface(*(vars(surface)[k] for k in ("r0", "u", "n0", "cells", "fields")), (near, far, joining, ring))
+        Surface(
+            *(vars(surface)[k] for k in ("r0", "u", "n0", "cells", "fields")),
+            (near, far, joining, ring),
+        )
     )
     assert [line is ring for line in drawn] == [True]
 
 
 @pytest.mark.parametrize(("farther", "drawn"), [(0.0, True), (1.0, False)])
 def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
-    """That of the case: drawn, with a camera for which the shell fills more of the picture than for the usual one."""
+    """That of the case: drawn, with a camera for which the shell fills more of the picture than for
+    the usual one.
+    """
     flat = grid(9)
     r0 = np.column_stack([(flat.r0[:, 0] + 1) / 2, flat.r0[:, 1] / 12, flat.r0[:, 2]])
     lift = 0.18 * r0[:, :1] ** 2 * [0, 0, 1]
-    lines = outlines(make_problem(Case.load(CASES / "magnet_past_strip.yaml")).loads, {"source": 0.0}, 0.0)
+    lines = outlines(
+        make_problem(Case.load(CASES / "magnet_past_strip.yaml")).loads, {"source": 0.0}, 0.0
+    )
     lines = tuple(line + np.array([farther, 0, 0]) for line in lines)
     surface = Surface(r0, lift, flat.n0, flat.cells, {}, lines)
     assert len(near_outlines(surface)) == (len(lines) if drawn else 0)
@@ -86,7 +108,9 @@ def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
 def test_a_small_contact_is_drawn_large(radius: float, alone: bool) -> None:
     surface = grid()
     distance = np.linalg.norm(surface.r0, axis=1)
-    surface.fields.update(gap_over_h=np.where(distance < radius, 0.5, 9.0), contact_pressure=1.0 * (distance < radius))
+    surface.fields.update(
+        gap_over_h=np.where(distance < radius, 0.5, 9.0), contact_pressure=1.0 * (distance < radius)
+    )
     assert (contact_region(surface) is not None) == alone
     figure = figures(surface, 0.01, OutputSection(), ABOVE, ["contact"])["contact"]
     assert any("around the contact" in text.get_text() for text in figure.texts) == alone
@@ -107,10 +131,14 @@ def test_arrows_stay_in_their_panel() -> None:
 
 
 def test_moments_that_are_noise_are_pale() -> None:
-    """Smooth ones have colours up to their largest value; those that differ by 90 % from the cells' do not."""
+    """Smooth ones have colours up to their largest value; those that differ by 90 % from the cells'
+    do not.
+    """
     surface = grid()
     wave = 1e-5 * np.sin(3 * surface.r0[:, 0])
     surface.fields.update(M_1=wave, M_2=0 * wave)
-    smooth, noise = (moments(replace(surface, jump=jump), 0.01)[0][0].limits[1] for jump in (1e-3, 0.9))
+    smooth, noise = (
+        moments(replace(surface, jump=jump), 0.01)[0][0].limits[1] for jump in (1e-3, 0.9)
+    )
     assert smooth == pytest.approx(np.abs(wave).max())
     assert noise > 10 * np.sqrt(np.mean(wave**2))

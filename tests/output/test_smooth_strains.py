@@ -1,4 +1,6 @@
-"""Smooth strains and moments: nearer to exact fields than those of cells are, with true jumps alone."""
+"""Smooth strains and moments: nearer to exact fields than those of cells are, with true jumps
+alone.
+"""
 
 from typing import Any
 
@@ -33,15 +35,23 @@ def unmoved(scene: Scene, **mu: float) -> Any:
 
 @pytest.mark.parametrize("dimensions", [1, 2])
 def test_polynomials_are_recovered_exactly(dimensions: int) -> None:
-    """Of the fitted degree, from three samples in each cell, also at the ends of cells on the border."""
+    """Of the fitted degree, from three samples in each cell, also at the ends of cells on the
+    border.
+    """
     if dimensions == 1:
         x = np.linspace(0, 1, 7)[:, None] ** 1.5
         cells = np.column_stack([np.arange(6), np.arange(1, 7)])
     else:
-        x = np.array([[i, k] for i in range(5) for k in range(5)]) + 0.2 * np.random.default_rng(1).random((25, 2))
+        x = np.array([[i, k] for i in range(5) for k in range(5)]) + 0.2 * np.random.default_rng(
+            1
+        ).random((25, 2))
         lower = np.array([5 * i + k for i in range(4) for k in range(4)])[:, None]
         cells = np.concatenate([lower + np.array(three) for three in ([0, 5, 6], [0, 6, 1])])
-    inside = 0.2 + 0.4 * np.eye(dimensions + 1) if dimensions == 2 else np.array([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
+    inside = (
+        0.2 + 0.4 * np.eye(dimensions + 1)
+        if dimensions == 2
+        else np.array([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
+    )
     samples = np.einsum("qv,mvk->mqk", inside, x[cells])
     frames = np.tile(np.eye(dimensions), (len(x), 1, 1))
     recovery = Recovery(cells, samples, np.ones(samples.shape[:2]), x, frames, 2)
@@ -49,7 +59,10 @@ def test_polynomials_are_recovered_exactly(dimensions: int) -> None:
     def field(places: Array) -> Array:
         return np.asarray(1 + places[..., 0] ** 2 - 3 * places[..., 0] * places[..., -1])
 
-    cell, corners = np.repeat(np.arange(len(cells)), dimensions + 1), x[cells].reshape(-1, dimensions)
+    cell, corners = (
+        np.repeat(np.arange(len(cells)), dimensions + 1),
+        x[cells].reshape(-1, dimensions),
+    )
     to_corners = recovery.at(cell, corners, np.tile(np.eye(dimensions + 1), (len(cells), 1)))
     found = to_corners @ recovery.coefficients(field(samples))
     assert found[:, 0] == pytest.approx(field(corners), abs=1e-9)
@@ -73,12 +86,26 @@ def clamped_ring(r: Array, a: float) -> tuple[Array, Array]:
 
 
 def moment_errors(refinement: float) -> tuple[float, float]:
-    """Errors (rms) of the recovered moments and of the means of the cells' at nodes, over the largest moment."""
-    ring = {"geometry": "annulus", "radius": 1, "inner_radius": 0.4, "thickness": 0.02, "poisson_ratio": NU}
+    """Errors (rms) of the recovered moments and of the means of the cells' at nodes, over the
+    largest moment.
+    """
+    ring = {
+        "geometry": "annulus",
+        "radius": 1,
+        "inner_radius": 0.4,
+        "thickness": 0.02,
+        "poisson_ratio": NU,
+    }
     scene = scene_of(
         shell=ring,
         boundary={"inner": "clamped", "outer": "clamped"},
-        loading={"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-9, "points": 1},
+        loading={
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 1e-9,
+            "points": 1,
+        },
         mesh={"degree": 3, "refinement": refinement},
         symmetry="none",
     )
@@ -101,14 +128,20 @@ def moment_errors(refinement: float) -> tuple[float, float]:
 
 def means_of_cells(shell: SurfaceGatherer, u: Array) -> Array:
     """M/D = (1 - nu) K + nu tr K of each cell at its nodes, averaged there."""
-    frame = PointFields(shell._jet(shell._model.r0, shell._places), shell._model.material, None, None)._frame
+    frame = PointFields(
+        shell._jet(shell._model.r0, shell._places), shell._model.material, None, None
+    )._frame
     K = frame.tensor(frame.curvature_change(shell._jet(shell._model.u, shell._places)))
     flat = np.diag([1.0, 1.0, 0.0])
-    return shell._averaged((1 - NU) * K + NU * np.trace(K, axis1=-2, axis2=-1)[..., None, None] * flat)
+    return shell._averaged(
+        (1 - NU) * K + NU * np.trace(K, axis1=-2, axis2=-1)[..., None, None] * flat
+    )
 
 
 def test_recovered_moments_are_nearer_to_the_exact_ones() -> None:
-    """A ring under pressure, whose deflection is no polynomial: better on both meshes, and more so on the finer one."""
+    """A ring under pressure, whose deflection is no polynomial: better on both meshes, and more so
+    on the finer one.
+    """
     (coarse, its_means), (fine, finer_means) = moment_errors(1.0), moment_errors(2.0)
     assert coarse < 0.8 * its_means
     assert fine < 0.65 * finer_means
@@ -116,7 +149,9 @@ def test_recovered_moments_are_nearer_to_the_exact_ones() -> None:
 
 
 def test_fields_jump_between_patches() -> None:
-    """A flat cross held flat: M = -D (1 + nu) kappa on one arm, zero elsewhere, at the seam both; |Br| is 1 or 0."""
+    """A flat cross held flat: M = -D (1 + nu) kappa on one arm, zero elsewhere, at the seam both;
+    |Br| is 1 or 0.
+    """
     grown = "loading={kind: natural, curvature: 1}", "natural={curvature: {east: [400, 400, 0]}}"
     scene = scene_of("gripper.yaml", *grown, "symmetry=none")
     found = unmoved(scene, natural_curvature=1.0)
@@ -125,7 +160,9 @@ def test_fields_jump_between_patches() -> None:
     size = -0.4 * (1 + scene.problem.context.shell.poisson_ratio)  # R is 1 mm
     assert M[held] == pytest.approx(size)
     assert found.fields["M_1"][held] == pytest.approx(size)
-    seam = {tuple(x) for x in np.round(found.r0[held], 9)} & {tuple(x) for x in np.round(found.r0[~held], 9)}
+    seam = {tuple(x) for x in np.round(found.r0[held], 9)} & {
+        tuple(x) for x in np.round(found.r0[~held], 9)
+    }
     assert len(seam) > 2
     Br = np.linalg.norm(found.fields["Br"], axis=1)
     assert ((np.abs(Br - 1) < 1e-9) | (Br < 1e-9)).all()
@@ -151,11 +188,15 @@ def test_a_meridian_has_two_circles_where_the_remanence_jumps() -> None:
 
 
 def test_parts_are_apart_at_jumps_and_kinks_alone() -> None:
-    """Four squares in a row: a jump of a field, then a normal that turns by 10 degrees, then one that turns by 60."""
+    """Four squares in a row: a jump of a field, then a normal that turns by 10 degrees, then one
+    that turns by 60.
+    """
     corners = np.array([[2 * i, 2 * i + 2, 2 * i + 1, 2 * i + 3] for i in range(4)])
     sides = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
     angles = np.radians([0.0, 0, 10, 70])
-    normals = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])[:, None].repeat(4, axis=1)
+    normals = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])[:, None].repeat(
+        4, axis=1
+    )
     given = np.array([1.0, 2, 2, 2])[:, None].repeat(4, axis=1)
     assert smooth_parts(corners, sides, [given, normals], normals).tolist() == [0, 1, 1, 2]
     assert len(np.unique(split(corners, np.array([0, 1, 1, 2])))) == 10 + 2 + 2

@@ -1,4 +1,6 @@
-"""A case with units: its columns, its sentence, and that every number of its report stands in a file."""
+"""A case with units: its columns, its sentence, and that every number of its report stands in a
+file.
+"""
 
 import csv
 import json
@@ -28,7 +30,13 @@ NUMBER = r"[−-]?\d+(?:\.\d+)?(?:e[−-]?\d+)?"
 def written(folder: Path, shell: str, magnetic: str, loading: str) -> Path:
     file = folder / "case.yaml"
     boundary, mesh = "boundary: {equator: clamped}", "mesh: {degree: 3, refinement: 0.5}"
-    parts = (f"shell: {SHELL % shell}", boundary, f"magnetic: {magnetic}", f"loading: {loading}", mesh)
+    parts = (
+        f"shell: {SHELL % shell}",
+        boundary,
+        f"magnetic: {magnetic}",
+        f"loading: {loading}",
+        mesh,
+    )
     file.write_text("\n".join(parts) + "\n", encoding="utf-8")
     return file
 
@@ -46,7 +54,11 @@ def buckled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 def test_columns_in_units(buckled: tuple[Path, str]) -> None:
     """Against p_c, h and R³ by hand; the dimensionless columns stay."""
     folder, _ = buckled
-    last = {key: float(v) for key, v in read_path(folder)[-1].items() if key not in ("label", "amplitude", "mode")}
+    last = {
+        key: float(v)
+        for key, v in read_path(folder)[-1].items()
+        if key not in ("label", "amplitude", "mode")
+    }
     assert last["pressure_Pa"] == pytest.approx(last["p_over_pc"] * P_C, rel=1e-12)
     assert last["applied_mT"] == pytest.approx(-20, rel=1e-12)
     assert last["w_mm"] == pytest.approx(last["w_over_h"] * 0.32, rel=1e-12)
@@ -63,10 +75,14 @@ def test_summary_and_final_line_in_units(buckled: tuple[Path, str]) -> None:
     assert found["limit_points"][0]["pressure_Pa"] == pytest.approx(buckling, rel=1e-12)
     *_, results, sentence = printed.splitlines()
     assert results.startswith("results in ")
-    said = r"The shell buckles .* k_d = p/p_c = [\d.]+ \([\d.]+ Pa\): a fold, w = .* mm at the pole\."
+    said = (
+        r"The shell buckles .* k_d = p/p_c = [\d.]+ \([\d.]+ Pa\): a fold, w = .* mm at the pole\."
+    )
     assert re.fullmatch(said, sentence)
     assert float(sentence.split("(")[1].split(" Pa")[0]) == pytest.approx(buckling, rel=1e-5)
-    assert not re.search(r"(?<![\w/])-0(\.0*)?(?![.\d])", printed)  # a folder may be called pytest-0
+    assert not re.search(
+        r"(?<![\w/])-0(\.0*)?(?![.\d])", printed
+    )  # a folder may be called pytest-0
 
 
 def numbers_in(part: Any) -> Iterator[float]:
@@ -105,11 +121,16 @@ SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modu
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            "cylinder_waves", ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"], marks=pytest.mark.slow
+            "cylinder_waves",
+            ["mesh.refinement=0.4", "symmetry=half", "stability={modes: 2}"],
+            marks=pytest.mark.slow,
         ),
         ("gripper", ["mesh={degree: 2}"]),
         pytest.param("rod_contact", ["mesh={degree: 2, refinement: 0.4}"], marks=pytest.mark.slow),
-        ("dimple_buckling", [f"shell={SPHERE % DIMPLE}", "symmetry=half", "mesh={degree: 2, refinement: 0.4}"]),
+        (
+            "dimple_buckling",
+            [f"shell={SPHERE % DIMPLE}", "symmetry=half", "mesh={degree: 2, refinement: 0.4}"],
+        ),
         pytest.param(
             "dimple_buckling",
             [
@@ -124,14 +145,20 @@ SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modu
 def test_numbers_of_other_reports(name: str, settings: list[str], tmp_path: Path) -> None:
     """A field, waves, a mesh from a file, contact, places of modes, sensitivities and gradients."""
     done = magshell(
-        "run", CASES / f"{name}.yaml", *(w for s in settings for w in ("--set", s)), "--out", tmp_path, "--no-pictures"
+        "run",
+        CASES / f"{name}.yaml",
+        *(w for s in settings for w in ("--set", s)),
+        "--out",
+        tmp_path,
+        "--no-pictures",
     )
     assert done.returncode == 0, done.stderr
     assert whole_report(tmp_path) > 15
 
 
 def whole_report(folder: Path) -> int:
-    """See that numbers of the path table are in path.csv, in the row of the point, all others in summary.json too.
+    """See that numbers of the path table are in path.csv, in the row of the point, all others in
+    summary.json too.
 
     Returns the number of these others.
     """
@@ -144,7 +171,10 @@ def whole_report(folder: Path) -> int:
         rows = [set(numbers_in(row)) for row in csv.DictReader(stream)]
     summary = set(numbers_in(json.loads((folder / "summary.json").read_text(encoding="utf-8"))))
     heads = re.findall(r"<th.*?</th>", table, flags=re.DOTALL)
-    powers = [int(p[1].replace("−", "-")) if (p := re.search(r"10<sup>(−?\d+)</sup>", each)) else 0 for each in heads]
+    powers = [
+        int(p[1].replace("−", "-")) if (p := re.search(r"10<sup>(−?\d+)</sup>", each)) else 0
+        for each in heads
+    ]
     lines = [re.findall(r"<td.*?>(.*?)</td>", line) for line in table.split("<tr>")[2:]]
     assert len(lines) == len(rows) > 1
     for cells, known in zip(lines, rows, strict=True):
@@ -165,23 +195,44 @@ def test_forces_and_their_axes(tmp_path: Path) -> None:
     last = read_path(tmp_path / "out")[-1]
     unit = 2 * pi * E * H**3 / (12 * (1 - NU**2)) / R
     assert float(last["force_N"]) == pytest.approx(float(last["force"]) * unit, rel=1e-12)
-    assert [axis.label for axis in axes_of("force", last)] == ["displacement at the load  $w$  (mm)", "force  $F$  (N)"]
+    assert [axis.label for axis in axes_of("force", last)] == [
+        "displacement at the load  $w$  (mm)",
+        "force  $F$  (N)",
+    ]
     assert done.stdout.splitlines()[-1].endswith(" N), w = 0.32 mm at the load.")
 
 
 def test_sign_of_the_field_and_strength_of_sources() -> None:
-    """A remanence of the other sign turns lambda_m, not the applied field; magnets have a strength of 100 %."""
+    """A remanence of the other sign turns lambda_m, not the applied field; magnets have a strength
+    of 100 %.
+    """
 
     def full(magnetic: dict[str, Any]) -> tuple[float, str]:
-        shell = {"geometry": "hemisphere", "radius": "25.2 mm", "thickness": "0.32 mm", "youngs_modulus": "1.8 MPa"}
-        data = {"shell": shell | {"poisson_ratio": 0.5}, "boundary": {"equator": "clamped"}, "magnetic": magnetic}
+        shell = {
+            "geometry": "hemisphere",
+            "radius": "25.2 mm",
+            "thickness": "0.32 mm",
+            "youngs_modulus": "1.8 MPa",
+        }
+        data = {
+            "shell": shell | {"poisson_ratio": 0.5},
+            "boundary": {"equator": "clamped"},
+            "magnetic": magnetic,
+        }
         case = Case.from_source(Source("units", data))
         sizes = sizes_of(case.context)
         return case.lambda_m * sizes.of["λ_m"], sizes.field
 
-    value, unit = full({"remanent": {"flux_density": "-63 mT"}, "applied": {"flux_density": "20 mT"}})
+    value, unit = full(
+        {"remanent": {"flux_density": "-63 mT"}, "applied": {"flux_density": "20 mT"}}
+    )
     assert (pytest.approx(value), unit) == (20, "mT")
-    magnet = {"kind": "sphere", "diameter": "10 mm", "polarization": "1 T", "position": ["0 mm", "0 mm", "-40 mm"]}
+    magnet = {
+        "kind": "sphere",
+        "diameter": "10 mm",
+        "polarization": "1 T",
+        "position": ["0 mm", "0 mm", "-40 mm"],
+    }
     value, unit = full({"remanent": {"flux_density": "63 mT"}, "applied": {"sources": [magnet]}})
     assert (pytest.approx(value), unit) == (100, "%")
 
@@ -193,5 +244,7 @@ def test_names_of_columns_in_units_are_taken() -> None:
         "bodies": {"N": {"kind": "plane"}},
         "loading": {"kind": "contact", "approach": 1},
     }
-    with pytest.raises(CaseError, match=r"bodies\.N: is taken, by columns in this unit; choose another name"):
+    with pytest.raises(
+        CaseError, match=r"bodies\.N: is taken, by columns in this unit; choose another name"
+    ):
         Case.from_source(Source("units", data))

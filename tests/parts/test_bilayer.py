@@ -1,4 +1,7 @@
-"""The bilayer of docs/howto.md against Timoshenko's bimetal, J. Opt. Soc. Am. 11 (1925), 233-255."""
+"""The bilayer of docs/howto.md against Timoshenko's bimetal, J.
+
+Opt. Soc. Am. 11 (1925), 233-255.
+"""
 
 import re
 from typing import Any
@@ -10,12 +13,16 @@ from conftest import CASES
 
 @pytest.mark.slow
 def test_the_bilayer_of_the_howto() -> None:
-    """Its curvature is 6 (a2 - a1) (1 + m)^2 / (h (3 (1 + m)^2 + (1 + m n)(m^2 + 1/(m n)))), m = h1/h2, n = E1/E2.
+    """Its curvature is 6 (a2 - a1) (1 + m)^2 / (h (3 (1 + m)^2 + (1 + m n)(m^2 + 1/(m n)))), m =
+    h1/h2, n = E1/E2.
 
-    The strip's radius is that of the circle through three of its points, away from the root that holds its width.
+    The strip's radius is that of the circle through three of its points, away from the root that
+    holds its width.
     """
     page = (CASES.parent / "docs/howto.md").read_text(encoding="utf-8")
-    (program,) = (code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "plies" in code)
+    (program,) = (
+        code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "plies" in code
+    )
     found: dict[str, Any] = {}
     exec(program, found)
     m, n = 0.6 / 0.4, 1 / 3

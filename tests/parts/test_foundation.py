@@ -1,4 +1,6 @@
-"""Shells on a Winkler foundation: beams and plates in closed form, every model, and what a case says of it."""
+"""Shells on a Winkler foundation: beams and plates in closed form, every model, and what a case
+says of it.
+"""
 
 from math import pi
 from typing import Any
@@ -32,16 +34,22 @@ def end(case: ms.Case) -> dict[str, float]:
 
 
 def test_plate_under_a_force() -> None:
-    """Hertz 1884, in Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, section 57: w0 = F l^2/(8 D)."""
+    """Hertz 1884, in Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, section 57: w0
+    = F l^2/(8 D).
+    """
     case = ms.Case.load(CASES / "foundation.yaml")
     found, l_over_R, force = end(case), 1 / 12, 1e-4
-    assert case.foundation.terms(case.context.scales)[0].value == pytest.approx(1e-4 / (12 * 0.91) / l_over_R**4, 1e-6)
+    assert case.foundation.terms(case.context.scales)[0].value == pytest.approx(
+        1e-4 / (12 * 0.91) / l_over_R**4, 1e-6
+    )
     assert found["w_over_h"] == pytest.approx(2 * pi * force * l_over_R**2 / 8 * 100, rel=1e-5)
     assert found["foundation_force"] == pytest.approx(force, rel=2e-3)  # the rim takes the rest
 
 
 def beam(beta: float) -> tuple[dict[str, float], float, float]:
-    """Half of a strip on a foundation under a line load P: what is observed, w at the load in closed form, and P/2."""
+    """Half of a strip on a foundation under a line load P: what is observed, w at the load in
+    closed form, and P/2.
+    """
     E, h, width, P = 3.0, 0.01, 0.1, 1e-10
     K = beta**4 * E * h**3 / 3  # beta^4 = K width/(4 E I), I = width h^3/12
     case = load(
@@ -81,11 +89,19 @@ def test_long_beam_under_a_force() -> None:
 
 
 @pytest.mark.parametrize(
-    ("symmetry", "refinement", "tolerance"), [pytest.param("half", 2, 2e-7, marks=pytest.mark.slow), ("none", 1, 2e-5)]
+    ("symmetry", "refinement", "tolerance"),
+    [pytest.param("half", 2, 2e-7, marks=pytest.mark.slow), ("none", 1, 2e-5)],
 )
 def test_the_same_in_every_shell(symmetry: str, refinement: float, tolerance: float) -> None:
-    """A clamped plate, on the meridian and on triangles; without a foundation it deflects 17 times as far."""
-    sections = {"shell": DISC, "boundary": {"rim": "clamped"}, "loading": PRESSED, "foundation": {"stiffness": 1e-3}}
+    """A clamped plate, on the meridian and on triangles; without a foundation it deflects 17 times
+    as far.
+    """
+    sections = {
+        "shell": DISC,
+        "boundary": {"rim": "clamped"},
+        "loading": PRESSED,
+        "foundation": {"stiffness": 1e-3},
+    }
     meridian = end(load(**sections, symmetry="axisymmetric"))
     whole = end(load(**sections, symmetry=symmetry, mesh={"refinement": refinement}))
     without = end(load(**{key: value for key, value in sections.items() if key != "foundation"}))
@@ -98,7 +114,12 @@ def test_the_same_in_every_shell(symmetry: str, refinement: float, tolerance: fl
 @pytest.mark.slow
 def test_under_a_solid() -> None:
     """On its outer face; it is more flexible than the shell by its shear, of order (h/R)^2."""
-    sections = {"shell": DISC, "boundary": {"rim": "clamped"}, "loading": PRESSED, "foundation": {"stiffness": 1e-3}}
+    sections = {
+        "shell": DISC,
+        "boundary": {"rim": "clamped"},
+        "loading": PRESSED,
+        "foundation": {"stiffness": 1e-3},
+    }
     shell, solid = (end(load(**sections, model=model)) for model in ("shell", "solid"))
     for name in ("w_pole_over_h", "foundation_force"):
         assert solid[name] == pytest.approx(shell[name], rel=0.01)
@@ -108,11 +129,19 @@ def test_under_a_solid() -> None:
 def test_tangent(symmetry: str) -> None:
     """Against central differences of the residual, and it grows with the stiffness."""
     mesh = {"degree": 2, "refinement": 0.5}
-    case = load(shell=DISC, boundary={"rim": "clamped"}, foundation={"stiffness": 0.3}, mesh=mesh, symmetry=symmetry)
+    case = load(
+        shell=DISC,
+        boundary={"rim": "clamped"},
+        foundation={"stiffness": 0.3},
+        mesh=mesh,
+        symmetry=symmetry,
+    )
     scene = ms.Scene(case)
     system, mu = scene.model.system, scene.unloaded().mu
     assert mu == {"foundation": pytest.approx(15.0)}
-    u, v = (system.held(1e-3 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
+    u, v = (
+        system.held(1e-3 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+    )
 
     def along(stiffness: float) -> np.ndarray:
         K = system.tangent(u, {"foundation": stiffness})
@@ -125,7 +154,9 @@ def test_tangent(symmetry: str) -> None:
     residuals = [system.residual(u + change * v, mu) for change in (step, -step)]
     slope = (residuals[0] - residuals[1]) / (2 * step)
     assert np.abs(along(15.0) - slope).max() < 1e-6 * np.abs(slope).max()
-    assert v @ along(30.0) - v @ along(15.0) == pytest.approx(v @ along(15.0) - v @ along(0.0), rel=1e-9)
+    assert v @ along(30.0) - v @ along(15.0) == pytest.approx(
+        v @ along(15.0) - v @ along(0.0), rel=1e-9
+    )
     assert v @ along(15.0) > v @ along(0.0)
 
 
@@ -133,7 +164,9 @@ def test_tangent(symmetry: str) -> None:
 def test_buckling_is_that_of_ones_own_energy() -> None:
     """The key of the case file and an `OwnTerm` with the same density."""
     case = ms.Case.load(CASES / "dimple_buckling.yaml", ["mesh.degree=3"])
-    key = case.model_validate(case.model_dump() | {"foundation": {"stiffness": 0.02 / case.shell.R_over_h}})
+    key = case.model_validate(
+        case.model_dump() | {"foundation": {"stiffness": 0.02 / case.shell.R_over_h}}
+    )
     density = key.foundation.terms(key.context.scales)[0].density
     scene = ms.Scene(case, terms=[ms.OwnTerm("springs", density, (1.0,), 0.02)])
     *_, last = ms.trace(scene, "pressure", first=0.1)
@@ -149,7 +182,9 @@ def test_units() -> None:
     lengths = {"radius": "20 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
     held = {"boundary": {"equator": "clamped"}}
     si = load(shell=sphere | lengths, foundation={"stiffness": "0.3 MPa/m"}, **held)
-    plain = load(shell=sphere | {"radius_to_thickness": 100}, foundation={"stiffness": 0.006}, **held)
+    plain = load(
+        shell=sphere | {"radius_to_thickness": 100}, foundation={"stiffness": 0.006}, **held
+    )
     terms = [case.foundation.terms(case.context.scales)[0] for case in (si, plain)]
     assert terms[0].value == pytest.approx(terms[1].value, rel=1e-12)
     assert terms[0].value == pytest.approx(0.6, rel=1e-12)
@@ -160,7 +195,10 @@ def test_check_and_labels() -> None:
     """Built or left out; its column is drawn with its symbol."""
     said = describe(load(shell=DISC, boundary={"rim": "clamped"}, foundation={"stiffness": 0.3}))
     assert "  Winkler foundation, k R²/(E h) = 15\n" in said.partition("left out:")[0]
-    assert "  foundation: none" in describe(load(shell=DISC, boundary={"rim": "clamped"})).partition("left out:")[2]
+    assert (
+        "  foundation: none"
+        in describe(load(shell=DISC, boundary={"rim": "clamped"})).partition("left out:")[2]
+    )
     assert quantity("foundation").label == "stiffness  $k R^2/(E h)$"
     assert quantity("foundation_force").html == "F<sub>k</sub> R/(2πD)"
 
@@ -187,7 +225,9 @@ def test_what_is_refused(foundation: dict[str, Any], shell: dict[str, Any], said
 
 
 def test_bar_on_springs_that_stiffen() -> None:
-    """A bar with k_t = k x/L is pulled at x = L: u'' = b³ x u, so that u is a sum of Airy's functions of b x."""
+    """A bar with k_t = k x/L is pulled at x = L: u'' = b³ x u, so that u is a sum of Airy's
+    functions of b x.
+    """
     h, pulled, b = 0.02, 1e-8, 2.0
     case = load(
         shell={
@@ -226,9 +266,11 @@ def test_bar_on_springs_that_stiffen() -> None:
     ],
 )
 def test_narrow_springs(y: float, r: float, model: str) -> None:
-    """Springs on a disc of radius r, and k everywhere: the energy of a unit of w is k (pi + A pi r²)/2.
+    """Springs on a disc of radius r, and k everywhere: the energy of a unit of w is k (pi + A pi
+    r²)/2.
 
-    On a plane through e3 they leave a half, elsewhere all of the plate; a meridian would not see them.
+    On a plane through e3 they leave a half, elsewhere all of the plate; a meridian would not see
+    them.
     """
     A = 1 / r**2
     factor = f"1 + {A}*(1 - sign((x - 0.31)**2 + (y - {y})**2 - {r}**2))/2"
@@ -247,7 +289,12 @@ def test_narrow_springs(y: float, r: float, model: str) -> None:
 
 
 def test_springs_of_negative_stiffness() -> None:
-    case = load(shell=DISC, boundary={"rim": "clamped"}, foundation={"tangential": 1, "factor": "x"}, loading=PRESSED)
+    case = load(
+        shell=DISC,
+        boundary={"rim": "clamped"},
+        foundation={"tangential": 1, "factor": "x"},
+        loading=PRESSED,
+    )
     with pytest.raises(ms.CaseError, match=r"foundation\.factor: .x.: is -"):
         make_problem(case)
 
@@ -258,7 +305,13 @@ FREE_DISC = {"shell": DISC, "boundary": {"rim": "free"}}
 @pytest.mark.parametrize("symmetry", ["axisymmetric", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_free_disc_on_springs(symmetry: str) -> None:
     """It is held by its springs alone, in equilibrium with a force: their reaction is the force."""
-    force = {"kind": "indentation", "at": {"polar": 0}, "control": "load", "until": "target", "force": 1e-3}
+    force = {
+        "kind": "indentation",
+        "at": {"polar": 0},
+        "control": "load",
+        "until": "target",
+        "force": 1e-3,
+    }
     springs = {"stiffness": 1e-3, "tangential": 1e-3}
     case = load(**FREE_DISC, foundation=springs, loading={**force, "points": 1}, symmetry=symmetry)
     assert "Winkler foundation" in describe(case)
@@ -266,7 +319,9 @@ def test_a_free_disc_on_springs(symmetry: str) -> None:
 
 
 def test_a_free_disc_on_springs_swings_as_a_rigid_body() -> None:
-    """Springs of k and k_t per area: omega^2 rho h is k_t along and around the disc, k across it and tilting."""
+    """Springs of k and k_t per area: omega^2 rho h is k_t along and around the disc, k across it
+    and tilting.
+    """
     R_over_h = DISC["radius_to_thickness"]
     springs = {"stiffness": 1e-4 / R_over_h, "tangential": 3e-4 / R_over_h}  # over E/R
     scene = ms.Scene(load(**FREE_DISC, foundation=springs, frequencies={}, symmetry="axisymmetric"))
@@ -277,6 +332,8 @@ def test_a_free_disc_on_springs_swings_as_a_rigid_body() -> None:
 
 
 def test_springs_along_the_normal_leave_a_disc_free_across() -> None:
-    case = load(**FREE_DISC, foundation={"stiffness": 1e-3}, loading=PRESSED, symmetry="axisymmetric")
+    case = load(
+        **FREE_DISC, foundation={"stiffness": 1e-3}, loading=PRESSED, symmetry="axisymmetric"
+    )
     with pytest.raises(MeshError, match=r"free to move along \(1, 0, 0\)"):
         ms.Scene(case)

@@ -29,7 +29,12 @@ def ended(case: Case) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     ("model", "symmetry", "tolerance"),
-    [("shell", "auto", 1e-3), ("shell", "half", 1e-3), ("shell", "none", 1e-3), ("solid", "half", 0.01)],
+    [
+        ("shell", "auto", 1e-3),
+        ("shell", "half", 1e-3),
+        ("shell", "none", 1e-3),
+        ("solid", "half", 0.01),
+    ],
 )
 def test_disc(model: str, symmetry: str, tolerance: float) -> None:
     """A clamped plate under q = ρ g h: w = q R⁴/(64 D) at its centre."""
@@ -45,15 +50,24 @@ def test_disc(model: str, symmetry: str, tolerance: float) -> None:
     assert make_problem(case).axisymmetric == (symmetry == "auto")
     row = ended(case)
     assert row["gravity"] == pytest.approx(g)
-    assert row["w_pole_over_h"] == pytest.approx(g * 12 * (1 - nu**2) * R_over_h**3 / 64, rel=tolerance)
+    assert row["w_pole_over_h"] == pytest.approx(
+        g * 12 * (1 - nu**2) * R_over_h**3 / 64, rel=tolerance
+    )
 
 
-@pytest.mark.parametrize(("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")])
+@pytest.mark.parametrize(
+    ("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")]
+)
 def test_hanging_strip(model: str, symmetry: str) -> None:
     """It hangs from its root: u = ρ g L²/(2 E) at its tip."""
     case = made(
         model=model,
-        shell={"geometry": "strip", "width": 0.1, "radius_to_thickness": 50.0, "poisson_ratio": 0.0},
+        shell={
+            "geometry": "strip",
+            "width": 0.1,
+            "radius_to_thickness": 50.0,
+            "poisson_ratio": 0.0,
+        },
         boundary={"root": "clamped"},
         points={"tip_middle": [1, 0, 0]},
         loading={"kind": "gravity", "direction": [2, 0, 0], "acceleration": 1e-3, "points": 1},
@@ -80,10 +94,17 @@ def test_thickness_that_varies() -> None:
 
 
 def test_greenhill() -> None:
-    """A clamped column buckles at ρ g L³ 12/(E h²) = 9/4 of the squared first zero of J₋⅓ (Greenhill 1881)."""
+    """A clamped column buckles at ρ g L³ 12/(E h²) = 9/4 of the squared first zero of J₋⅓
+    (Greenhill 1881).
+    """
     zero = brentq(lambda t: jv(-1 / 3, t), 1.5, 2.2)
     case = made(
-        shell={"geometry": "strip", "width": 0.1, "radius_to_thickness": 100.0, "poisson_ratio": 0.0},
+        shell={
+            "geometry": "strip",
+            "width": 0.1,
+            "radius_to_thickness": 100.0,
+            "poisson_ratio": 0.0,
+        },
         boundary={"root": "clamped"},
         loading={"kind": "gravity", "direction": [-1, 0, 0], "until": "bifurcation"},
     )
@@ -92,28 +113,53 @@ def test_greenhill() -> None:
 
 @pytest.mark.slow
 def test_fold_from_two_sides() -> None:
-    """A heavy cap under pressure: the fold by the weight at p is the fold by the pressure at that weight."""
-    pressed = {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.2, "points": 2}
+    """A heavy cap under pressure: the fold by the weight at p is the fold by the pressure at that
+    weight.
+    """
+    pressed = {
+        "kind": "pressure",
+        "until": "target",
+        "control": "load",
+        "pressure": 0.2,
+        "points": 2,
+    }
 
     def fold(*steps: dict[str, Any]) -> dict[str, float]:
-        scene = ms.Scene(made(shell=CAP, boundary={"rim": "hinged"}, symmetry="axisymmetric", loading=list(steps)))
+        scene = ms.Scene(
+            made(
+                shell=CAP, boundary={"rim": "hinged"}, symmetry="axisymmetric", loading=list(steps)
+            )
+        )
         (record,) = [each for each in ms.follow(scene) if each.label == "fold"]
         return scene.observe(record.point.state)
 
     found = fold(pressed, {"kind": "gravity", "until": "limit"})
     weight = {"kind": "gravity", "acceleration": found["gravity"], "points": 4}
     assert found["gravity"] > 0
-    assert fold(weight, {"kind": "pressure", "until": "limit"})["p_over_pc"] == pytest.approx(0.2, rel=1e-4)
+    assert fold(weight, {"kind": "pressure", "until": "limit"})["p_over_pc"] == pytest.approx(
+        0.2, rel=1e-4
+    )
 
 
 def test_two_directions_add_up() -> None:
-    """Two steps along e1 and -e3 end where one along their sum does; the first is held, and each has its unit."""
+    """Two steps along e1 and -e3 end where one along their sum does; the first is held, and each
+    has its unit.
+    """
     disc = {"geometry": "disc", "radius": "0.1 m", "thickness": "1 mm", "youngs_modulus": "2 GPa"}
     disc |= {"poisson_ratio": 0.3, "density": "1100 kg/m^3"}
-    common: dict[str, Any] = {"shell": disc, "boundary": {"rim": "clamped"}, "points": {"here": ["50 mm", 0, 0]}}
+    common: dict[str, Any] = {
+        "shell": disc,
+        "boundary": {"rim": "clamped"},
+        "points": {"here": ["50 mm", 0, 0]},
+    }
 
     def step(direction: list[float], acceleration: str) -> dict[str, Any]:
-        return {"kind": "gravity", "direction": direction, "acceleration": acceleration, "points": 1}
+        return {
+            "kind": "gravity",
+            "direction": direction,
+            "acceleration": acceleration,
+            "points": 1,
+        }
 
     apart = made(**common, loading=[step([3, 0, 0], "3 m/s^2"), step([0, 0, -1], "4 m/s^2")])
     scene = ms.Scene(apart)
@@ -158,16 +204,29 @@ def test_history() -> None:
     assert rows[-2:] == pytest.approx([2e-6, 3e-6])
 
 
-@pytest.mark.parametrize("factor", [None, pytest.param("exp(0.6*x + 0.8*y)", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "factor", [None, pytest.param("exp(0.6*x + 0.8*y)", marks=pytest.mark.slow)]
+)
 def test_a_half_beside_the_first_axis(factor: str | None) -> None:
-    """Gravity across the axis of a disc chooses the plane of the half, also on a bed that varies in this plane."""
+    """Gravity across the axis of a disc chooses the plane of the half, also on a bed that varies in
+    this plane.
+    """
     sections: dict[str, Any] = {
         "shell": {"geometry": "disc", "radius_to_thickness": 50.0, "poisson_ratio": 0.3},
         "boundary": {"rim": "hinged"},
-        "loading": {"kind": "gravity", "direction": [0.6, 0.8, -1], "acceleration": 1e-5, "points": 1},
+        "loading": {
+            "kind": "gravity",
+            "direction": [0.6, 0.8, -1],
+            "acceleration": 1e-5,
+            "points": 1,
+        },
         "points": {"here": [0.3, 0.4, 0], "there": [0.0, 0.0, 0.0]},
         "mesh": {"size": 0.25},
-        "foundation": {"stiffness": 1e-4, "tangential": 0.01, **({"factor": factor} if factor else {})},
+        "foundation": {
+            "stiffness": 1e-4,
+            "tangential": 0.01,
+            **({"factor": factor} if factor else {}),
+        },
     }
     half, whole = (made(**sections, symmetry=symmetry) for symmetry in ("auto", "none"))
     assert make_problem(half).half

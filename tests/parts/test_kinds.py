@@ -1,4 +1,6 @@
-"""The kinds of bodies, imperfections and sources: every file is in the list, and lengths are found by their types."""
+"""The kinds of bodies, imperfections and sources: every file is in the list, and lengths are found
+by their types.
+"""
 
 from importlib import import_module
 from pathlib import Path
@@ -18,8 +20,16 @@ PARTS = "magshell_fenicsx.parts"
 
 def kinds_of(module: str) -> set[str]:
     """The kinds of the sections that a module defines."""
-    own = [each for each in vars(import_module(module)).values() if getattr(each, "__module__", "") == module]
-    fields = [each.model_fields.get("kind") for each in own if isinstance(each, type) and issubclass(each, Section)]
+    own = [
+        each
+        for each in vars(import_module(module)).values()
+        if getattr(each, "__module__", "") == module
+    ]
+    fields = [
+        each.model_fields.get("kind")
+        for each in own
+        if isinstance(each, type) and issubclass(each, Section)
+    ]
     return {kind for field in fields if field for kind in get_args(field.annotation)}
 
 
@@ -43,17 +53,25 @@ DIMPLE = {"kind": "dimple", "amplitude": 1.0, "width": 3.0, "at": {"point": ["0 
     [
         ("bodies.a.radius", {}, {"kind": "sphere", "radius": "2 mm"}),
         ("bodies.a.edge", {}, {"kind": "rod", "radius": 0.2, "edge": "1 mm"}),
-        ("bodies.a.size.2", {}, {"kind": "box", "size": [1, 1, "2 m"], "edge": 0.1, "axis": [1, 0, 0]}),
+        (
+            "bodies.a.size.2",
+            {},
+            {"kind": "box", "size": [1, 1, "2 m"], "edge": 0.1, "axis": [1, 0, 0]},
+        ),
         ("bodies.a.position.2", {}, {"kind": "plane", "position": [0, 0, "2 mm"]}),
         ("bodies.a.at.point.2", {}, {"kind": "plane", "at": {"point": [0, 0, "1 m"]}}),
         ("shell.imperfections.0.at.point.0", {"imperfections": [DIMPLE]}, None),
         ("shell.defect.at.point.0", {"defect": DIMPLE}, None),
     ],
 )
-def test_a_unit_beside_a_shell_without_one(key: str, shell: dict[str, Any], body: dict[str, Any] | None) -> None:
+def test_a_unit_beside_a_shell_without_one(
+    key: str, shell: dict[str, Any], body: dict[str, Any] | None
+) -> None:
     bodies = {"a": body} if body else {}
     with pytest.raises(ValueError, match=rf"{key}: has a unit, but the shell's lengths have none"):
-        Case.model_validate({"shell": CAP | shell, "boundary": {"rim": "clamped"}, "bodies": bodies})
+        Case.model_validate(
+            {"shell": CAP | shell, "boundary": {"rim": "clamped"}, "bodies": bodies}
+        )
 
 
 class Placed(Section):
@@ -66,8 +84,15 @@ class Placed(Section):
 
 
 def test_numbers_with_units_are_found_by_what_is_made_of_them() -> None:
-    """Every text that became a number, in any section; not names, and no targets over a size of the case."""
-    data = {"kind": "placed", "through": [[0, "1 mm", 0], [1, 0, 0]], "name": "5 mm", "target": "1 Pa"}
+    """Every text that became a number, in any section; not names, and no targets over a size of the
+    case.
+    """
+    data = {
+        "kind": "placed",
+        "through": [[0, "1 mm", 0], [1, 0, 0]],
+        "name": "5 mm",
+        "target": "1 Pa",
+    }
     made = Placed.model_validate(data, context={"folder": ""})  # no shell: any number will do
     assert [*numbers_with_units(made, data, "loading.0")] == ["loading.0.through.0.1"]
     assert [*numbers_with_units({"a": [made]}, {"a": [data]}, "of")] == ["of.a.0.through.0.1"]

@@ -1,4 +1,6 @@
-"""Cases of laminates: lamination theory, the symmetry that plies leave, gradients, fields, and what is refused."""
+"""Cases of laminates: lamination theory, the symmetry that plies leave, gradients, fields, and what
+is refused.
+"""
 
 from typing import Any
 
@@ -23,7 +25,14 @@ def plies(*angles: float) -> list[dict[str, float]]:
     return [{"angle": float(angle)} | common for angle in angles]
 
 
-STRIP = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.002, "youngs_modulus": 1, "poisson_ratio": 0}
+STRIP = {
+    "geometry": "plate",
+    "length": 1,
+    "width": 0.2,
+    "thickness": 0.002,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0,
+}
 SIDES = {"left": "clamped", "bottom": "symmetry", "top": "symmetry"}
 
 
@@ -36,7 +45,15 @@ def test_coupled_strip(load: str) -> None:
     loads = [{"edge": "right", "force": [0.2 * N, 0, 0]}] if N else [{"edge": "right", "moment": M}]
     shell = STRIP | {"laminate": {"plies": plies(0, 90)}}
     loading = {"kind": "dead", "loads": loads, "factor": 1, "points": 1}
-    found = ms.run(case(shell=shell, boundary=SIDES, points={"tip": [1, 0.1, 0]}, loading=loading, mesh={"size": 0.1}))
+    found = ms.run(
+        case(
+            shell=shell,
+            boundary=SIDES,
+            points={"tip": [1, 0.1, 0]},
+            loading=loading,
+            mesh={"size": 0.1},
+        )
+    )
     e, k = np.linalg.solve([[A * h, -B * h**2], [-B * h**2, D * h**3]], [N, -M])
     last = found.rows[-1]
     assert float(last["tip_ux"]) == pytest.approx(e, rel=1e-4)
@@ -49,7 +66,11 @@ PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure":
 
 def pressed(laminate: dict[str, Any], **sections: Any) -> ms.Case:
     return case(
-        **{"shell": HEMISPHERE | {"laminate": laminate}, "boundary": {"equator": "clamped"}, "loading": PRESSED}
+        **{
+            "shell": HEMISPHERE | {"laminate": laminate},
+            "boundary": {"equator": "clamped"},
+            "loading": PRESSED,
+        }
         | sections
     )
 
@@ -66,7 +87,21 @@ def pressed(laminate: dict[str, Any], **sections: Any) -> ms.Case:
         ({"plies": plies(0, 90), "along": [0.0, 0.0, 2.0]}, "meridian"),
         ({"plies": plies(0, 30), "along": [1.0, 0.0, 0.0]}, "full shell"),
         ({"plies": plies(30, -30, -30, 30), "along": [1.0, 0.0, 0.0]}, "full shell"),  # D16 stays
-        ({"plies": [{"E1": 1.0, "E2": 1.0, "nu12": 0.3, "G12": 1 / 2.6, "fraction": 1.0, "angle": 20.0}]}, "meridian"),
+        (
+            {
+                "plies": [
+                    {
+                        "E1": 1.0,
+                        "E2": 1.0,
+                        "nu12": 0.3,
+                        "G12": 1 / 2.6,
+                        "fraction": 1.0,
+                        "angle": 20.0,
+                    }
+                ]
+            },
+            "meridian",
+        ),
     ],
 )
 def test_symmetry(laminate: dict[str, Any], model: str) -> None:
@@ -75,7 +110,9 @@ def test_symmetry(laminate: dict[str, Any], model: str) -> None:
 
 @pytest.mark.slow
 def test_meridian_and_half() -> None:
-    """Plies along the meridians: a meridian and half of the surface have the same energy and volume."""
+    """Plies along the meridians: a meridian and half of the surface have the same energy and
+    volume.
+    """
     laminate = {"plies": plies(0, 90)}
     found = [
         ms.run(pressed(laminate, symmetry=symmetry, mesh=mesh)).rows[-1]
@@ -95,7 +132,12 @@ def test_gradients() -> None:
         "shell": STRIP | {"thickness": 0.02, "laminate": {"plies": plies(30, 0)}},
         "boundary": {"left": "clamped"},
         "points": {"tip": [1, 0.2, 0]},
-        "loading": {"kind": "dead", "loads": [{"edge": "right", "force": [0, 0, 1e-6]}], "factor": 1, "points": 1},
+        "loading": {
+            "kind": "dead",
+            "loads": [{"edge": "right", "force": [0, 0, 1e-6]}],
+            "factor": 1,
+            "points": 1,
+        },
         "mesh": {"size": 0.2, "degree": 3},
     }
 
@@ -114,13 +156,27 @@ def test_gradients() -> None:
 def test_what_is_refused() -> None:
     """Each with its key, the value and what is allowed; all stand in docs/troubleshooting.md."""
     bad = plies(0)[0] | {"nu12": 2.0}
-    cap = {"geometry": "cap", "polar": 40, "radius": "1 m", "thickness": "2 cm", "poisson_ratio": 0.3}
+    cap = {
+        "geometry": "cap",
+        "polar": 40,
+        "radius": "1 m",
+        "thickness": "2 cm",
+        "poisson_ratio": 0.3,
+    }
     wrong: dict[str, dict[str, Any]] = {
         "nu12: 2: allowed is nu12^2 < E1/E2 = 3": {"laminate": {"plies": [bad]}},
         "plies: their fractions must add up to 1": {"laminate": {"plies": plies(0, 90)[:1]}},
-        "along: a vector of length zero is no direction": {"laminate": {"plies": plies(0), "along": [0.0, 0.0, 0.0]}},
-        "give each of E1, E2, G12 a unit, or none": {"laminate": {"plies": [plies(0)[0] | {"E1": "3 GPa"}]}},
-        "laminate: needs law: koiter": {"laminate": {"plies": plies(0)}, "law": "neo-hookean", "poisson_ratio": 0.5},
+        "along: a vector of length zero is no direction": {
+            "laminate": {"plies": plies(0), "along": [0.0, 0.0, 0.0]}
+        },
+        "give each of E1, E2, G12 a unit, or none": {
+            "laminate": {"plies": [plies(0)[0] | {"E1": "3 GPa"}]}
+        },
+        "laminate: needs law: koiter": {
+            "laminate": {"plies": plies(0)},
+            "law": "neo-hookean",
+            "poisson_ratio": 0.5,
+        },
     }
     for message, keys in wrong.items():
         with pytest.raises(CaseError, match=message.replace("^", r"\^")):
@@ -140,14 +196,22 @@ def test_what_is_refused() -> None:
         pressed({"plies": plies(0)}, model="solid")
     for laminate, message in (
         ({"plies": plies(45, -45)}, "the laminate is not balanced about the meridian"),
-        ({"plies": plies(0), "along": [1.0, 0.0, 0.0]}, "the angle 0 of the plies is not along the meridians"),
+        (
+            {"plies": plies(0), "along": [1.0, 0.0, 0.0]},
+            "the angle 0 of the plies is not along the meridians",
+        ),
     ):
         with pytest.raises(CaseError, match=message):
             pressed(laminate, symmetry="axisymmetric").problem()
-    with pytest.raises(CaseError, match="the fractions of the plies add up to 1: one alone has no gradient"):
+    with pytest.raises(
+        CaseError, match="the fractions of the plies add up to 1: one alone has no gradient"
+    ):
         number_of(pressed({"plies": plies(0, 90)}).context, "shell.laminate.plies.0.fraction")
     for size, said in ((1e10, "1e\\+10"), (1e-10, "1e-10")):
-        with pytest.raises(CaseError, match=rf"plies\.0\.E2: is {said} times youngs_modulus: allowed 1e-09 to 1e\+09"):
+        with pytest.raises(
+            CaseError,
+            match=rf"plies\.0\.E2: is {said} times youngs_modulus: allowed 1e-09 to 1e\+09",
+        ):
             pressed({"plies": [plies(0)[0] | {"E1": 1e9, "E2": size, "nu12": 0}]})
 
 

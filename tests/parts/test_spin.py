@@ -23,7 +23,12 @@ def made(**sections: Any) -> Case:
 def disc(model: str = "shell", symmetry: str = "auto", **further: Any) -> Case:
     """With a rim that does not move; R/h = 50."""
     further.setdefault("loading", {"kind": "spin", "speed": sqrt(SMALL), "points": 1})
-    shell = {"geometry": "disc", "radius_to_thickness": 50.0, "poisson_ratio": 0.3, **further.pop("shell", {})}
+    shell = {
+        "geometry": "disc",
+        "radius_to_thickness": 50.0,
+        "poisson_ratio": 0.3,
+        **further.pop("shell", {}),
+    }
     mesh = {"size": 0.25} if symmetry != "auto" else {}
     return made(
         model=model, shell=shell, boundary={"rim": "hinged"}, points={"here": [0.5, 0, 0]}, symmetry=symmetry,
@@ -40,29 +45,45 @@ def ended(case: Case) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     ("model", "symmetry", "tolerance"),
-    [("shell", "auto", 1e-3), ("shell", "half", 1e-3), ("shell", "none", 1e-3), ("solid", "half", 0.02)],
+    [
+        ("shell", "auto", 1e-3),
+        ("shell", "half", 1e-3),
+        ("shell", "none", 1e-3),
+        ("solid", "half", 0.02),
+    ],
 )
 def test_disc(model: str, symmetry: str, tolerance: float) -> None:
     """Plane stress: u = (1 - ν²) ρ ω²/(8 E) r (R² - r²) where the rim is fixed."""
     row = ended(disc(model, symmetry))
     assert row["spin"] == pytest.approx(SMALL)
-    assert row["here_ux"] == pytest.approx((1 - 0.3**2) * SMALL / 8 * 0.5 * (1 - 0.5**2), rel=tolerance)
+    assert row["here_ux"] == pytest.approx(
+        (1 - 0.3**2) * SMALL / 8 * 0.5 * (1 - 0.5**2), rel=tolerance
+    )
 
 
-@pytest.mark.parametrize(("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")])
+@pytest.mark.parametrize(
+    ("model", "symmetry"), [("shell", "half"), ("shell", "none"), ("solid", "half")]
+)
 def test_blade(model: str, symmetry: str) -> None:
     """The tension ∫ ρ ω² r of a narrow blade from its root: u = ρ ω² L³/(3 E) at its tip."""
     shell = {"geometry": "strip", "width": 0.1, "radius_to_thickness": 50.0, "poisson_ratio": 0.0}
     loading = {"kind": "spin", "speed": sqrt(SMALL), "points": 1}
     points = {"tip_middle": [1, 0, 0]}
     case = made(
-        model=model, shell=shell, boundary={"root": "clamped"}, loading=loading, symmetry=symmetry, points=points
+        model=model,
+        shell=shell,
+        boundary={"root": "clamped"},
+        loading=loading,
+        symmetry=symmetry,
+        points=points,
     )
     assert ended(case)["tip_middle_ux"] == pytest.approx(SMALL / 3, rel=2e-3)
 
 
 def test_thickness_that_varies() -> None:
-    """h = h0 exp(-r²): forces and stiffness fall together; u solves (r h u')' ... = -ρ ω² h r² numerically."""
+    """h = h0 exp(-r²): forces and stiffness fall together; u solves (r h u')' ... = -ρ ω² h r²
+    numerically.
+    """
     row = ended(disc(shell={"thickness_factor": "exp(-(x**2 + y**2))"}))
     nu, n = 0.3, 4000
     r = (np.arange(n) + 0.5) / n
@@ -75,7 +96,11 @@ def test_thickness_that_varies() -> None:
     for i in range(2):
         f[i : n + i] += SMALL * weight * r * 0.5
         for j in range(2):
-            entry = weight / (1 - nu**2) * (a[i] * a[j] + nu * (a[i] * b[j] + b[i] * a[j]) + b[i] * b[j])
+            entry = (
+                weight
+                / (1 - nu**2)
+                * (a[i] * a[j] + nu * (a[i] * b[j] + b[i] * a[j]) + b[i] * b[j])
+            )
             K[1 + i - j, j : n + j] += entry
     from scipy.linalg import solve_banded
 
@@ -88,8 +113,16 @@ CAP = {"geometry": "cap", "polar": 40, "radius": 1.0, "thickness": 0.01, "poisso
 
 
 def test_fold_from_two_sides() -> None:
-    """A spinning cap under pressure: the fold by the spin at p is the fold by the pressure at that spin."""
-    pressed = {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.4, "points": 2}
+    """A spinning cap under pressure: the fold by the spin at p is the fold by the pressure at that
+    spin.
+    """
+    pressed = {
+        "kind": "pressure",
+        "until": "target",
+        "control": "load",
+        "pressure": 0.4,
+        "points": 2,
+    }
 
     def fold(*steps: dict[str, Any]) -> dict[str, float]:
         scene = ms.Scene(made(shell=CAP, boundary={"rim": "hinged"}, loading=list(steps)))
@@ -97,7 +130,10 @@ def test_fold_from_two_sides() -> None:
         return scene.observe(record.point.state)
 
     found = fold(pressed, {"kind": "spin", "until": "limit"})
-    again = fold({"kind": "spin", "speed": sqrt(found["spin"]), "points": 4}, {"kind": "pressure", "until": "limit"})
+    again = fold(
+        {"kind": "spin", "speed": sqrt(found["spin"]), "points": 4},
+        {"kind": "pressure", "until": "limit"},
+    )
     assert found["spin"] > 0
     assert again["p_over_pc"] == pytest.approx(0.4, rel=1e-4)
 
@@ -123,7 +159,11 @@ def test_units() -> None:
 
 @pytest.mark.parametrize(
     ("speed", "words"),
-    [("50 Hz", "give rpm or rad/s"), ("300 rad/s", "needs density, youngs_modulus and lengths"), (0.0, "not be zero")],
+    [
+        ("50 Hz", "give rpm or rad/s"),
+        ("300 rad/s", "needs density, youngs_modulus and lengths"),
+        (0.0, "not be zero"),
+    ],
 )
 def test_mistakes(speed: Any, words: str) -> None:
     with pytest.raises(CaseError, match=words):
@@ -145,7 +185,9 @@ def test_held_in_a_step() -> None:
 
 
 def test_a_history_is_of_the_speed() -> None:
-    """As the target is: half of the time of a ramp from 0.02 to 0.04 is 0.03, and the amplitude its square."""
+    """As the target is: half of the time of a ramp from 0.02 to 0.04 is 0.03, and the amplitude its
+    square.
+    """
     spin = {"kind": "spin", "speed": 0.02, "points": 1}
 
     def spun(history: Any) -> list[float]:
@@ -160,5 +202,9 @@ def test_a_history_is_of_the_speed() -> None:
 def test_a_history_with_a_unit() -> None:
     """As a target of the load; where the case has no units it says what it needs."""
     time = {"kind": "time", "duration": 1.0, "history": {"spin": {"kind": "step", "to": "200 rpm"}}}
-    with pytest.raises(CaseError, match=r"history.spin: 200 rpm: has a unit: that needs density, youngs_modulus"):
-        made(shell=CAP, boundary={"rim": "clamped"}, loading=[{"kind": "spin", "speed": 0.02}, time])
+    with pytest.raises(
+        CaseError, match=r"history.spin: 200 rpm: has a unit: that needs density, youngs_modulus"
+    ):
+        made(
+            shell=CAP, boundary={"rim": "clamped"}, loading=[{"kind": "spin", "speed": 0.02}, time]
+        )

@@ -33,7 +33,15 @@ sys.argv = ["magshell", *words]
 from magshell_fenicsx.cli import main
 main()
 """
-QUICK = ["--set", "mesh.degree=2", "--set", "loading.factor=0.01", "--set", "loading.points=1", "--no-pictures"]
+QUICK = [
+    "--set",
+    "mesh.degree=2",
+    "--set",
+    "loading.factor=0.01",
+    "--set",
+    "loading.points=1",
+    "--no-pictures",
+]
 
 
 def done(mode: str, rank: int, *words: str | Path) -> subprocess.CompletedProcess[str]:

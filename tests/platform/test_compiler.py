@@ -1,4 +1,6 @@
-"""Libraries that several processes want at the same time, disks that are full, compilers of every kind and none."""
+"""Libraries that several processes want at the same time, disks that are full, compilers of every
+kind and none.
+"""
 
 import ctypes
 import shlex
@@ -40,7 +42,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_one_compiles_and_the_others_wait(cache: Path) -> None:
-    """Of all that ask at once one compiles; the others load what it makes. Nothing else is left in the folder."""
+    """Of all that ask at once one compiles; the others load what it makes.
+
+    Nothing else is left in the folder.
+    """
     asked = list[str]()
 
     def source() -> str:
@@ -87,7 +92,9 @@ def test_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     beside.mkdir()
     then_compiles = f'exec {shlex.join(compiler.c_compiler())} "$@"\n'
     program.write_text(
-        MEETING.format(folder=shlex.quote(str(beside)), seen=shlex.quote(str(seen))) + then_compiles, encoding="utf-8"
+        MEETING.format(folder=shlex.quote(str(beside)), seen=shlex.quote(str(seen)))
+        + then_compiles,
+        encoding="utf-8",
     )
     program.chmod(0o755)
     monkeypatch.setenv("CC", shlex.quote(str(program)))
@@ -100,7 +107,9 @@ def test_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("cache", "two_cores")
 def test_in_opposite_orders() -> None:
-    """Nobody waits for another one that waits for it: a lock is held while a compiler runs, and no longer."""
+    """Nobody waits for another one that waits for it: a lock is held while a compiler runs, and no
+    longer.
+    """
     orders = ["abcdef", "fedcba", "cfaebd"]
     with ThreadPoolExecutor(len(orders)) as pool:
         for done in [pool.submit(compiler.side_by_side, libraries(*order)) for order in orders]:
@@ -127,7 +136,11 @@ def test_what_has_not_begun_is_given_up(cache: Path) -> None:
 def test_options_and_names_make_another_library(cache: Path) -> None:
     made = {
         compiler.Library(*of).path()
-        for of in (("a", lambda: SOURCE, ()), ("b", lambda: SOURCE, ()), ("a", lambda: SOURCE, ("-O1",)))
+        for of in (
+            ("a", lambda: SOURCE, ()),
+            ("b", lambda: SOURCE, ()),
+            ("a", lambda: SOURCE, ("-O1",)),
+        )
     }
     assert len(made) == 3
 
@@ -164,7 +177,9 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_compiler_is_any_that_there_is(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """That of CC, else that of Python, else any of the usual ones, else Zig's; none is refused in words."""
+    """That of CC, else that of Python, else any of the usual ones, else Zig's; none is refused in
+    words.
+    """
     with pytest.raises(NoCompiler, match=r"there is no C compiler.*install gcc or clang.*ziglang"):
         compiler.c_compiler()
     monkeypatch.setattr(compiler, "find_spec", lambda name: name)
@@ -181,19 +196,28 @@ def test_the_compiler_is_any_that_there_is(bare: Path, monkeypatch: pytest.Monke
     assert compiler.c_compiler()[:2] == ("other", "-x")
 
 
-def test_a_compiler_that_is_not_gcc(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_compiler_that_is_not_gcc(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The package's C code and its libraries are compiled without the options of GCC."""
     gcc = shutil.which("gcc")
     if not gcc or not compiler.is_gnu((gcc,)):
         pytest.skip("no GCC here")
-    monkeypatch.setenv("CC", shlex.quote(str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc)))))
+    monkeypatch.setenv(
+        "CC", shlex.quote(str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc))))
+    )
     (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
     assert native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)[1].seven() == 7
     assert ctypes.CDLL(str(compiler.Library("seven", lambda: SOURCE, ("-O0",)).path())).seven() == 7
 
 
-def test_a_compiler_that_compiles_nothing(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its first error is said, before anything is solved. Where kernels have been compiled, none is needed."""
+def test_a_compiler_that_compiles_nothing(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first error is said, before anything is solved.
+
+    Where kernels have been compiled, none is needed.
+    """
     lacking = "#!/bin/sh\necho 'in file\nmath.h: fatal error: no such file' >&2\nexit 1\n"
     monkeypatch.setenv("CC", shlex.quote(str(program(tmp_path, "cc", lacking))))
     (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
@@ -218,15 +242,24 @@ def test_a_run_without_a_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("given", ["'gcc", "{refusing}"])
-def test_compilers_that_are_refused(given: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilers_that_are_refused(
+    given: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A quotation without its end, and a compiler that lacks an option of the kernels."""
     text = '#!/bin/sh\ncase "$*" in *-std=*) echo "error: unknown option" >&2; exit 1 ;; esac\nexec cc "$@"\n'
-    monkeypatch.setenv("CC", given.format(refusing=shlex.quote(str(program(tmp_path, "refusing", text)))))
-    with pytest.raises(NoCompiler, match=r"there is no such compiler|refusing'? cannot compile: error: unknown option"):
+    monkeypatch.setenv(
+        "CC", given.format(refusing=shlex.quote(str(program(tmp_path, "refusing", text))))
+    )
+    with pytest.raises(
+        NoCompiler,
+        match=r"there is no such compiler|refusing'? cannot compile: error: unknown option",
+    ):
         compiler.check_compiler()
 
 
-def test_pictures_have_their_code_before_anything_is_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_have_their_code_before_anything_is_solved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where a compiler has been there before, and not for this."""
 
     def without_compiler() -> None:

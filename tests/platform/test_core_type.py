@@ -26,7 +26,9 @@ def without(more: dict[str, str]) -> dict[str, str]:
 
 def said(*words: str | Path, core_type: str | None = None) -> subprocess.CompletedProcess[str]:
     told = without({"OPENBLAS_CORETYPE": core_type} if core_type else {})
-    return subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, env=told, cwd=TOP)
+    return subprocess.run(
+        list(map(str, words)), capture_output=True, text=True, check=False, env=told, cwd=TOP
+    )
 
 
 def test_the_choice_reaches_the_environment() -> None:
@@ -37,7 +39,9 @@ def test_the_choice_reaches_the_environment() -> None:
     assert other != used
     assert said(IN_ENV, CORE_TYPE, core_type=other).stdout.strip() == other
     assert said(IN_ENV, CORE_TYPE, other, core_type=other).returncode == 0
-    first, second = (said(IN_ENV, "python3", "-c", PRODUCT, core_type=each).stdout for each in (None, other))
+    first, second = (
+        said(IN_ENV, "python3", "-c", PRODUCT, core_type=each).stdout for each in (None, other)
+    )
     assert first
     assert second
     assert first != second
@@ -46,13 +50,19 @@ def test_the_choice_reaches_the_environment() -> None:
 def test_a_choice_without_effect_is_an_error() -> None:
     done = said(IN_ENV, CORE_TYPE, "Nonesuch", core_type="Nonesuch")
     assert done.returncode == 1
-    assert re.fullmatch(r"core-type: OPENBLAS_CORETYPE=Nonesuch has no effect: .* computes for \w+\n", done.stderr)
+    assert re.fullmatch(
+        r"core-type: OPENBLAS_CORETYPE=Nonesuch has no effect: .* computes for \w+\n", done.stderr
+    )
 
 
 def test_make_looks_first() -> None:
     """Before its tests; without a choice there is nothing to look for."""
     lines = said("make", "-n", "test", "OPENBLAS_CORETYPE=Nehalem").stdout.splitlines()
-    (check,) = (i for i, line in enumerate(lines) if line.split()[:3] == [".ci/in-env", ".ci/core-type", "Nehalem"])
+    (check,) = (
+        i
+        for i, line in enumerate(lines)
+        if line.split()[:3] == [".ci/in-env", ".ci/core-type", "Nehalem"]
+    )
     assert "pytest" in lines[check + 1]
     assert "core-type" not in said("make", "-n", "test").stdout
 
@@ -85,7 +95,10 @@ CALLS_UP_TO_FAILURE = {
 
 @pytest.mark.parametrize("fails", CALLS_UP_TO_FAILURE)
 def test_ci_runs_all(tmp_path: Path, fails: str) -> None:
-    """In a clone, with folders that are empty at first. What fails fails the run, which ends or goes on."""
+    """In a clone, with folders that are empty at first.
+
+    What fails fails the run, which ends or goes on.
+    """
     top, home = tmp_path / "top", tmp_path / "home"
     (top / ".ci").mkdir(parents=True)
     home.mkdir()
@@ -95,16 +108,28 @@ def test_ci_runs_all(tmp_path: Path, fails: str) -> None:
         (top / name).write_text(text, encoding="utf-8")
         (top / name).chmod(0o755)
     more = dict.fromkeys(("TMPDIR", "HOME", "XDG_CACHE_HOME"), str(home))
-    more |= {"PATH": f"{top}:{os.environ['PATH']}", "FAILS": fails, "CALLS": str(tmp_path / "calls")}
-    done = subprocess.run([top / ".ci" / "run"], env=without(more), capture_output=True, text=True, check=False)
+    more |= {
+        "PATH": f"{top}:{os.environ['PATH']}",
+        "FAILS": fails,
+        "CALLS": str(tmp_path / "calls"),
+    }
+    done = subprocess.run(
+        [top / ".ci" / "run"], env=without(more), capture_output=True, text=True, check=False
+    )
     assert [each.name for each in home.iterdir()] == ["earlier"]
     listed = (tmp_path / "calls.folders").read_text(encoding="utf-8").splitlines()
     there = {each.split("/")[-1] for each in listed if each}
-    assert there - {"sid", "sid.log"} == {"cache:", "home:", "tmp:"}  # nothing, but for building Debian unstable
+    assert there - {"sid", "sid.log"} == {
+        "cache:",
+        "home:",
+        "tmp:",
+    }  # nothing, but for building Debian unstable
     lines = (tmp_path / "calls").read_text(encoding="utf-8").splitlines()
     calls = [[word for word in line.split() if not word.startswith("LIMIT=")] for line in lines]
     assert (done.returncode != 0) == bool(fails)
-    solving = [f"tests/{each}" for each in ("continuation", "models/axisymmetric", "simulate", "cases")]
+    solving = [
+        f"tests/{each}" for each in ("continuation", "models/axisymmetric", "simulate", "cases")
+    ]
     wanted = [
         ["test", "ROOT="],
         ["test", "MARK=slow", "ROOT="],

@@ -1,4 +1,6 @@
-"""The memory that is left, from the files in which the kernel says so, and models that are refused for it."""
+"""The memory that is left, from the files in which the kernel says so, and models that are refused
+for it.
+"""
 
 import re
 import resource
@@ -33,7 +35,10 @@ def test_what_the_machine_says(tmp_path: Path) -> None:
     assert environment.available_memory(tmp_path) == 8000 * 1024
     written(tmp_path, proc__self__cgroup="0::/jobs/mine\n", sys__fs__cgroup__jobs__mine__x="")
     group = tmp_path / "sys/fs/cgroup/jobs"
-    written(group, **{"memory.max": "5000000\n", "memory.current": "3000000\n", "memory.stat": "anon 1\n"})
+    written(
+        group,
+        **{"memory.max": "5000000\n", "memory.current": "3000000\n", "memory.stat": "anon 1\n"},
+    )
     written(group / "mine", **{"memory.max": "max\n", "memory.current": "3000000\n"})
     assert environment.available_memory(tmp_path) == 2_000_000
     written(group, **{"memory.stat": "anon 1\ninactive_file 500000\n"})
@@ -76,8 +81,12 @@ def test_what_is_given_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (5, 31_398, True, None, 1.430),
     ],
 )
-def test_estimates(degree: int, unknowns: int, half: bool, least: float | None, most: float | None) -> None:
-    """Against the peaks of whole runs of the dimpled hemisphere in GB, of a static load and of a path past its fold."""
+def test_estimates(
+    degree: int, unknowns: int, half: bool, least: float | None, most: float | None
+) -> None:
+    """Against the peaks of whole runs of the dimpled hemisphere in GB, of a static load and of a
+    path past its fold.
+    """
     case = ms.Case.load(DIMPLE, [f"mesh.degree={degree}"])
     found = Memory.of(case.context, unknowns, half=half)
     for measured, estimated in ((least, found.least), (most, found.most)):
@@ -85,8 +94,12 @@ def test_estimates(degree: int, unknowns: int, half: bool, least: float | None, 
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_model_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
-    """One message with unknowns, estimate and what is free; with a little more memory it is only a warning."""
+def test_a_model_that_is_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """One message with unknowns, estimate and what is free; with a little more memory it is only a
+    warning.
+    """
     words = [DIMPLE, *FULL, *(["--out", tmp_path / "out"] if command == "run" else [])]
     monkeypatch.setenv("MAGSHELL_MEMORY", "0.3")
     done = magshell(command, *words)
@@ -110,16 +123,31 @@ def test_a_model_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_mesh_file_and_two_ranks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cells of a file are counted; two ranks on one machine take its memory together; a meridian is never large."""
+    """The cells of a file are counted; two ranks on one machine take its memory together; a
+    meridian is never large.
+    """
     monkeypatch.setenv("MAGSHELL_MEMORY", "0.2")
     done = magshell("check", BRACKET)
     assert done.returncode == 2
     assert "take a coarser mesh file, or a lower mesh.degree" in done.stderr
     assert magshell("check", CASES / "clamped_plate.yaml").returncode == 0
     monkeypatch.setenv("MAGSHELL_MEMORY", "0.45")  # enough for one
-    words = ["-m", "magshell_fenicsx", "run", BRACKET, "--set", "mesh.degree=2", "--out", tmp_path / "out"]
+    words = [
+        "-m",
+        "magshell_fenicsx",
+        "run",
+        BRACKET,
+        "--set",
+        "mesh.degree=2",
+        "--out",
+        tmp_path / "out",
+    ]
     ended = subprocess.run(
-        [*mpirun(2), sys.executable, *map(str, words)], capture_output=True, text=True, check=False, timeout=100
+        [*mpirun(2), sys.executable, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
     )
     assert ended.returncode == 2
     assert ended.stderr.count("0.45 GB are free") == 1

@@ -1,4 +1,6 @@
-"""The script that sets up the environment, where links are in the way, and where nothing can be had."""
+"""The script that sets up the environment, where links are in the way, and where nothing can be
+had.
+"""
 
 import os
 import shutil
@@ -45,7 +47,9 @@ def in_env(bare: Path, **told: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
 
 
-@pytest.mark.parametrize(("root", "said"), [("", "Debian 13 and root, or Docker"), ("pypi", "Python 3.12 or newer")])
+@pytest.mark.parametrize(
+    ("root", "said"), [("", "Debian 13 and root, or Docker"), ("pypi", "Python 3.12 or newer")]
+)
 def test_where_nothing_can_be_had(bare: Path, root: str, said: str) -> None:
     """One message, exit code 2."""
     done = in_env(bare, ROOT=root)
@@ -58,7 +62,10 @@ def test_where_nothing_can_be_had(bare: Path, root: str, said: str) -> None:
 def test_a_link_to_nothing(bare: Path) -> None:
     (bare / "top/.env").symlink_to(bare / "nowhere")
     done = in_env(bare)
-    assert (done.returncode, done.stderr) == (2, f"in-env: .env is a link to {bare}/nowhere, which is no folder\n")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"in-env: .env is a link to {bare}/nowhere, which is no folder\n",
+    )
 
 
 def test_a_root_on_another_disk(bare: Path) -> None:
@@ -70,10 +77,18 @@ def test_a_root_on_another_disk(bare: Path) -> None:
     (bare / "home").symlink_to(home)
     done = in_env(bare)  # which says what the stamp is not
     packages = (TOP / ".ci/packages.txt").read_text(encoding="utf-8").splitlines()
-    listed = " ".join(line.partition("#")[0].strip() for line in packages if line.partition("#")[0].strip())
-    stamp = subprocess.run(["cksum"], input=listed, capture_output=True, text=True, check=True).stdout
-    (disk / "root/etc/magshell-packages").write_text("-".join(stamp.split()) + "\n", encoding="utf-8")
-    pypi = subprocess.run(["cksum"], input=(TOP / ".ci/pypi.txt").read_bytes(), capture_output=True, check=True).stdout
+    listed = " ".join(
+        line.partition("#")[0].strip() for line in packages if line.partition("#")[0].strip()
+    )
+    stamp = subprocess.run(
+        ["cksum"], input=listed, capture_output=True, text=True, check=True
+    ).stdout
+    (disk / "root/etc/magshell-packages").write_text(
+        "-".join(stamp.split()) + "\n", encoding="utf-8"
+    )
+    pypi = subprocess.run(
+        ["cksum"], input=(TOP / ".ci/pypi.txt").read_bytes(), capture_output=True, check=True
+    ).stdout
     (disk / f"pypi-{'-'.join(pypi.decode().split())}").mkdir()
     program(bare / "bin/bwrap", ARGUMENTS)
     done = in_env(bare, HOME=str(bare / "home"))

@@ -71,7 +71,9 @@ def test_folders_of_others(tmp_path: Path, home: Path) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="root owns the image")
-def test_an_image_is_read_by_any_user(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_is_read_by_any_user(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Kernels of root's that nobody else may write are taken; new ones go to a private folder."""
     image, own = folder(tmp_path / "image", 0o755), home / ".cache" / "magshell"
     (image / "kernel").write_bytes(b"compiled")
@@ -103,8 +105,12 @@ def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setenv(name, str(shared))
     done = started("info")
     assert done.returncode == 2
-    assert done.stderr.startswith(f"kernel cache {shared}/fenics: others may write to it or own it, ")
-    assert done.stderr.endswith("set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)\n")
+    assert done.stderr.startswith(
+        f"kernel cache {shared}/fenics: others may write to it or own it, "
+    )
+    assert done.stderr.endswith(
+        "set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)\n"
+    )
 
 
 @pytest.mark.parametrize("base", ["", "relative"])

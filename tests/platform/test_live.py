@@ -38,7 +38,9 @@ class Terminal:
         self._end, other = pty.openpty()
         command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *map(str, arguments)]
         environment = os.environ | {"TERM": "xterm", "COLUMNS": "200"}
-        found = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs begin with SIGINT ignored
+        found = signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # background jobs begin with SIGINT ignored
         self.process = subprocess.Popen(command, stdout=other, stderr=other, env=environment)
         signal.signal(signal.SIGINT, found)
         os.close(other)
@@ -58,7 +60,9 @@ class Terminal:
 
     @property
     def screen(self) -> list[str]:
-        """The lines that are left; knows carriage returns and the erasure of a line, and no other escape."""
+        """The lines that are left; knows carriage returns and the erasure of a line, and no other
+        escape.
+        """
         lines, place = [""], 0
         for piece in re.findall(r"\r|\n|\x1b\[K|[^\r\n\x1b]+|\x1b", self.written):
             if piece == "\r":
@@ -93,20 +97,26 @@ def test_terminal_and_pipe(tmp_path: Path) -> None:
     assert re.fullmatch(r"mesh and kernels  \d:\d\d", feet[0])
     steps = [foot for foot in feet if " du/h " in foot]
     assert re.fullmatch(r"1 point  w/h 0 -> 6  \d:\d\d  du/h \d\.?\d*", steps[0])
-    assert re.fullmatch(r"\d points  w/h \d\.?\d* -> 6  \d:\d\d, about \d:\d\d left  du/h .*", steps[-1])
+    assert re.fullmatch(
+        r"\d points  w/h \d\.?\d* -> 6  \d:\d\d, about \d:\d\d left  du/h .*", steps[-1]
+    )
     assert [foot for foot in feet if "looking for modes that the model excludes" in foot]
     assert "modes and pictures" in feet[-1]
 
 
 def test_one_rank_of_mpirun(tmp_path: Path) -> None:
     """It has a terminal between it and mpirun, which may write to a file."""
-    terminal = Terminal("run", *QUICK, "--time-limit", "0", "--out", tmp_path, launcher=("mpirun", "-n", "1"))
+    terminal = Terminal(
+        "run", *QUICK, "--time-limit", "0", "--out", tmp_path, launcher=("mpirun", "-n", "1")
+    )
     terminal.read()
     assert "results in" in terminal.written
     assert "\x1b" not in terminal.written
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
     """The run ends after the point, and only its message is left."""
     terminal = Terminal("run", *QUICK, "--set=loading.points=60", "--out", tmp_path)
@@ -121,13 +131,18 @@ def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, -signal.SIGTERM, marks=pytest.mark.slow)]
+    ("number", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, -signal.SIGTERM, marks=pytest.mark.slow)],
 )
 def test_stopped_while_a_mesh_is_found(tmp_path: Path, number: signal.Signals, code: int) -> None:
     """Nothing can be resumed, so the process ends at once; the line that told of the mesh is gone."""
     case = CASES / "dimple_buckling.yaml"
-    terminal = Terminal("run", case, "--set=mesh.tolerance=1e-5", "--set=symmetry=half", "--out", tmp_path)
-    terminal.read(lambda written: "a mesh for the tolerance 1e-05: the path on a coarse one" in written)
+    terminal = Terminal(
+        "run", case, "--set=mesh.tolerance=1e-5", "--set=symmetry=half", "--out", tmp_path
+    )
+    terminal.read(
+        lambda written: "a mesh for the tolerance 1e-05: the path on a coarse one" in written
+    )
     terminal.process.send_signal(number)
     terminal.read()
     assert terminal.process.returncode == code
@@ -152,7 +167,9 @@ def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_pipe_gets_a_line_each_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last status where nothing else was printed for 30 s; no control characters; on several ranks too."""
+    """The last status where nothing else was printed for 30 s; no control characters; on several
+    ranks too.
+    """
     printed: list[str] = []
     clock = iter([0.0, 10.0, 31.0, 40.0, 60.0, 69.0, 70.0, 70.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
@@ -184,14 +201,18 @@ def test_a_pipe_gets_the_last_status_again(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Known points took no time, so only new ones tell how long the rest takes; the field has no part in it."""
+    """Known points took no time, so only new ones tell how long the rest takes; the field has no
+    part in it.
+    """
     case = Case.load(CASES / "indentation.yaml")
     problem = replace(make_problem(case), material=Material(0.5, 0.01))
     told: list[str] = []
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
     model = SimpleNamespace(contacts={})
-    scene = SimpleNamespace(case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes())
+    scene = SimpleNamespace(
+        case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes()
+    )
     progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     row = {"lambda_m": 0.0, "w_over_h": 0.0}
@@ -206,7 +227,8 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told == [
         "2 points  lambda_m 0.00092 -> 0.00184  0:50  du/h 1",
         "3 points  w/h 8 -> 20  1:10  du/h 1",
-        "4 points  w/h 12 -> 20  1:30, about 0:30 left  du/h 1",  # 4 of 12 took 20 s: 40 s, 10 s ago
+        # 4 of 12 took 20 s: 40 s, 10 s ago
+        "4 points  w/h 12 -> 20  1:30, about 0:30 left  du/h 1",
         "5 points  w/h 14 -> 20  1:50, about 0:30 left  du/h 1",
     ]
 
@@ -218,7 +240,9 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(time, "perf_counter", lambda: 0.0)
     model = SimpleNamespace(contacts={})
     problem = replace(make_problem(case), material=Material(0.5, 0.01))
-    scene = SimpleNamespace(case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes())
+    scene = SimpleNamespace(
+        case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes()
+    )
     progress = RunProgress(scene, told.append, 0.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     progress.beginning(1)
@@ -237,7 +261,10 @@ def test_where_a_path_leads() -> None:
     assert Aim("w_over_h", 21.0).part({"w_over_h": 1.0}, row, 7) == 0.2
     assert Aim("w_over_h", words="28 steps", steps=28).part(row, row, 7) == 0.25
     assert Aim("p_over_pc", words="the first instability").part(row, row, 7) is None
-    assert Aim("p_over_pc", words="the first instability").text(row) == "p/pc 0.25 -> the first instability"
+    assert (
+        Aim("p_over_pc", words="the first instability").text(row)
+        == "p/pc 0.25 -> the first instability"
+    )
     assert time_left((0.0, 10.0), (0.25, 20.0)) == 30.0
     assert time_left((0.2, 10.0), (0.4, 20.0)) == pytest.approx(30.0)
     assert time_left((0.0, 10.0), (1.0, 20.0)) is None

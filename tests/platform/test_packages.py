@@ -10,7 +10,9 @@ from conftest import CASES
 from magshell_fenicsx.platform.packages import Unusable, gmsh_module, missing
 
 
-@pytest.mark.parametrize("first", ["petsc4py.PETSc", "dolfinx", "magshell_fenicsx.continuation.factor"])
+@pytest.mark.parametrize(
+    "first", ["petsc4py.PETSc", "dolfinx", "magshell_fenicsx.continuation.factor"]
+)
 def test_mpi_comes_first(first: str) -> None:
     """PyPI's PETSc finds no MPI library but the one that mpi4py has loaded."""
     code = f"""
@@ -42,12 +44,18 @@ main()
     assert done.stderr.count("\n") == 1
 
 
-def test_gmsh_without_the_libraries_of_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gmsh_without_the_libraries_of_a_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The message names the library, and the packages that have it."""
-    (tmp_path / "gmsh.py").write_text('raise OSError("libGLU.so.1: no such file")', encoding="utf-8")
+    (tmp_path / "gmsh.py").write_text(
+        'raise OSError("libGLU.so.1: no such file")', encoding="utf-8"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "gmsh", raising=False)
-    with pytest.raises(Unusable, match=r"^gmsh cannot be loaded: libGLU\.so\.1: .* apt install libglu1-mesa"):
+    with pytest.raises(
+        Unusable, match=r"^gmsh cannot be loaded: libGLU\.so\.1: .* apt install libglu1-mesa"
+    ):
         gmsh_module()
 
 

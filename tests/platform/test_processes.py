@@ -55,7 +55,12 @@ def what_rank_0_gets() -> None:
 
 
 def any_error() -> None:
-    for error in (ValueError("a bug"), KeyError("a bug"), AlreadyComplete({"a bug": 1}), MeshError("a bug")):
+    for error in (
+        ValueError("a bug"),
+        KeyError("a bug"),
+        AlreadyComplete({"a bug": 1}),
+        MeshError("a bug"),
+    ):
         for share in (from_first, by_first):
             with raised(type(error), str(error)):
                 share(COMM, failing(error))
@@ -80,7 +85,9 @@ def what_cannot_be_sent() -> None:
 def what_one_rank_cannot() -> None:
     """All ranks raise, also where the first has no error."""
     with raised(OSError, "of the last"):
-        raised_by_all(COMM, failing(OSError("of the last")) if COMM.rank == COMM.size - 1 else lambda: None)
+        raised_by_all(
+            COMM, failing(OSError("of the last")) if COMM.rank == COMM.size - 1 else lambda: None
+        )
     raised_by_all(COMM, lambda: None)
 
 
@@ -91,7 +98,10 @@ def reads() -> None:
 
 
 def meshes() -> None:
-    with patch.object(Problem, "triangulated", failing(RuntimeError("gmsh has a bug"))), raised(RuntimeError, "gmsh"):
+    with (
+        patch.object(Problem, "triangulated", failing(RuntimeError("gmsh has a bug"))),
+        raised(RuntimeError, "gmsh"),
+    ):
         Scene(ms.Case.load(CASES / "indentation.yaml"), COMM)
 
 
@@ -103,9 +113,15 @@ def a_folder(out: Path) -> None:
         ms.run(ms.Case.load(PLATE), out / "run", COMM)
     from_first(COMM, (out / "run" / "mesh.json").mkdir)
     case = ms.Case.load(PLATE, ["mesh={tolerance: 0.01}"])
-    with patch("magshell_fenicsx.runs.running.open_folder"), raised(Damaged, "mesh.json: is damaged: Is a directory"):
+    with (
+        patch("magshell_fenicsx.runs.running.open_folder"),
+        raised(Damaged, "mesh.json: is damaged: Is a directory"),
+    ):
         ms.run(case, out / "run", COMM, resume=True)
-    with patch("magshell_fenicsx.studies.sweep.kept_outcome", failing(KeyError("a bug"))), raised(KeyError, "a bug"):
+    with (
+        patch("magshell_fenicsx.studies.sweep.kept_outcome", failing(KeyError("a bug"))),
+        raised(KeyError, "a bug"),
+    ):
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)
 
 

@@ -1,4 +1,6 @@
-"""What a case names may be any file: each is read once, whole, and refused by one message before it costs memory."""
+"""What a case names may be any file: each is read once, whole, and refused by one message before it
+costs memory.
+"""
 
 import io
 import os
@@ -86,7 +88,9 @@ MADE = {
     "lying.npz": lying,
     "wide.csv": wide,
     "scattered.csv": scattered,
-    "huge.vti": lambda file: file.write_text(VTI.format("0 99999 0 99999 0 99999"), encoding="utf-8"),
+    "huge.vti": lambda file: file.write_text(
+        VTI.format("0 99999 0 99999 0 99999"), encoding="utf-8"
+    ),
     "huge.vtk": lambda file: file.write_text(LEGACY.format(99999), encoding="utf-8"),
     "huge.vtu": lambda file: file.write_text(
         '<VTKFile type="UnstructuredGrid"><UnstructuredGrid><Piece NumberOfPoints="9999999999" NumberOfCells="1">'
@@ -103,14 +107,22 @@ REFUSED = [
     ("data", "zero.csv", SPECIAL),
     ("grid", "zero.vti", SPECIAL),
     ("mesh", "zero.msh", SPECIAL),
-    ("modes", "zero.vti", "is no mode file that a run writes (fields/mode_*.vtu): it is a device or a pipe"),
+    (
+        "modes",
+        "zero.vti",
+        "is no mode file that a run writes (fields/mode_*.vtu): it is a device or a pipe",
+    ),
     ("data", "folder.csv", "cannot be read: Is a directory"),
     ("data", "bomb.npz", "its arrays have 3.92e+10 bytes; allowed at most 5e+08"),
     ("grid", "bomb.npz", "its arrays have 3.92e+10 bytes; allowed at most 5e+08"),
     ("data", "lying.npz", "its arrays have 8e+12 bytes; allowed at most 5e+08"),
     ("data", "wide.csv", "line 2 has more than 10000 characters"),
     ("grid", "wide.csv", "line 2 has more than 10000 characters"),
-    ("grid", "scattered.csv", "is no rectilinear grid of finite numbers: 3000 rows with 3000 x 3000 x 3000 different"),
+    (
+        "grid",
+        "scattered.csv",
+        "is no rectilinear grid of finite numbers: 3000 rows with 3000 x 3000 x 3000 different",
+    ),
     ("grid", "huge.vti", "declares 4.8e+16 bytes of numbers; allowed at most 5e+08"),
     ("grid", "huge.vtk", "declares 2.4e+16 bytes of numbers; allowed at most 5e+08"),
     ("modes", "huge.vtu", "declares 4.8e+11 bytes of numbers; allowed at most 5e+08"),
@@ -134,7 +146,11 @@ def _refused(folder: Path) -> None:
             make_problem(ms.Case.load(case))
             print(f"{kind} {name}: accepted", flush=True)
         except Exception as e:
-            print(f"{type(e).__name__}: {str(e)!r}", f"{time.process_time() - start:.1f} s", flush=True)
+            print(
+                f"{type(e).__name__}: {str(e)!r}",
+                f"{time.process_time() - start:.1f} s",
+                flush=True,
+            )
 
 
 def test_files_that_are_refused(tmp_path: Path) -> None:
@@ -143,7 +159,9 @@ def test_files_that_are_refused(tmp_path: Path) -> None:
         make(tmp_path / name)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, __file__, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, env=environment)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=200, env=environment
+    )
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert len(lines) == len(REFUSED)
@@ -174,7 +192,9 @@ def test_what_is_read_stays(tmp_path: Path) -> None:
 
 
 def test_limits(tmp_path: Path) -> None:
-    """A file at the limit is read, as it was when it was opened; one byte more is refused, and so is a zero byte."""
+    """A file at the limit is read, as it was when it was opened; one byte more is refused, and so
+    is a zero byte.
+    """
     (tmp_path / "ten").write_bytes(b"0123456789")
     assert read_whole(tmp_path / "ten", 10) == b"0123456789"
     with pytest.raises(OSError, match="it is larger than 9 bytes"):

@@ -12,7 +12,13 @@ from magshell_fenicsx.simulate.results import differentiable
 CASE = {
     "shell": {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3},
     "boundary": {"equator": "clamped"},
-    "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1, "points": 1},
+    "loading": {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": 0.1,
+        "points": 1,
+    },
     "mesh": {"degree": 3, "refinement": 0.5},
 }
 
@@ -20,7 +26,9 @@ CASE = {
 @pytest.mark.parametrize("factor", ["1/0", "log(-1)", "0", "-1", "1e-30"])
 def test_a_thickness_that_is_none(factor):
     case = Case.model_validate(CASE | {"shell": CASE["shell"] | {"thickness_factor": factor}})
-    with pytest.raises(CaseError, match=r"shell\.thickness_factor: .*: is .* at .*: allowed 0\.001 to 1000"):
+    with pytest.raises(
+        CaseError, match=r"shell\.thickness_factor: .*: is .* at .*: allowed 0\.001 to 1000"
+    ):
         describe(case)
 
 
@@ -33,10 +41,18 @@ def test_a_natural_shape_that_is_none(natural):
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        ({"gradients": {"of": ["nope"]}}, r"gradients\.of: nope: has no gradient here; allowed are knockdown"),
+        (
+            {"gradients": {"of": ["nope"]}},
+            r"gradients\.of: nope: has no gradient here; allowed are knockdown",
+        ),
         ({"gradients": {"by": ["nope"]}}, r"gradients\.by: nope: the case has no such key"),
         (
-            {"design": {"numbers": {"shell.poisson_ratio": [0.2, 0.4]}, "objective": {"maximise": "nope"}}},
+            {
+                "design": {
+                    "numbers": {"shell.poisson_ratio": [0.2, 0.4]},
+                    "objective": {"maximise": "nope"},
+                }
+            },
             r"design\.objective\.maximise: nope: has no gradient here",
         ),
     ],

@@ -23,7 +23,10 @@ PANEL = {"geometry": "cylinder", "radius": 1.0, "length": 0.5, "azimuth": [10, 6
 TORUS = {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "azimuth": [0, 60]}
 ACROSS = {"lambda_m": 1e-3, "applied": {"polar": 90}, "remanent": {"polar": 90}}
 HALVES: dict[str, tuple[list[float], dict[str, Any]]] = {
-    "plate magnetised across its plane": ([1, 0, 0], {"shell": PLATE, "boundary": AROUND, "magnetic": ACROSS}),
+    "plate magnetised across its plane": (
+        [1, 0, 0],
+        {"shell": PLATE, "boundary": AROUND, "magnetic": ACROSS},
+    ),
     "plate clamped at one side": ([0, 1, 0], {"shell": PLATE, "boundary": {"left": "clamped"}}),
     "plate between two clamps, pulled apart": (
         [1, 0, 0],
@@ -31,26 +34,45 @@ HALVES: dict[str, tuple[list[float], dict[str, Any]]] = {
             "shell": PLATE,
             "boundary": {"bottom": "clamped"},
             "loading": DEAD
-            | {"loads": [{"edge": "left", "force": [-1e-6, 0, 0]}, {"edge": "right", "force": [1e-6, 0, 0]}]},
+            | {
+                "loads": [
+                    {"edge": "left", "force": [-1e-6, 0, 0]},
+                    {"edge": "right", "force": [1e-6, 0, 0]},
+                ]
+            },
         },
     ),
     "square plate clamped at two sides": (
         [1, -1, 0],
         {"shell": SQUARE, "boundary": {"left": "clamped", "bottom": "clamped"}},
     ),
-    "panel": ([-np.sin(np.radians(37.5)), np.cos(np.radians(37.5)), 0], {"shell": PANEL, "boundary": AROUND}),
+    "panel": (
+        [-np.sin(np.radians(37.5)), np.cos(np.radians(37.5)), 0],
+        {"shell": PANEL, "boundary": AROUND},
+    ),
     "panel under live pressure": (
         [0, 0, 1],
         {
             "shell": PANEL,
             "boundary": AROUND | {"left": "hinged"},
-            "loading": {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.05, "points": 1},
+            "loading": {
+                "kind": "pressure",
+                "until": "target",
+                "control": "load",
+                "pressure": 0.05,
+                "points": 1,
+            },
         },
     ),
     "sector of a ring": (
         [-np.sin(np.radians(27.5)), np.cos(np.radians(27.5)), 0],
         {
-            "shell": {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "azimuth": [-30, 85]},
+            "shell": {
+                "geometry": "annulus",
+                "radius": 1.0,
+                "inner_radius": 0.5,
+                "azimuth": [-30, 85],
+            },
             "boundary": {"outer": "clamped"},
         },
     ),
@@ -70,7 +92,9 @@ def case(symmetry: str, **sections: Any) -> ms.Case:
 
 @pytest.mark.parametrize("name", HALVES)
 def test_half_and_whole_agree(name: str) -> None:
-    """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of that."""
+    """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of
+    that.
+    """
     normal, sections = HALVES[name]
     asked = case("auto", **sections)
     problem = make_problem(asked)
@@ -113,15 +137,30 @@ def test_a_half_of_a_solid_knows_the_modes_of_the_whole() -> None:
 NOT_HALVED: list[dict[str, Any]] = [
     {"shell": PLATE, "boundary": {"left": "clamped", "bottom": "hinged"}},
     {"shell": PLATE | {"thickness_factor": "1 + x*y"}, "boundary": AROUND},
-    {"shell": PLATE, "boundary": {"left": {"held": ["x", "y", "z"]}}, "points": {"A": [1, 0, 0], "B": [1, 0.5, 0]}},
+    {
+        "shell": PLATE,
+        "boundary": {"left": {"held": ["x", "y", "z"]}},
+        "points": {"A": [1, 0, 0], "B": [1, 0.5, 0]},
+    },
     {
         "shell": PLATE,
         "boundary": {"left": "clamped"},
         "loading": DEAD | {"loads": [{"edge": "right", "force": [0, 1e-6, 0]}]},
     },
-    {"shell": SQUARE, "boundary": {"A": {"held": ["x", "y", "z"]}, "left": "hinged"}, "points": {"A": [1, 0, 0]}},
-    {"shell": PANEL, "boundary": AROUND | {"left": {"held": ["x"]}, "right": {"held": ["x"]}, "top": "free"}},
-    {"shell": PLATE, "boundary": AROUND, "magnetic": ACROSS | {"applied": {"polar": 45, "azimuth": 30}}},
+    {
+        "shell": SQUARE,
+        "boundary": {"A": {"held": ["x", "y", "z"]}, "left": "hinged"},
+        "points": {"A": [1, 0, 0]},
+    },
+    {
+        "shell": PANEL,
+        "boundary": AROUND | {"left": {"held": ["x"]}, "right": {"held": ["x"]}, "top": "free"},
+    },
+    {
+        "shell": PLATE,
+        "boundary": AROUND,
+        "magnetic": ACROSS | {"applied": {"polar": 45, "azimuth": 30}},
+    },
 ]
 
 
@@ -142,7 +181,11 @@ def test_a_half_knows_the_modes_of_the_whole() -> None:
 
 
 def written(
-    file: Path, nodes: NDArray[np.float64], cells: NDArray[np.int64], rim: NDArray[np.int64], order: int = 3
+    file: Path,
+    nodes: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    rim: NDArray[np.int64],
+    order: int = 3,
 ) -> Path:
     """A file of triangles, with the edge `rim`."""
     gmsh.initialize(readConfigFiles=False, interruptible=False)
@@ -188,15 +231,34 @@ def result(asked: ms.Case, column: str) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("column", FOUND)
 def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> None:
-    """F(10) and k_d on the triangles of the built-in half, cubic in place of exact; by half and whole."""
+    """F(10) and k_d on the triangles of the built-in half, cubic in place of exact; by half and
+    whole.
+    """
     defect, loading = FOUND[column]
     shell = {"geometry": "hemisphere", "radius_to_thickness": 1 / H, "poisson_ratio": NU, **defect}
     mesh = {"degree": 3, "refinement": 0.5}
-    data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": loading, "mesh": mesh, "symmetry": "half"}
+    data = {
+        "shell": shell,
+        "boundary": {"equator": "clamped"},
+        "loading": loading,
+        "mesh": mesh,
+        "symmetry": "half",
+    }
     built_in = ms.Case.from_source(data)
     file = mesh_of(built_in, tmp_path / "hemisphere.msh")
-    shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, "thickness": H, "poisson_ratio": NU}
-    data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3}, "loading": loading}
+    shell = {
+        "geometry": "mesh",
+        "file": str(file),
+        "radius": 1.0,
+        "thickness": H,
+        "poisson_ratio": NU,
+    }
+    data = {
+        "shell": shell,
+        "boundary": {"rim": "clamped"},
+        "mesh": {"degree": 3},
+        "loading": loading,
+    }
     if column == "force":
         data |= {"points": {"A": [0, 0, 1]}, "loading": loading | {"at": {"point": "A"}}}
     half, whole = (ms.Case.from_source(data | {"symmetry": s}) for s in ("auto", "none"))
@@ -217,7 +279,9 @@ def test_a_mesh_file_with_a_curve_in_its_plane(model: dict[str, Any], tmp_path: 
     nodes = patch.embedding(patch.nodes)
     move = (nodes[:, 0] > 0.51) & (nodes[:, 0] < 0.99) & (nodes[:, 1] > 0.01) & (nodes[:, 1] < 0.49)
     nodes[move] += [0.03, 0.02, 0.0]
-    file = written(tmp_path / "plate.msh", nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
+    file = written(
+        tmp_path / "plate.msh", nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1
+    )
     shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, **MATERIAL}
     sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {}, **model}
     assert not make_problem(case("auto", **sections)).mirror

@@ -46,7 +46,9 @@ HALVES: dict[str, tuple[str, dict[str, Any]]] = {
         "y",
         {
             "shells": CREASE,
-            "joints": [{"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 1e-7}],
+            "joints": [
+                {"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 1e-7}
+            ],
             "loading": dead(WEIGHT),
         },
     ),
@@ -58,28 +60,48 @@ HALVES: dict[str, tuple[str, dict[str, Any]]] = {
                 "high": tube(1, thickness_factor="1 + x*y/4") | {"points": {"end": [0, -1, 0.5]}},
             },
             "loading": dead({"over": "high", "per_area": [1e-7, 1e-7, 0]}),
-            "mesh": {"degree": 3, "size": 0.27},  # 24 elements around the axis, a line of them at 45 degrees
+            "mesh": {
+                "degree": 3,
+                "size": 0.27,
+            },  # 24 elements around the axis, a line of them at 45 degrees
         },
     ),
     "tubes beside each other": (
         "y",
         {
-            "shells": {"low": tube(0), "high": tube(1) | {"place": {"position": [3, 0, 0], "axis": {"polar": 40}}}},
-            "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-5, "points": 1},
+            "shells": {
+                "low": tube(0),
+                "high": tube(1) | {"place": {"position": [3, 0, 0], "axis": {"polar": 40}}},
+            },
+            "loading": {
+                "kind": "pressure",
+                "control": "load",
+                "until": "target",
+                "pressure": 1e-5,
+                "points": 1,
+            },
         },
     ),
 }
 
 
 def asked(name: str, symmetry: str) -> Case:
-    return Case.from_source({"mesh": {"degree": 3, "size": 0.25}, "symmetry": symmetry, **HALVES[name][1]})
+    return Case.from_source(
+        {"mesh": {"degree": 3, "size": 0.25}, "symmetry": symmetry, **HALVES[name][1]}
+    )
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=[pytest.mark.slow] * (each == "tubes with one axis")) for each in HALVES]
+    "name",
+    [
+        pytest.param(each, marks=[pytest.mark.slow] * (each == "tubes with one axis"))
+        for each in HALVES
+    ],
 )
 def test_half_and_whole_agree(name: str) -> None:
-    """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of that; 1e-8."""
+    """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of
+    that; 1e-8.
+    """
     seen = []
     for symmetry in ("auto", "none"):
         scene = Scene(asked(name, symmetry))
@@ -93,14 +115,28 @@ def test_half_and_whole_agree(name: str) -> None:
         assert half[column] == pytest.approx(whole[column], rel=1e-8, abs=1e-13), column
 
 
-def pressed(shell: dict[str, Any], place: dict[str, Any], boundary: dict[str, str], **move: Any) -> dict[str, Any]:
+def pressed(
+    shell: dict[str, Any], place: dict[str, Any], boundary: dict[str, str], **move: Any
+) -> dict[str, Any]:
     """Two of a shell, the upper one at a place, and pushed on the lower one."""
     lower = {"shell": {**shell, **MATERIAL}, "boundary": boundary}
-    moved = [{**move, "supports": [f"upper.{name}" for name, held in boundary.items() if held == "clamped"]}]
+    moved = [
+        {
+            **move,
+            "supports": [f"upper.{name}" for name, held in boundary.items() if held == "clamped"],
+        }
+    ]
     return {
         "shells": {"lower": lower, "upper": {**lower, "place": place}},
         "contact": [["upper", "lower"]],
-        "loading": {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1, "moves": moved},
+        "loading": {
+            "kind": "edge",
+            "name": "w",
+            "control": "load",
+            "factor": 1,
+            "points": 1,
+            "moves": moved,
+        },
     }
 
 
@@ -138,19 +174,26 @@ def exactly() -> Iterator[None]:
 
 @pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=[pytest.mark.slow] * each.startswith("caps")) for each in PRESSED]
+    "name",
+    [pytest.param(each, marks=[pytest.mark.slow] * each.startswith("caps")) for each in PRESSED],
 )
 def test_pressed_halves_are_the_whole(name: str) -> None:
-    """The half's equilibrium and its image are one of all shells on the mirrored mesh, with its forces: 1e-7."""
+    """The half's equilibrium and its image are one of all shells on the mirrored mesh, with its
+    forces: 1e-7.
+    """
     across, size, data = PRESSED[name]
     data = data | {"mesh": {"degree": 3, "size": size}}
-    half, whole = (Scene(Case.from_source(data | {"symmetry": symmetry})) for symmetry in ("half", "none"))
+    half, whole = (
+        Scene(Case.from_source(data | {"symmetry": symmetry})) for symmetry in ("half", "none")
+    )
     plane = half.problem.mirror
     assert plane is not None
     assert abs(plane.normal @ ACROSS[across]) == pytest.approx(1)
     places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
     beyond = plane.beyond(all_places) < -1e-9
-    far, node = cKDTree(places).query(np.where(beyond[:, None], plane.image(all_places), all_places))
+    far, node = cKDTree(places).query(
+        np.where(beyond[:, None], plane.image(all_places), all_places)
+    )
     assert far.max() < 1e-12
     *_, last = follow(half)
     u = half.model.system.with_ghosts(last.point.state.u, last.point.state.mu).reshape(-1, 3)[node]
@@ -174,7 +217,10 @@ def test_modes_of_both_sides() -> None:
     assert values[0] == pytest.approx(values[1], rel=1e-7)
 
 
-PLIES = {"along": [0, 0, 1], "plies": [{"angle": 30, "E1": 2, "E2": 1, "nu12": 0.3, "G12": 0.4, "fraction": 1}]}
+PLIES = {
+    "along": [0, 0, 1],
+    "plies": [{"angle": 30, "E1": 2, "E2": 1, "nu12": 0.3, "G12": 0.4, "fraction": 1}],
+}
 NOT_HALVED: dict[str, dict[str, Any]] = {
     "planes of their own": {"shells": {"low": tube(0), "high": plate([3, 1, 0], boundary={"left": "clamped"})}},
     "one that is held by nothing": {"shells": {"low": tube(0), "high": plate([3, -0.25, 0])}},

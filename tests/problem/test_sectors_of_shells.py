@@ -37,7 +37,9 @@ def wall(radius: float) -> dict[str, Any]:
 
 JOINED: dict[str, Any] = {
     "shells": {"lower": RING, "tube": wall(0.6)},
-    "joints": [{"edges": ["tube.bottom", "lower.inner"], "kind": "spring", "stiffness": 1e-4, "angle": 30}],
+    "joints": [
+        {"edges": ["tube.bottom", "lower.inner"], "kind": "spring", "stiffness": 1e-4, "angle": 30}
+    ],
     "mesh": {"degree": 3, "size": 0.2},
 }
 
@@ -54,7 +56,10 @@ NOT_THERE: dict[str, tuple[dict[str, Any], str]] = {
         "no two mirror planes .* each shell is held, and its own image in both",
     ),
     "a T-junction": (
-        {"shells": {"lower": RING, "web": wall(0.8)}, "joints": [{"edges": ["web.bottom", "lower"]}]},
+        {
+            "shells": {"lower": RING, "web": wall(0.8)},
+            "joints": [{"edges": ["web.bottom", "lower"]}],
+        },
         "symmetry: 6: not with a T-junction: take symmetry: half",
     ),
 }
@@ -64,7 +69,9 @@ NOT_THERE: dict[str, tuple[dict[str, Any], str]] = {
 def test_no_sector(name: str) -> None:
     keys, message = NOT_THERE[name]
     with pytest.raises((CaseError, MeshError), match=message):
-        make_problem(Case.from_source({**RINGS, "contact": [], "symmetry": 6, **keys})).triangulated()
+        make_problem(
+            Case.from_source({**RINGS, "contact": [], "symmetry": 6, **keys})
+        ).triangulated()
 
 
 def symmetric(scene: Scene, size: float) -> np.ndarray:
@@ -73,43 +80,70 @@ def symmetric(scene: Scene, size: float) -> np.ndarray:
     x = model.r0.x.array[: model.system.size].reshape(-1, 3)
     angle, rho = np.arctan2(x[:, 1], x[:, 0]), np.hypot(x[:, 0], x[:, 1])
     begin = scene.problem.mirror.azimuth  # type: ignore[union-attr]
-    wave, out = np.cos(m * (angle - begin)), np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    wave, out = (
+        np.cos(m * (angle - begin)),
+        np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]),
+    )
     u = size * h * ((1 + 0.1 * wave) * rho)[:, None] * (0.2 * out + [0, 0, 1])
     upper = x[:, 2] > 0.5 * h
     u[upper] = -u[upper]
     return np.asarray(model.system.held(u.ravel()))
 
 
-@pytest.mark.parametrize("name", ["rings", pytest.param("gripper", marks=pytest.mark.slow), "joined"])
+@pytest.mark.parametrize(
+    "name", ["rings", pytest.param("gripper", marks=pytest.mark.slow), "joined"]
+)
 def test_copies_make_the_half(name: str) -> None:
-    """Energy, contact force and residual of the half at the copies of a displacement: those of the sector, 1e-9."""
+    """Energy, contact force and residual of the half at the copies of a displacement: those of the
+    sector, 1e-9.
+    """
     scene = Scene(sector(name))
     model, waves = scene.model, scene.problem.mirror.waves  # type: ignore[union-attr]
     assert isinstance(model, ShellModel)
     assert isinstance(model.excluded_modes, UnfoldedModes)
     half = model.excluded_modes.half
     assert (model.multiplicity, half.multiplicity) == (2 * waves, 2)
-    size = {"rings": 0.4, "gripper": 2.0, "joined": 1e-7}[name]  # the sine of its angles is the angle
+    size = {"rings": 0.4, "gripper": 2.0, "joined": 1e-7}[
+        name
+    ]  # the sine of its angles is the angle
     u, mu = symmetric(scene, size), {**scene.unloaded().mu}
     mu |= {key: 1e-3 for key in ("lambda_m", "pressure", "fold") if key in mu}
     copies = model.excluded_modes.unfolded(u)
-    way = symmetric(scene, 1.0) * (1 + np.arange(model.system.size) % 2)  # of no meaning, and not along u
+    way = symmetric(scene, 1.0) * (
+        1 + np.arange(model.system.size) % 2
+    )  # of no meaning, and not along u
     way = u if name == "gripper" else model.system.held(way)
-    works = [model.system.residual(u, mu) @ way, half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way)]
+    works = [
+        model.system.residual(u, mu) @ way,
+        half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way),
+    ]
     assert works[1] == pytest.approx(waves * works[0], rel=1e-9)
     if name == "joined":
         return
-    ours, theirs = (system.at(State(v, mu)) for system, v in ((model.system, u), (half.system, copies)))
+    ours, theirs = (
+        system.at(State(v, mu)) for system, v in ((model.system, u), (half.system, copies))
+    )
     forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)
     assert (forces[0] > 0) == (name == "rings")
 
 
 def test_a_ball_on_a_sector() -> None:
-    """A ball on the axis of a cap that has waves around it presses on the copies as on the half, 1e-9."""
+    """A ball on the axis of a cap that has waves around it presses on the copies as on the half,
+    1e-9.
+    """
     cap = {"geometry": "cap", "radius": 1, "polar": 20, **MATERIAL}
-    ball = {"bodies": {"ball": {"kind": "sphere", "radius": 0.2}}, "loading": {"kind": "contact", "approach": 1}}
-    data = {"shell": cap, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3, "size": 0.15}, "symmetry": 3, **ball}
+    ball = {
+        "bodies": {"ball": {"kind": "sphere", "radius": 0.2}},
+        "loading": {"kind": "contact", "approach": 1},
+    }
+    data = {
+        "shell": cap,
+        "boundary": {"rim": "clamped"},
+        "mesh": {"degree": 3, "size": 0.15},
+        "symmetry": 3,
+        **ball,
+    }
     scene = Scene(Case.from_source(data))
     model = scene.model
     assert isinstance(model, ShellModel)
@@ -117,7 +151,10 @@ def test_a_ball_on_a_sector() -> None:
     half, u = model.excluded_modes.half, symmetric(scene, -0.1)
     copies = model.excluded_modes.unfolded(u)
     mu = scene.unloaded().mu | {"approach": 0.5}
-    deep = [each.region(State(v, mu), "approach").penetration for each, v in ((model, u), (half, copies))]
+    deep = [
+        each.region(State(v, mu), "approach").penetration
+        for each, v in ((model, u), (half, copies))
+    ]
     assert deep[0] > 0.1 * h
     assert deep[1] == pytest.approx(deep[0], rel=1e-9)
     works = [model.system.residual(u, mu) @ u, half.system.residual(copies, mu) @ copies]

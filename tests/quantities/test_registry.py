@@ -7,7 +7,13 @@ from magshell_fenicsx import Case, Scene, columns, follow
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.report.verdict import path_table
 from magshell_fenicsx.output.store.table import COLUMNS
-from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES, amplitude, axes_of, quantity
+from magshell_fenicsx.quantities.registry import (
+    AMPLITUDES,
+    QUANTITIES,
+    amplitude,
+    axes_of,
+    quantity,
+)
 
 FIRST_RELEASE = """
 point label amplitude p_over_pc lambda_m force w_over_h w_from_field_over_h w_pole_over_h volume_change energy
@@ -25,7 +31,13 @@ def test_a_run_has_the_columns_of_every_run() -> None:
     data = {
         "shell": {"geometry": "disc", "radius_to_thickness": 20, "poisson_ratio": 0.3},
         "boundary": {"rim": "clamped"},
-        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1, "points": 1},
+        "loading": {
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 0.1,
+            "points": 1,
+        },
         "mesh": {"degree": 2},
     }
     scene = Scene(Case.from_source(Source("disc", data)))
@@ -45,7 +57,10 @@ def test_labels_can_be_drawn(name: str) -> None:
 @pytest.mark.parametrize("name", AMPLITUDES)
 def test_an_amplitude_leads_to_columns(name: str) -> None:
     assert amplitude(name).column in QUANTITIES
-    assert {each.name for each in axes_of(name)} == {amplitude(name).column, amplitude(name).conjugate}
+    assert {each.name for each in axes_of(name)} == {
+        amplitude(name).column,
+        amplitude(name).conjugate,
+    }
 
 
 def test_ones_own_amplitude_is_called_by_its_name() -> None:
@@ -55,7 +70,9 @@ def test_ones_own_amplitude_is_called_by_its_name() -> None:
 
 def test_only_named_points_have_the_unit_of_lengths() -> None:
     """In the report one's own amplitude has no unit."""
-    lines = [{"point": str(i), "label": "step", "my_term": str(i), "A_ux": str(i)} for i in range(2)]
+    lines = [
+        {"point": str(i), "label": "step", "my_term": str(i), "A_ux": str(i)} for i in range(2)
+    ]
     units = {str(column.head): str(column.unit).strip() for column in path_table(lines, "m")}
     assert (units["my term"], units["A ux"]) == ("", "m")
 

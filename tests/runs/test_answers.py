@@ -1,4 +1,6 @@
-"""Runs whose answer is there: what is beyond it is a remark, and pictures show the point that the headline names."""
+"""Runs whose answer is there: what is beyond it is a remark, and pictures show the point that the
+headline names.
+"""
 
 import json
 import re
@@ -23,7 +25,12 @@ def case_of(shell: dict[str, Any], edge: dict[str, str], **sections: Any) -> Cas
 
 def dimpled(radius: float, amplitude: float, **load: Any) -> Case:
     defect = {"kind": "dimple", "amplitude": amplitude, "width": 2.5}
-    shell = {"geometry": "hemisphere", "radius_to_thickness": radius, "poisson_ratio": 0.3, "defect": defect}
+    shell = {
+        "geometry": "hemisphere",
+        "radius_to_thickness": radius,
+        "poisson_ratio": 0.3,
+        "defect": defect,
+    }
     return case_of(shell, {"equator": "clamped"}, loading={"kind": "pressure"} | load)
 
 
@@ -35,7 +42,9 @@ def in_units(polar: float, thickness: str, **sections: Any) -> dict[str, Any]:
 
 def test_load_control_locates_the_fold() -> None:
     """As volume control does; nothing is wrong beyond it."""
-    found, known = (run(dimpled(50, 1.0, control=control, until="limit")) for control in ("load", "volume"))
+    found, known = (
+        run(dimpled(50, 1.0, control=control, until="limit")) for control in ("load", "volume")
+    )
     assert (found.stopped, found.remarks) == (None, [])
     assert found.knockdown == pytest.approx(known.knockdown, rel=1e-7)
     assert found.rows[-1]["label"] == "fold"
@@ -53,8 +62,12 @@ PERFECT = in_units(60, "0.3 mm", mesh=MESH, loading={"kind": "pressure", "until"
 
 
 @pytest.mark.slow
-def test_path_that_is_lost_beyond_the_first_instability(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same k_d as with until: bifurcation, exit code 0, the reason as a remark, and pictures of that point."""
+def test_path_that_is_lost_beyond_the_first_instability(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same k_d as with until: bifurcation, exit code 0, the reason as a remark, and pictures of
+    that point.
+    """
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 9)
     (tmp_path / "cap.yaml").write_text(json.dumps(PERFECT), encoding="utf-8")
     done = magshell("run", tmp_path / "cap.yaml", "--out", tmp_path / "limit")
@@ -69,11 +82,16 @@ def test_path_that_is_lost_beyond_the_first_instability(tmp_path: Path, monkeypa
     number = int(first["point"])
     assert number < summary["points"] - 3
     draw(tmp_path / "limit", number)
-    pictures = [(tmp_path / "limit" / name).read_bytes() for name in ("shell.png", f"shell_{number:04d}.png")]
+    pictures = [
+        (tmp_path / "limit" / name).read_bytes()
+        for name in ("shell.png", f"shell_{number:04d}.png")
+    ]
     assert pictures[0] == pictures[1]
     report = (tmp_path / "limit" / "report.html").read_text(encoding="utf-8")
     assert f"Bending moments at point {number}, the first instability." in report
-    known = run(Case.from_source(PERFECT | {"loading": {"kind": "pressure", "until": "bifurcation"}}))
+    known = run(
+        Case.from_source(PERFECT | {"loading": {"kind": "pressure", "until": "bifurcation"}})
+    )
     assert summary["knockdown"] == pytest.approx(known.knockdown, rel=1e-9)
 
 
@@ -84,7 +102,9 @@ def test_python_hears_what_is_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "bifurcation" in labels
 
 
-def test_path_that_is_lost_before_an_instability_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_that_is_lost_before_an_instability_is_no_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 3)
     found = run(Case.from_source(PERFECT))
     assert found.stopped
@@ -93,7 +113,9 @@ def test_path_that_is_lost_before_an_instability_is_no_answer(monkeypatch: pytes
 
 @pytest.mark.slow
 def test_snap_of_a_shell_that_has_buckled_before() -> None:
-    """A shallow cap has waves before its fold; the remark names the first of them, which the path has located."""
+    """A shallow cap has waves before its fold; the remark names the first of them, which the path
+    has located.
+    """
     load = {"kind": "pressure", "until": "limit", "then": "snap"}
     data = in_units(25, "0.6 mm", mesh=MESH, loading=load) | {"boundary": {"rim": "hinged"}}
     heard, records = list[str](), list[Any]()
@@ -111,24 +133,36 @@ def test_snap_of_a_shell_that_has_buckled_before() -> None:
 
 @pytest.mark.slow
 def test_plate_on_a_deep_cap_snaps() -> None:
-    """Where it snaps a finer mesh (refinement 2) has 5.40719 h; behind it the contact goes back the way it came."""
+    """Where it snaps a finer mesh (refinement 2) has 5.40719 h; behind it the contact goes back the
+    way it came.
+    """
     loading = {"kind": "contact", "approach": "8 mm", "points": 10}
     data = in_units(40, "0.5 mm", bodies={"plate": {"kind": "plane"}}, loading=loading)
     found = run(Case.from_source(data))
     (fold,) = (row for row in found.rows if row["label"] == "fold")
     assert fold["approach_over_h"] == pytest.approx(5.40719, rel=1e-3)
     assert found.stopped
-    assert "at its fold the shell snaps under a given approach; the last fold is at approach = 5.4" in found.stopped
+    assert (
+        "at its fold the shell snaps under a given approach; the last fold is at approach = 5.4"
+        in found.stopped
+    )
     assert found.rows[-1]["approach_over_h"] > 5
 
 
 def test_line_of_a_fold_has_the_force_of_its_body() -> None:
     """Of two bodies; the column `force` is of no body then."""
-    ball = {"kind": "sphere", "radius": "3 mm", "side": "inside", "position": ["0 mm", "0 mm", "10 mm"]}
+    ball = {
+        "kind": "sphere",
+        "radius": "3 mm",
+        "side": "inside",
+        "position": ["0 mm", "0 mm", "10 mm"],
+    }
     bodies = {"plate": {"kind": "plane"}, "ball": ball | {"direction": [0, 0, 1]}}
     loading = {"kind": "contact", "body": "plate", "until": "limit"}
     lines = list[str]()
-    found = run(Case.from_source(in_units(22, "0.5 mm", bodies=bodies, loading=loading)), say=lines.append)
+    found = run(
+        Case.from_source(in_units(22, "0.5 mm", bodies=bodies, loading=loading)), say=lines.append
+    )
     fold = next(line for line in lines if " fold " in line)
     assert found.rows[-1]["force_plate_N"] == pytest.approx(0.0696, rel=1e-3)
     assert f"F {found.rows[-1]['force_plate_N']:9.5g} N" in fold
@@ -142,7 +176,9 @@ def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
     field = {"lambda_m": 0.0005, "remanent": {"polar": 0}, "applied": {"polar": 0}}
     data = {"shell": shell, "boundary": {"equator": "clamped"}, "magnetic": field}
     data |= {"loading": {"kind": "pressure", "until": "limit"}}
-    (tmp_path / "case.yaml").write_text(json.dumps(data | {"mesh": {"tolerance": 1e-4}}), encoding="utf-8")
+    (tmp_path / "case.yaml").write_text(
+        json.dumps(data | {"mesh": {"tolerance": 1e-4}}), encoding="utf-8"
+    )
     done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / "out", "--no-pictures")
     assert done.returncode == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
@@ -150,7 +186,9 @@ def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
     assert known["error_estimate"] == min(each["estimate"] for each in known["rounds"])
     exact = run(Case.from_source(data | {"mesh": {"degree": 5, "refinement": 2.0}})).knockdown
     assert summary["knockdown"] == pytest.approx(exact, rel=max(known["error_estimate"], 1e-8))
-    told = re.search(r" The estimated relative error of the result is (\S+)\.$", done.stdout.rstrip())
+    told = re.search(
+        r" The estimated relative error of the result is (\S+)\.$", done.stdout.rstrip()
+    )
     assert told
     assert float(told[1]) == pytest.approx(known["error_estimate"], rel=0.05)
 
@@ -160,5 +198,8 @@ def test_better_round_than_that_of_the_mesh_that_is_taken() -> None:
     rounds = [Round(3, 0.5, 300, 5000, 0.330001, 2e-6), Round(3, 0.4, 200, 3000, 0.3301, 5e-4)]
     made = Adapted(dimpled(50, 1.0).problem(), Choice(3, 0.4), rounds[1], rounds)
     known = made.account(0.3301)
-    assert (known["error_estimate"], known["best"]) == (5e-4, {"result": 0.330001, "error_estimate": 2e-6})
+    assert (known["error_estimate"], known["best"]) == (
+        5e-4,
+        {"result": 0.330001, "error_estimate": 2e-6},
+    )
     assert made.account(0.5)["best"] is None

@@ -49,20 +49,31 @@ LONGEST = swapped(b"MSF1", b"MSF1" + (2**62).to_bytes(8, "little"))
 PATH = {
     "binary": BINARY,
     "no table": one_of(b"a\nb\n"),
-    **{text[:4]: swapped(b"step,pressure,0.", f"step,pressure,{text}".encode()) for text in ("1e308", 5000 * "1")},
+    **{
+        text[:4]: swapped(b"step,pressure,0.", f"step,pressure,{text}".encode())
+        for text in ("1e308", 5000 * "1")
+    },
     **{text: in_first_row("w_over_h", text) for text in ("nan", "inf")},
     "word": swapped(b"step,pressure,0.", b"step,pressure,abc"),
     "no such load": swapped(b"step,pressure,", b"step,pressurf,"),
     "a count": swapped(b"\r\n1,step", b"\r\n1.5,step"),
     "a short row": swapped(b"\r\n2,step", b"\r\n2\r\n2,step"),
 }
-JSON = {name: one_of(name.encode()) for name in ("{", "[]", "{}", '{"a": 1}', "3", '{"case": 3}')} | {"binary": BINARY}
+JSON = {
+    name: one_of(name.encode()) for name in ("{", "[]", "{}", '{"a": 1}', "3", '{"case": 3}')
+} | {"binary": BINARY}
 FIELDS = {"cut": cut, "binary": BINARY, "another array": swapped(b'"r0"', b'"r1"')}
-HEADS = {name: one_of(framed(name.encode())) for name in ("[1]", "3", "{")} | {"long": LONGEST, "binary": BINARY}
+HEADS = {name: one_of(framed(name.encode())) for name in ("[1]", "3", "{")} | {
+    "long": LONGEST,
+    "binary": BINARY,
+}
 OF_COMPLETE = [
     *(("path.csv", name, damage) for name, damage in PATH.items()),
     *(("summary.json", name, damage) for name, damage in JSON.items()),
-    *(("summary.json", f"no {key}", swapped(f'"{key}"'.encode(), b'"other"')) for key in ("stopped", "jit_s", "dofs")),
+    *(
+        ("summary.json", f"no {key}", swapped(f'"{key}"'.encode(), b'"other"'))
+        for key in ("stopped", "jit_s", "dofs")
+    ),
     *(("fields/point_0004.vtu", name, damage) for name, damage in FIELDS.items()),
 ]
 OF_INTERRUPTED = [
@@ -73,7 +84,9 @@ OF_INTERRUPTED = [
 
 def named(damages: list[tuple[str, str, Damage]]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(
-        ("name", "damage"), [(f, d) for f, _, d in damages], ids=[f"{f}: {how}" for f, how, _ in damages]
+        ("name", "damage"),
+        [(f, d) for f, _, d in damages],
+        ids=[f"{f}: {how}" for f, how, _ in damages],
     )
 
 
@@ -127,7 +140,9 @@ def test_of_a_complete_run(complete: Path, tmp_path: Path, name: str, damage: Da
 
 
 @named(OF_INTERRUPTED)
-def test_of_an_interrupted_run(interrupted: Path, tmp_path: Path, name: str, damage: Damage) -> None:
+def test_of_an_interrupted_run(
+    interrupted: Path, tmp_path: Path, name: str, damage: Damage
+) -> None:
     """Nothing is changed by the refusal."""
     file = damaged(interrupted, tmp_path / "out", name, damage)
     before = file.read_bytes()
@@ -147,15 +162,24 @@ def test_a_field_that_is_cut_off_is_written_again(
     assert file.read_bytes() == (complete / "fields/point_0002.vtu").read_bytes()
 
 
-def test_an_interrupted_run_is_not_erased(interrupted: Path, tmp_path: Path, no_pictures: None) -> None:
-    """It says what is there: points, when, why; `--overwrite` starts again. A killed run has no summary."""
+def test_an_interrupted_run_is_not_erased(
+    interrupted: Path, tmp_path: Path, no_pictures: None
+) -> None:
+    """It says what is there: points, when, why; `--overwrite` starts again.
+
+    A killed run has no summary.
+    """
     out = tmp_path / "out"
     shutil.copytree(interrupted, out)
     for how in ("interrupted by the time limit of 0 s", "killed, or its machine stopped"):
         refused = magshell("run", *CASE, "--out", out)
         assert refused.returncode == 2
-        assert refused.stderr.startswith(f"--out {out}: has a run that was not finished: 4 points, the last on 20")
-        assert refused.stderr.endswith(f"; {how}. Give --resume to continue it, or --overwrite to start again\n")
+        assert refused.stderr.startswith(
+            f"--out {out}: has a run that was not finished: 4 points, the last on 20"
+        )
+        assert refused.stderr.endswith(
+            f"; {how}. Give --resume to continue it, or --overwrite to start again\n"
+        )
         assert len(read_path(out)) == 4
         for file in ("summary.json", "report.html", "written.txt"):
             (out / file).unlink(missing_ok=True)
@@ -172,7 +196,9 @@ SPECIAL: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", SPECIAL)
-@pytest.mark.parametrize("name", ["path.csv", "summary.json", "checkpoint", "written.txt", "fields/point_0001.vtu"])
+@pytest.mark.parametrize(
+    "name", ["path.csv", "summary.json", "checkpoint", "written.txt", "fields/point_0001.vtu"]
+)
 def test_no_regular_file(complete: Path, tmp_path: Path, name: str, kind: str) -> None:
     """It is named, neither waited for nor read without end, and no file beside it is lost."""
     out = tmp_path / "out"
@@ -197,7 +223,10 @@ def test_linked_fields(complete: Path, tmp_path: Path) -> None:
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     for how in ((), ("--overwrite",), ("--resume",)):
         refused = magshell("run", *CASE, "--out", out, *how)
-        assert (refused.returncode, "known to have written: fields (a link); move" in refused.stderr) == (2, True)
+        assert (
+            refused.returncode,
+            "known to have written: fields (a link); move" in refused.stderr,
+        ) == (2, True)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
@@ -206,7 +235,9 @@ def test_linked_fields(complete: Path, tmp_path: Path) -> None:
 def test_killed_while_making_room(
     of: str, removed: int, tmp_path: Path, request: pytest.FixtureRequest, no_pictures: None
 ) -> None:
-    """What is left of the earlier run is never said to be complete, and the new run can be started again."""
+    """What is left of the earlier run is never said to be complete, and the new run can be started
+    again.
+    """
     out, unlink, done = tmp_path / "out", Path.unlink, list[Path]()
     shutil.copytree(request.getfixturevalue(of), out)
 
@@ -225,7 +256,9 @@ def test_killed_while_making_room(
     (out / "checkpoint.new.unfinished").write_bytes(b"MSF1")  # of one more start, killed earlier
     resumed = magshell("run", *CASE, "--out", out, "--resume")
     assert resumed.returncode == 2
-    assert resumed.stderr.startswith(f"--resume: {out}: a new run was interrupted while it removed the files")
+    assert resumed.stderr.startswith(
+        f"--resume: {out}: a new run was interrupted while it removed the files"
+    )
     assert magshell("run", *CASE, "--out", out).returncode == 0
     assert not list(out.glob("checkpoint*"))
     assert len(read_path(out)) == 5

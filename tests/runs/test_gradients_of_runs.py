@@ -31,15 +31,21 @@ def summary(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_fold_of_a_meridian(tmp_path: Path) -> None:
-    """A stronger magnet everywhere is a larger lambda_m; interrupted and resumed, the run has the same gradients."""
+    """A stronger magnet everywhere is a larger lambda_m; interrupted and resumed, the run has the
+    same gradients.
+    """
     out = tmp_path / "out"
     assert magshell("run", WHERE, "--out", out, ranks=1).returncode == 0
     found = summary(out)["gradients"]["knockdown"]
     assert found["value"] == pytest.approx(0.44727601, rel=1e-7)
-    assert found["fields"]["magnitude"]["alike"][0] == pytest.approx(0.001 * found["numbers"]["lambda_m"], rel=1e-8)
+    assert found["fields"]["magnitude"]["alike"][0] == pytest.approx(
+        0.001 * found["numbers"]["lambda_m"], rel=1e-8
+    )
     surface, _ = read_vtu(out / "fields/gradients_knockdown.vtu")
     assert surface.fields["remanence"].shape == surface.r0.shape
-    assert np.abs(surface.fields["thickness"]).max() == pytest.approx(found["fields"]["thickness"]["most_per_area"])
+    assert np.abs(surface.fields["thickness"]).max() == pytest.approx(
+        found["fields"]["thickness"]["most_per_area"]
+    )
     assert "most per area" in (out / "report.html").read_text(encoding="utf-8")
     again = tmp_path / "again"
     assert magshell("run", WHERE, "--out", again, "--time-limit", "0.01", ranks=1).returncode != 0
@@ -55,7 +61,9 @@ def test_same_on_ranks(tmp_path: Path) -> None:
     found = {}
     for ranks in (1, 2):
         coarse = "--set=mesh.refinement=0.5"
-        done = magshell("run", tmp_path / "strip.yaml", coarse, "--out", tmp_path / f"{ranks}", ranks=ranks)
+        done = magshell(
+            "run", tmp_path / "strip.yaml", coarse, "--out", tmp_path / f"{ranks}", ranks=ranks
+        )
         assert done.returncode == 0, done.stderr
         surface, _ = read_vtu(tmp_path / f"{ranks}/fields/gradients_tip_uz.vtu")
         found[ranks] = summary(tmp_path / f"{ranks}")["gradients"]["tip_uz"], surface
@@ -65,10 +73,15 @@ def test_same_on_ranks(tmp_path: Path) -> None:
     order = cKDTree(there.r0).query(surface.r0)[1]
     for name, field in numbers["fields"].items():
         size = field["most_per_area"]
-        assert other["fields"][name]["alike"] == pytest.approx(field["alike"], rel=1e-6, abs=1e-6 * size), name
+        assert other["fields"][name]["alike"] == pytest.approx(
+            field["alike"], rel=1e-6, abs=1e-6 * size
+        ), name
     for name, values in surface.fields.items():
         size = np.abs(values).max()
-        here, other_half = np.abs(values), np.abs(there.fields[name][order])  # on the mirror plane both images lie
+        here, other_half = (
+            np.abs(values),
+            np.abs(there.fields[name][order]),
+        )  # on the mirror plane both images lie
         np.testing.assert_allclose(other_half, here, rtol=0, atol=1e-5 * size, err_msg=name)
 
 
@@ -80,14 +93,24 @@ def test_same_on_ranks(tmp_path: Path) -> None:
             "gradients.of: sideways: has no gradient here; allowed are knockdown, buckling_pressure_Pa",
         ),
         ("{of: [force_N]}", "gradients.of: force_N: has no gradient here; allowed are"),
-        ("{of: [buckling_pressure_Pa]}", "buckling_pressure_Pa: the case has no such unit; knockdown has none"),
+        (
+            "{of: [buckling_pressure_Pa]}",
+            "buckling_pressure_Pa: the case has no such unit; knockdown has none",
+        ),
         ("{of: [tip_uz], by: [magnets]}", "gradients.by: magnets: the case has no such key"),
     ],
 )
 def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
     """Said before the run."""
     (tmp_path / "strip.yaml").write_text(STRIP)
-    done = magshell("run", tmp_path / "strip.yaml", "--out", tmp_path / "out", f"--set=gradients={section}", ranks=1)
+    done = magshell(
+        "run",
+        tmp_path / "strip.yaml",
+        "--out",
+        tmp_path / "out",
+        f"--set=gradients={section}",
+        ranks=1,
+    )
     assert done.returncode == 2
     assert message in done.stderr
     assert not (tmp_path / "out/path.csv").exists()
@@ -104,7 +127,9 @@ def test_one_key_without_a_gradient(tmp_path: Path) -> None:
         ("some", "[thickness, shell.poisson_ratio]"),
     ):
         asked = f"--set=gradients={{of: [tip_uz], by: {by}}}"
-        done = magshell("run", tmp_path / "strip.yaml", coarse, asked, "--out", tmp_path / out, ranks=1)
+        done = magshell(
+            "run", tmp_path / "strip.yaml", coarse, asked, "--out", tmp_path / out, ranks=1
+        )
         assert done.returncode == 0, done.stderr
         said = "warning: no gradient of tip_uz by magnetic.remanent.azimuth: "
         assert (said in done.stdout) == (out == "all")
@@ -124,16 +149,22 @@ gradients: {of: [buckling_pressure_Pa, pressure_Pa, w_pole_mm], by: [shell.young
 def test_results_in_units(tmp_path: Path) -> None:
     """Against the difference of two runs; E changes k_d, by the field, and the classical pressure.
 
-    The pressure where the path ends is that of the fold; the displacement there moves along the path, and it once had
-    the derivative at the point before the fold.
+    The pressure where the path ends is that of the fold; the displacement there moves along the
+    path, and it once had the derivative at the point before the fold.
     """
     (tmp_path / "cap.yaml").write_text(IN_UNITS, encoding="utf-8")
-    done = magshell("run", tmp_path / "cap.yaml", "--out", tmp_path / "out", "--no-pictures", ranks=1)
+    done = magshell(
+        "run", tmp_path / "cap.yaml", "--out", tmp_path / "out", "--no-pictures", ranks=1
+    )
     assert "no gradient of w_pole_mm: the path ends at a fold, which moves" in done.stdout
     found = summary(tmp_path / "out")["gradients"]
 
     def buckling(modulus: float) -> float:
-        result = ms.run(ms.Case.load(tmp_path / "cap.yaml", [f"shell.youngs_modulus={modulus} Pa", "gradients=null"]))
+        result = ms.run(
+            ms.Case.load(
+                tmp_path / "cap.yaml", [f"shell.youngs_modulus={modulus} Pa", "gradients=null"]
+            )
+        )
         assert result.knockdown
         return result.knockdown * result.scene.sizes.of["p_c"]
 

@@ -1,4 +1,6 @@
-"""Signals, a time limit, a full disk, a lost rank: a clear message, readable files, and the run can go on."""
+"""Signals, a time limit, a full disk, a lost rank: a clear message, readable files, and the run can
+go on.
+"""
 
 import json
 import os
@@ -23,7 +25,10 @@ LONG = (CASES / "pole_indentation.yaml", "--set=loading.points=30", "--set=mesh.
 # of a surface the checkpoint soon is larger than a file of fields
 SURFACE = (
     CASES / "pole_indentation.yaml",
-    *(f"--set={key}" for key in ("loading.points=40", "mesh.degree=3", "mesh.refinement=0.2", "symmetry=half")),
+    *(
+        f"--set={key}"
+        for key in ("loading.points=40", "mesh.degree=3", "mesh.refinement=0.2", "symmetry=half")
+    ),
 )
 GOES_ON = "; the results so far are in {out}/, and --resume continues from there\n"
 
@@ -53,8 +58,12 @@ def check_goes_on(out: Path, reference: Path, case: tuple[Path | str, ...] = LON
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ranks", "number"), [(0, signal.SIGINT), (2, signal.SIGUSR1)])
-def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, number: signal.Signals) -> None:
-    """mpirun passes SIGUSR1 to all; one rank of two is stopped below, and a hang-up is obeyed or not."""
+def test_signal(
+    tmp_path: Path, reference: Path, no_pictures: None, ranks: int, number: signal.Signals
+) -> None:
+    """mpirun passes SIGUSR1 to all; one rank of two is stopped below, and a hang-up is obeyed or
+    not.
+    """
     out = tmp_path / "out"
     run = start("run", *LONG, "--out", out, ranks=ranks)
     wait_for_rows(run, out, 3)
@@ -65,13 +74,18 @@ def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, 
         assert f"stopped early: interrupted by {number.name}" + GOES_ON.format(out=out) in said
     assert "Traceback" not in said
     assert 3 <= len(read_path(out)) < len(read_path(reference))
-    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"] == f"interrupted by {number.name}"
+    assert (
+        json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+        == f"interrupted by {number.name}"
+    )
     check_goes_on(out, reference)
 
 
 @pytest.mark.slow
 def test_stiff_motion(tmp_path: Path) -> None:
-    """A row that would take hours ends at the next step in time, by a signal to one rank or the time limit."""
+    """A row that would take hours ends at the next step in time, by a signal to one rank or the
+    time limit.
+    """
     case, out = tmp_path / "case.yaml", tmp_path / "out"
     case.write_text(
         "shell: {geometry: hemisphere, radius_to_thickness: 20, poisson_ratio: 0.3}\n"
@@ -85,17 +99,25 @@ def test_stiff_motion(tmp_path: Path) -> None:
     run.communicate(timeout=20)
     assert run.returncode == 3
     rows = read_path(out)
-    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"] == "interrupted by SIGTERM"
+    assert (
+        json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+        == "interrupted by SIGTERM"
+    )
     again = start("run", case, "--out", out, "--resume", "--time-limit", "3", ranks=2)
     again.communicate(timeout=40)
     assert again.returncode == 3
-    assert "time limit of 3 s" in json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    assert (
+        "time limit of 3 s"
+        in json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    )
     assert read_path(out) == rows
 
 
 def test_second_interrupt_stops_at_once() -> None:
     """The first only has the next check stop the run; afterwards signals do again what they did."""
-    found = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs begin with SIGINT ignored
+    found = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # background jobs begin with SIGINT ignored
     with Watch(MPI.COMM_SELF, 0.0, None, signals=True) as watch:
         watch.check()
         signal.raise_signal(signal.SIGINT)
@@ -107,7 +129,9 @@ def test_second_interrupt_stops_at_once() -> None:
 
 
 def test_nohup_is_obeyed() -> None:
-    """A hang-up that was ignored at the start stays so, though PETSc takes it; else it stops the run."""
+    """A hang-up that was ignored at the start stays so, though PETSc takes it; else it stops the
+    run.
+    """
     found = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with Watch(MPI.COMM_SELF, 0.0, None, signals=True) as watch:
@@ -125,7 +149,9 @@ def test_nohup_is_obeyed() -> None:
 def test_time_limit(tmp_path: Path, reference: Path, no_pictures: None) -> None:
     done = magshell("run", *LONG, "--out", tmp_path, "--time-limit", 0)
     assert done.returncode == 3
-    assert done.stderr == "stopped early: interrupted by the time limit of 0 s" + GOES_ON.format(out=tmp_path)
+    assert done.stderr == "stopped early: interrupted by the time limit of 0 s" + GOES_ON.format(
+        out=tmp_path
+    )
     assert [row["label"] for row in read_path(tmp_path)] == ["start"]
     said = "The run stopped early, after 1 point: interrupted by the time limit of 0 s."
     assert said in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -141,11 +167,18 @@ def test_full_disk(tmp_path: Path) -> None:
     run = start("run", *SURFACE, "--out", out, ranks=2, size_limit=300_000)
     said = run.communicate(timeout=60)[1]
     assert run.returncode == 3
-    message = f"stopped early: {out}/checkpoint cannot be written: File too large" + GOES_ON.format(out=out)
-    assert said.count(message) <= 1  # mpirun may lose the last line of a job that fails; the summary has it
+    message = f"stopped early: {out}/checkpoint cannot be written: File too large" + GOES_ON.format(
+        out=out
+    )
+    assert (
+        said.count(message) <= 1
+    )  # mpirun may lose the last line of a job that fails; the summary has it
     assert "Traceback" not in said
     assert 5 < len(read_path(out)) < len(read_path(whole))
-    assert "checkpoint cannot be written" in json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    assert (
+        "checkpoint cannot be written"
+        in json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    )
     check_goes_on(out, whole, SURFACE)
 
 
@@ -167,7 +200,9 @@ def test_no_room_for_pictures(tmp_path: Path) -> None:
     said = run.communicate(timeout=60)[1]
     message = f"stopped early: {tmp_path}/shell.png cannot be written: File too large"
     assert (run.returncode, said) == (3, message + GOES_ON.format(out=tmp_path))
-    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["points"] == len(read_path(tmp_path))
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["points"] == len(
+        read_path(tmp_path)
+    )
     assert [file.name for file in tmp_path.glob("*.png")] == ["curve.png"]
     assert magshell("run", *case, "--out", tmp_path, "--resume").returncode == 0
     assert (tmp_path / "shell.png").stat().st_size > 10_000

@@ -37,11 +37,16 @@ def test_another_case_is_refused(out: Path, tmp_path: Path) -> None:
     with pytest.raises(ms.CaseError, match="which is kept; give another folder"):
         ms.run(case, out)
     assert magshell("run", case, *SMALL, "--out", out, "--overwrite").returncode == 0
-    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["case_file"] == "other.yaml"
+    assert (
+        json.loads((out / "summary.json").read_text(encoding="utf-8"))["case_file"] == "other.yaml"
+    )
 
 
 def test_the_same_file_with_other_values(out: Path) -> None:
-    assert magshell("run", FILE, *SMALL, "--set", "magnetic.lambda_m=0.001", "--out", out).returncode == 0
+    assert (
+        magshell("run", FILE, *SMALL, "--set", "magnetic.lambda_m=0.001", "--out", out).returncode
+        == 0
+    )
 
 
 def test_the_same_case_in_another_file(out: Path, tmp_path: Path) -> None:
@@ -57,10 +62,17 @@ def test_an_interrupted_run_of_another_file_is_kept_too(tmp_path: Path) -> None:
 
 def content(folder: Path) -> dict[str, bytes]:
     """Every file of a folder."""
-    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
 
 
-REFUSED = {"scene": 'shell.thickness_factor="1/0"', "gradients": "gradients={of: [nope], by: [lambda_m]}"}
+REFUSED = {
+    "scene": 'shell.thickness_factor="1/0"',
+    "gradients": "gradients={of: [nope], by: [lambda_m]}",
+}
 
 
 @pytest.mark.parametrize(
@@ -69,7 +81,17 @@ REFUSED = {"scene": 'shell.thickness_factor="1/0"', "gradients": "gradients={of:
 def test_what_is_refused_loses_nothing(out: Path, what: str, how: str, ranks: int) -> None:
     """Also if it is refused only when its scene is built."""
     before = content(out)
-    refused = magshell("run", FILE, *SMALL, "--set", REFUSED[what], "--out", out, *([how] if how else []), ranks=ranks)
+    refused = magshell(
+        "run",
+        FILE,
+        *SMALL,
+        "--set",
+        REFUSED[what],
+        "--out",
+        out,
+        *([how] if how else []),
+        ranks=ranks,
+    )
     assert refused.returncode == 2
     assert content(out) == before
 
@@ -80,7 +102,14 @@ def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-MINE = ("path.csv", "summary.json", "mesh.json", "report.html", "shell.png", "fields/point_0000.vtu")
+MINE = (
+    "path.csv",
+    "summary.json",
+    "mesh.json",
+    "report.html",
+    "shell.png",
+    "fields/point_0000.vtu",
+)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"case": {}}', "mine"])
@@ -101,7 +130,9 @@ def test_files_of_others_are_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_files_of_others_stay(out: Path) -> None:
-    """Under names that no run writes they survive, also beside its own; under such a name they are refused."""
+    """Under names that no run writes they survive, also beside its own; under such a name they are
+    refused.
+    """
     mine = ("notes.txt", "shell_1.png", "fields/mine.csv", "fields/point_mine.vtu")
     for name in mine:
         (out / name).write_text("mine", encoding="utf-8")

@@ -1,4 +1,6 @@
-"""User-defined energies in whole runs, and what Python says where a path or a state is not what was meant."""
+"""User-defined energies in whole runs, and what Python says where a path or a state is not what was
+meant.
+"""
 
 import json
 import warnings
@@ -24,12 +26,19 @@ def case_of(*settings: str) -> ms.Case:
 
 
 def test_run_with_ones_own_energy(tmp_path: Path) -> None:
-    """Springs with k as a parameter against those of the case file; all files, resumed, and the report."""
+    """Springs with k as a parameter against those of the case file; all files, resumed, and the
+    report.
+    """
     mine = ms.OwnTerm("my_springs", springs, (0.02,), value=1.0)
     stopped = ms.run(case_of(), tmp_path / "own", terms=[mine], pictures=False, time_limit=0)
     assert "interrupted" in (stopped.stopped or "")
     with pytest.raises(ms.CaseError, match=r"belongs to another run: terms\.my_springs is"):
-        ms.run(case_of(), tmp_path / "own", terms=[ms.OwnTerm("my_springs", springs, (0.03,), value=1.0)], resume=True)
+        ms.run(
+            case_of(),
+            tmp_path / "own",
+            terms=[ms.OwnTerm("my_springs", springs, (0.03,), value=1.0)],
+            resume=True,
+        )
     with pytest.raises(ms.CaseError, match=r"terms\.my_springs is .* there and nothing here"):
         ms.run(case_of(), tmp_path / "own", resume=True)
     own = ms.run(case_of(), tmp_path / "own", terms=[mine], pictures=False, resume=True)
@@ -46,7 +55,8 @@ def test_trace_says_that_it_has_not_arrived() -> None:
     """The shell buckles at 0.33 p_c, on the way to 0.5."""
     scene = ms.Scene(case_of())
     with pytest.warns(
-        UserWarning, match=r"trace: pressure: ends at a fold at pressure = 0\.32\d*, before its target 0\.5"
+        UserWarning,
+        match=r"trace: pressure: ends at a fold at pressure = 0\.32\d*, before its target 0\.5",
     ):
         *before, last = ms.trace(scene, "pressure", targets=[0.2, 0.5])
     assert (last.label, last.reached) == ("fold", False)
@@ -62,7 +72,9 @@ def test_state_of_another_scene_is_refused() -> None:
     with_springs = ms.Scene(case_of(), terms=[ms.OwnTerm("k", springs, (1.0,))])
     *_, last = ms.trace(scene, "pressure", targets=[0.1])
     *_, sprung = ms.trace(with_springs, "pressure", targets=[0.1])
-    with pytest.raises(ValueError, match="its amplitudes are k, pressure, those of this scene pressure"):
+    with pytest.raises(
+        ValueError, match="its amplitudes are k, pressure, those of this scene pressure"
+    ):
         ms.surface(scene, sprung)
     for other, said in (
         (finer, r"it has \d+ unknowns on this rank, this scene has \d+"),
@@ -89,14 +101,19 @@ def test_slope_of_the_knockdown_where_the_field_is_zero() -> None:
     scene, step = ms.Scene(case_of("magnetic.lambda_m=0")), 2e-5
     *_, last = ms.follow(scene)
     found = ms.sensitivities(scene, ms.fold_at(scene, last))
-    assert found["lambda_m"] == pytest.approx((knockdown(step) - knockdown(-step)) / (2 * step), rel=1e-5)
+    assert found["lambda_m"] == pytest.approx(
+        (knockdown(step) - knockdown(-step)) / (2 * step), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("density", "said"),
     [
         (lambda r0, u: np.sqrt(u.r), "not of NumPy or math"),
-        (lambda r0: r0.r[0], r"takes 1 positional argument but 2 were given.*r0, u and 0 parameters"),
+        (
+            lambda r0: r0.r[0],
+            r"takes 1 positional argument but 2 were given.*r0, u and 0 parameters",
+        ),
         (lambda r0, u: None, "returns a scalar"),
         (lambda r0, u: u.nothing, "has no attribute 'nothing'"),
         (lambda r0, u: u.r, r"a density is a scalar; this has the shape \(3,\)"),

@@ -1,4 +1,6 @@
-"""What a program gets of a run: its history as a table, records with their displacement, pictures without a display."""
+"""What a program gets of a run: its history as a table, records with their displacement, pictures
+without a display.
+"""
 
 import subprocess
 import sys
@@ -51,7 +53,9 @@ def test_without_pandas(result: ms.Result, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_records_of_a_run(result: ms.Result) -> None:
-    """The last one is the fold, with the displacement as a function; its space has the degree of the case."""
+    """The last one is the fold, with the displacement as a function; its space has the degree of
+    the case.
+    """
     (fold,) = result.instabilities
     assert fold is result.record
     assert fold.u.function_space.element.basix_element.degree == result.scene.model.degree
@@ -76,11 +80,15 @@ print(os.environ["DISPLAY"])
 
 
 @pytest.mark.slow
-def test_pictures_of_pyvista_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_pyvista_without_a_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two pictures with colours; the virtual display is gone with the process."""
     monkeypatch.delenv("DISPLAY", raising=False)
     files = [tmp_path / "one.png", tmp_path / "two.png"]
-    done = subprocess.run([sys.executable, "-c", PROGRAM, *map(str, files)], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *map(str, files)], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     for file in files:
         assert np.ptp(imread(file)[..., :3], axis=2).max() > 0.3, "no colours"
@@ -95,10 +103,16 @@ def test_pictures_of_pyvista_without_a_display(tmp_path: Path, monkeypatch: pyte
 def test_a_case_of_a_mapping() -> None:
     """Documented with `Case.load`; a mistake is one message with the key."""
     disc = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
-    case = ms.Case.from_source({"shell": disc, "boundary": {"rim": "clamped"}, "loading": {"kind": "pressure"}})
+    case = ms.Case.from_source(
+        {"shell": disc, "boundary": {"rim": "clamped"}, "loading": {"kind": "pressure"}}
+    )
     assert case.problem().material.h == 1 / 50
-    with pytest.raises(ms.CaseError, match=r"shell\.poisson_ratio: 0\.7: must be less than or equal to 0\.5"):
-        ms.Case.from_source({"shell": {**disc, "poisson_ratio": 0.7}, "boundary": {"rim": "clamped"}})
+    with pytest.raises(
+        ms.CaseError, match=r"shell\.poisson_ratio: 0\.7: must be less than or equal to 0\.5"
+    ):
+        ms.Case.from_source(
+            {"shell": {**disc, "poisson_ratio": 0.7}, "boundary": {"rim": "clamped"}}
+        )
 
 
 def test_no_display_and_no_virtual_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,11 +125,19 @@ def test_no_display_and_no_virtual_one(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_frequencies_and_gradients_need_no_folder() -> None:
-    """A clamped disc rings at 10.2158 sqrt(D/(rho h R^4)) (Leissa); its bending stiffness is that of h^3."""
+    """A clamped disc rings at 10.2158 sqrt(D/(rho h R^4)) (Leissa); its bending stiffness is that
+    of h^3.
+    """
     case = {
         "shell": {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.3},
         "boundary": {"rim": "clamped"},
-        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-9, "points": 1},
+        "loading": {
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 1e-9,
+            "points": 1,
+        },
         "frequencies": {"count": 1, "at": "ends"},
         "gradients": {"of": ["w_pole_over_h"], "by": ["shell.radius_to_thickness", "thickness"]},
     }
@@ -125,4 +147,6 @@ def test_frequencies_and_gradients_need_no_folder() -> None:
     assert sorted(result.frequencies) == [0, result.end]
     assert found == pytest.approx([10.2158, 10.2158], rel=1e-4)
     gradient = result.gradients["w_pole_over_h"]
-    assert gradient["fields"]["thickness"]["alike"][0] == pytest.approx(-3 * gradient["value"], rel=1e-4)
+    assert gradient["fields"]["thickness"]["alike"][0] == pytest.approx(
+        -3 * gradient["value"], rel=1e-4
+    )

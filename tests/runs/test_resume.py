@@ -21,7 +21,12 @@ SOLID = (
     *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.4"),
     *("--set=loading.depth=3", "--set=loading.points=6"),
 )
-PROGRAMME = (CASES / "programme.yaml", "--set=symmetry=half", "--set=mesh.degree=2", "--set=mesh.refinement=0.4")
+PROGRAMME = (
+    CASES / "programme.yaml",
+    "--set=symmetry=half",
+    "--set=mesh.degree=2",
+    "--set=mesh.refinement=0.4",
+)
 MAGNET = (
     CASES / "magnet_past_strip.yaml",
     "--set=mesh={degree: 2, refinement: 0.3}",
@@ -49,7 +54,9 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", ["solid", "magnet", "programme"], indirect=True)
 def test_killed_and_resumed(whole: Whole, tmp_path: Path) -> None:
-    """kill -9 on two ranks, and once more on one; resumed on one, a programme that holds a volume on three."""
+    """kill -9 on two ranks, and once more on one; resumed on one, a programme that holds a volume
+    on three.
+    """
     out = tmp_path / "out"
     steps = [row["step"] for row in read_rows(whole.out / "path.csv")]
     rows = steps.index(3) + 2 if 3 in steps else 3
@@ -73,7 +80,10 @@ def check_goes_on_as(whole: Whole, out: Path, seen: bytes, ranks: int = 1) -> No
     check_same_path(out, whole.out)
     check_fields(out)
     assert {file.name for file in out.iterdir()} == {file.name for file in whole.out.iterdir()}
-    a, b = (json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in (out, whole.out))
+    a, b = (
+        json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        for folder in (out, whole.out)
+    )
     assert b["replayed"] == 0 < a["replayed"]
     assert a["factorisations"] < b["factorisations"]
     assert a["knockdown"] == pytest.approx(b["knockdown"], rel=1e-9)
@@ -81,7 +91,9 @@ def check_goes_on_as(whole: Whole, out: Path, seen: bytes, ranks: int = 1) -> No
 
 @pytest.mark.parametrize("whole", ["meridian"], indirect=True)
 def test_torn_files(whole: Whole, tmp_path: Path) -> None:
-    """After kill -9 half a row and half an entry, as a crash of the machine leaves them, are cut off."""
+    """After kill -9 half a row and half an entry, as a crash of the machine leaves them, are cut
+    off.
+    """
     out = tmp_path / "out"
     run = start("run", *whole.case, "--out", out)
     wait_for_rows(run, out, 4)
@@ -129,7 +141,9 @@ def test_nothing_to_resume(tmp_path: Path) -> None:
 
 
 def test_one_run_at_a_time(tmp_path: Path) -> None:
-    """A run that still writes to the folder, such as ranks that outlive mpirun, is not joined by another."""
+    """A run that still writes to the folder, such as ranks that outlive mpirun, is not joined by
+    another.
+    """
     with held_folder(tmp_path, MPI.COMM_SELF, make=False):
         second = magshell("run", *LONG, "--out", tmp_path)
     assert second.returncode == 2

@@ -27,7 +27,10 @@ def test_ranks(tmp_path: Path) -> None:
     one, two = (read_path(tmp_path / ranks) for ranks in "12")
     assert [row["label"] for row in two] == [row["label"] for row in one]
     for column in EXACT:
-        a, b = (np.array([float(row[column]) for row in rows if row["label"] == "target"]) for rows in (one, two))
+        a, b = (
+            np.array([float(row[column]) for row in rows if row["label"] == "target"])
+            for rows in (one, two)
+        )
         assert a == pytest.approx(b, rel=0, abs=1e-9 * np.abs(a).max()), column
 
 
@@ -70,11 +73,15 @@ def test_two_shells_from_python() -> None:
     upper = ms.Shell("cap", name="upper", thickness=thick["upper"], place=place, mesh=finer, **keys)
     points = {"lower.tip": [0, 0, "25 mm"], "upper.tip": [0, 0, "25 mm"]}
     clamped = ms.Clamped("lower.rim", "upper.rim")
-    problem = ms.Problem([lower, upper], clamped, ms.Pressure(**load), mesh, points=points, symmetry="none")
+    problem = ms.Problem(
+        [lower, upper], clamped, ms.Pressure(**load), mesh, points=points, symmetry="none"
+    )
     both = ms.run(problem).rows[-1]
     for name, sign in (("lower", 1), ("upper", -1)):
         alone = ms.Shell("cap", thickness=thick[name], **keys)
         elements = ms.Section("mesh", degree=2, **(finer if name == "upper" else {"size": "8 mm"}))
         parts = (ms.Clamped("rim"), ms.Pressure(**load), elements)
-        row = ms.run(ms.Problem(alone, *parts, points={"tip": [0, 0, "25 mm"]}, symmetry="none")).rows[-1]
+        row = ms.run(
+            ms.Problem(alone, *parts, points={"tip": [0, 0, "25 mm"]}, symmetry="none")
+        ).rows[-1]
         assert both[f"{name}_tip_uz"] == pytest.approx(sign * row["tip_uz"], rel=1e-6)

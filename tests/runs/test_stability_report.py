@@ -1,4 +1,6 @@
-"""The lowest modes of shells: published plate frequencies, known folds and waves, the files of a report."""
+"""The lowest modes of shells: published plate frequencies, known folds and waves, the files of a
+report.
+"""
 
 import csv
 from collections import Counter
@@ -23,8 +25,8 @@ from magshell_fenicsx.public import run
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
-# Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of Plates,
-# NASA SP-160 (1969), table 2.1, square roots of 10.2158, 21.26, 34.88, 39.771, 51.04.
+# Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of
+# Plates, NASA SP-160 (1969), table 2.1, square roots of 10.2158, 21.26, 34.88, 39.771, 51.04.
 LEISSA = {0: 3.1962, 1: 4.6109, 2: 5.906, 3: 7.144}
 SECOND_WITHOUT_DIAMETER = 6.3064
 
@@ -34,7 +36,9 @@ def plate(symmetry: str) -> Scene:
 
 
 def wave_numbers(scene: Scene, count: int) -> list[tuple[str, float]]:
-    """Label and k R = (lambda/D)^(1/4) of the lowest modes of the unloaded plate, thin enough for Kirchhoff's."""
+    """Label and k R = (lambda/D)^(1/4) of the lowest modes of the unloaded plate, thin enough for
+    Kirchhoff's.
+    """
     D = scene.problem.material.bending_stiffness
     modes = ShellModes(scene.model).lowest(scene.unloaded(), count)
     return [(mode.label, (mode.eigenvalue / D) ** 0.25) for mode in modes]
@@ -59,20 +63,32 @@ def test_clamped_plate_by_half_and_whole() -> None:
 def band_of_triangles(rows: int, around: int, *, closed: bool = True) -> NDArray[np.int64]:
     """The triangles between rows of nodes; of rows that are closed the last nodes are beside the
     first."""
-    row, node = (x.ravel() for x in np.meshgrid(np.arange(rows - 1), np.arange(around - (not closed)), indexing="ij"))
+    row, node = (
+        x.ravel()
+        for x in np.meshgrid(np.arange(rows - 1), np.arange(around - (not closed)), indexing="ij")
+    )
     beside = (node + 1) % around
-    a, b, c, d = row * around + node, row * around + beside, (row + 1) * around + node, (row + 1) * around + beside
+    a, b, c, d = (
+        row * around + node,
+        row * around + beside,
+        (row + 1) * around + node,
+        (row + 1) * around + beside,
+    )
     return np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
 
 
-def drawn_mode(r0: NDArray[np.float64], w: NDArray[np.float64], cells: NDArray[np.int64]) -> Surface:
+def drawn_mode(
+    r0: NDArray[np.float64], w: NDArray[np.float64], cells: NDArray[np.int64]
+) -> Surface:
     return Surface(r0, 0 * r0, r0, cells, {"mode_w": w})
 
 
 def test_a_dent_between_small_elements_has_no_waves() -> None:
     """Points of a ring count by their distance: most of them are in a dent, which a wave of few
     crests fits there."""
-    theta = np.concatenate([np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)[1:-1]])
+    theta = np.concatenate(
+        [np.linspace(-0.5, 0.5, 400), np.linspace(0.5, 2 * np.pi - 0.5, 40)[1:-1]]
+    )
     rim = np.column_stack([np.cos(theta), np.sin(theta), 1e-3 * np.sin(theta)])  # it is not even
     r0 = np.concatenate([rim, rim + np.array([0.0, 0.0, 1.0])])
     cells = band_of_triangles(2, len(theta))
@@ -91,7 +107,9 @@ def past_the_fold() -> tuple[Scene, dict[str, Record]]:
 
 
 def test_lowest_stiffness_changes_sign_at_the_fold() -> None:
-    """k_d = 0.3262 of the independent axisymmetric solver; as many negative eigenvalues as negative pivots."""
+    """k_d = 0.3262 of the independent axisymmetric solver; as many negative eigenvalues as negative
+    pivots.
+    """
     scene, records = past_the_fold()
     shell = ShellModes(scene.model)
     lowest = {}
@@ -109,7 +127,9 @@ def test_lowest_stiffness_changes_sign_at_the_fold() -> None:
 @pytest.mark.slow
 def test_half_shell_and_meridian_agree_at_the_fold() -> None:
     """Two discretisations: a half's antisymmetric modes are the meridian's waves."""
-    half = Scene(Case.load(CASES / "dimple_buckling.yaml", ["symmetry=half", "mesh.refinement=0.4"]))
+    half = Scene(
+        Case.load(CASES / "dimple_buckling.yaml", ["symmetry=half", "mesh.refinement=0.4"])
+    )
     *_, at_fold = (record for record in follow(half) if record.label == "fold" and not record.mode)
     scene, records = past_the_fold()
     lowest = {}
@@ -144,26 +164,44 @@ def test_waves_of_the_perfect_hemisphere() -> None:
     )
     assert null == pytest.approx(mode, abs=1e-4)
     assert modes[1].eigenvalue > 1e-4
-    unstable = Counter(mode.label for mode in shell.lowest(limit.point.state, 1) if mode.eigenvalue < 0 and mode.label)
-    assert unstable == {f"m = {m}": n for m, n in scene.model.excluded_modes.waves.unstable(limit.point.state).items()}
+    unstable = Counter(
+        mode.label
+        for mode in shell.lowest(limit.point.state, 1)
+        if mode.eigenvalue < 0 and mode.label
+    )
+    assert unstable == {
+        f"m = {m}": n
+        for m, n in scene.model.excluded_modes.waves.unstable(limit.point.state).items()
+    }
     assert len(unstable) > 3
 
 
 @pytest.mark.slow
 def test_short_waves_on_a_sphere_under_pressure() -> None:
-    """lambda = 1 - (p/p_c)^2 over E h/R^2: D q^4 - p R q^2/2 + E h/R^2 at its lowest (van der Neut, Koiter).
+    """lambda = 1 - (p/p_c)^2 over E h/R^2: D q^4 - p R q^2/2 + E h/R^2 at its lowest (van der Neut,
+    Koiter).
 
-    The tangential part adds mass of order h/R. Below it lies one axisymmetric mode that is no short wave,
-    whose stiffness the pressure hardly changes.
+    The tangential part adds mass of order h/R. Below it lies one axisymmetric mode that is no short
+    wave, whose stiffness the pressure hardly changes.
     """
     data = {
         "shell": {"geometry": "hemisphere", "radius_to_thickness": 1000, "poisson_ratio": 0.3},
         "boundary": {"equator": "clamped"},
-        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.6, "points": 1},
+        "loading": {
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 0.6,
+            "points": 1,
+        },
     }
     scene = Scene(Case.from_source(Source("sphere", data)))
     *_, last = [record for record in follow(scene) if not record.mode]
-    own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(last.point.state, 2) if not mode.label]
+    own = [
+        mode.eigenvalue
+        for mode in ShellModes(scene.model).lowest(last.point.state, 2)
+        if not mode.label
+    ]
     assert own[1] == pytest.approx(1 - 0.6**2, rel=3e-3)
 
 
@@ -172,9 +210,13 @@ def surface_of(scene: Scene, u: np.ndarray, label: str, vector: np.ndarray) -> A
 
 
 def test_translation_as_a_wave() -> None:
-    """U = 1, V = -1, W = 0 with m = 1 is e1 everywhere, the axis included; the sign of a mode is free."""
+    """U = 1, V = -1, W = 0 with m = 1 is e1 everywhere, the axis included; the sign of a mode is
+    free.
+    """
     scene = plate("axisymmetric")
-    coefficients = np.tile([0.0, -1.0, 0.0], scene.model.excluded_modes.waves.V.dofmap.index_map.size_global)
+    coefficients = np.tile(
+        [0.0, -1.0, 0.0], scene.model.excluded_modes.waves.V.dofmap.index_map.size_global
+    )
     surface = surface_of(scene, scene.model.zero(), "m = 1", coefficients)
     assert np.abs(np.abs(surface.fields["mode"]) - [1.0, 0.0, 0.0]).max() < 1e-12
     assert np.ptp(surface.fields["mode"][:, 0]) < 1e-12
@@ -182,7 +224,9 @@ def test_translation_as_a_wave() -> None:
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
 def test_shapes_have_their_nodal_diameters(symmetry: str) -> None:
-    """Every mode of the plate has the waves around it that Leissa's table gives its frequency; odd ones are sines."""
+    """Every mode of the plate has the waves around it that Leissa's table gives its frequency; odd
+    ones are sines.
+    """
     scene = plate(symmetry)
     D = scene.problem.material.bending_stiffness
     modes = {
@@ -196,14 +240,23 @@ def test_shapes_have_their_nodal_diameters(symmetry: str) -> None:
         x, y = surface.r0[:, :2].T
         theta = np.arctan2(y, x)
         of_angle = np.sin if mode.label == "antisymmetric" else np.cos
-        fits = [abs(surface.fields["mode_w"] @ (of_angle(m * theta) * np.hypot(x, y) ** 2)) for m in range(7)]
-        waves = 0 if abs(kR - SECOND_WITHOUT_DIAMETER) < 0.01 else min(LEISSA, key=lambda m: abs(LEISSA[m] - kR))
+        fits = [
+            abs(surface.fields["mode_w"] @ (of_angle(m * theta) * np.hypot(x, y) ** 2))
+            for m in range(7)
+        ]
+        waves = (
+            0
+            if abs(kR - SECOND_WITHOUT_DIAMETER) < 0.01
+            else min(LEISSA, key=lambda m: abs(LEISSA[m] - kR))
+        )
         assert int(np.argmax(fits)) == waves
         assert np.linalg.norm(surface.fields["mode"], axis=1).max() == pytest.approx(1.0)
 
 
 def test_antisymmetric_mode_is_odd() -> None:
-    """The mirror image of (v1, v2, v3) at (x, -y) is (-v1, v2, -v3); that of a symmetric mode (v1, -v2, v3)."""
+    """The mirror image of (v1, v2, v3) at (x, -y) is (-v1, v2, -v3); that of a symmetric mode (v1,
+    -v2, v3).
+    """
     scene = plate("half")
     modes = ShellModes(scene.model).lowest(scene.unloaded(), 1)
     assert {mode.label for mode in modes} == {"", "antisymmetric"}
@@ -212,7 +265,9 @@ def test_antisymmetric_mode_is_odd() -> None:
         here, there = np.split(surface.fields["mode"], 2)
         sign = -1.0 if mode.label else 1.0
         assert there == pytest.approx(sign * here * [1.0, -1.0, 1.0], abs=1e-12)
-        assert np.split(surface.r0, 2)[1] == pytest.approx(np.split(surface.r0, 2)[0] * [1.0, -1.0, 1.0], abs=1e-12)
+        assert np.split(surface.r0, 2)[1] == pytest.approx(
+            np.split(surface.r0, 2)[0] * [1.0, -1.0, 1.0], abs=1e-12
+        )
 
 
 def test_null_vector_is_the_mode_without_stiffness() -> None:
@@ -232,7 +287,12 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.3", "--set=loading.depth=2", "--set=loading.points=1"]
+COARSE = [
+    "--set=mesh.degree=3",
+    "--set=mesh.refinement=0.3",
+    "--set=loading.depth=2",
+    "--set=loading.points=1",
+]
 
 
 @pytest.mark.slow
@@ -244,7 +304,14 @@ def test_same_modes_on_one_rank_and_two(tmp_path: Path, symmetry: str) -> None:
         out = tmp_path / str(ranks)
         settings = [*COARSE, f"--set=symmetry={symmetry}", "--set=stability.modes=3"]
         drawn = symmetry == "axisymmetric"
-        words = ["run", CASES / "pole_indentation.yaml", *settings, *(["--no-pictures"][drawn:]), "--out", out]
+        words = [
+            "run",
+            CASES / "pole_indentation.yaml",
+            *settings,
+            *(["--no-pictures"][drawn:]),
+            "--out",
+            out,
+        ]
         done = started(*words, ranks=ranks) if ranks > 1 else magshell(*words)
         assert done.returncode == 0, done.stderr
         tables.append(table(out))
@@ -258,7 +325,10 @@ def test_same_modes_on_one_rank_and_two(tmp_path: Path, symmetry: str) -> None:
 
 @pytest.mark.slow
 def test_files_at_instabilities(tmp_path: Path) -> None:
-    found = run(Case.load(CASES / "dimple_buckling.yaml", ["stability={modes: 2, at: instabilities}"]), tmp_path)
+    found = run(
+        Case.load(CASES / "dimple_buckling.yaml", ["stability={modes: 2, at: instabilities}"]),
+        tmp_path,
+    )
     number = len(found.rows) - 1
     fields = sorted(file.name for file in (tmp_path / "fields").glob("mode_*"))
     assert fields == [f"mode_{number:04d}_{name}.vtu" for name in ("1", "2_m1", "fold")]
@@ -272,7 +342,10 @@ def test_files_at_instabilities(tmp_path: Path) -> None:
 
 
 def test_nothing_is_compiled_without_the_section(tmp_path: Path) -> None:
-    found = run(Case.load(CASES / "pole_indentation.yaml", ["loading.depth=1", "loading.points=1"]), tmp_path)
+    found = run(
+        Case.load(CASES / "pole_indentation.yaml", ["loading.depth=1", "loading.points=1"]),
+        tmp_path,
+    )
     assert not [name for name in found.scene.model.kernels.names if "mass" in name]
     assert not list(tmp_path.glob("**/mode*"))
     assert not (tmp_path / "stability.csv").exists()
@@ -293,7 +366,8 @@ def test_mistakes_in_the_section(setting: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("m", "turn", "counted"), [(0, 2, None), (1, 2, None), (5, 2, 5), (28, 2, 28), (5, 1, None), (5, 1.6, None)]
+    ("m", "turn", "counted"),
+    [(0, 2, None), (1, 2, None), (5, 2, 5), (28, 2, 28), (5, 1, None), (5, 1.6, None)],
 )
 def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | None) -> None:
     """Not on a part of a shell that does not go around it."""
@@ -307,7 +381,9 @@ def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | N
 
 @pytest.mark.parametrize("staggered", [0.0, 1 / 3, 0.5])
 @pytest.mark.parametrize(("m", "resolved"), [(2, True), (3, True), (5, True), (8, False)])
-def test_waves_are_counted_whatever_nodes_lie_on_rings(m: int, staggered: float, resolved: bool) -> None:
+def test_waves_are_counted_whatever_nodes_lie_on_rings(
+    m: int, staggered: float, resolved: bool
+) -> None:
     """cos(m theta) at 21 nodes around, on rows so near that one ring has three: there 63 - m and 42
     + m fit as well.
 

@@ -34,11 +34,15 @@ def command(out: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """1 and 2: every target to 1e-9 of the largest value on the path; resumed, the same rows to the last digit.
+    """1 and 2: every target to 1e-9 of the largest value on the path; resumed, the same rows to the
+    last digit.
 
-    Of the contact to 1e-8, its gap over h, and its force, a small difference of two, over the load on a wall.
+    Of the contact to 1e-8, its gap over h, and its force, a small difference of two, over the load
+    on a wall.
     """
-    monkeypatch.setenv("PETSC_OPTIONS", "-snes_stol 1e-11")  # a stiff contact multiplies the error of u
+    monkeypatch.setenv(
+        "PETSC_OPTIONS", "-snes_stol 1e-11"
+    )  # a stiff contact multiplies the error of u
     for ranks in (1, 2):
         done = all_started([command(tmp_path / str(ranks))], ranks)
         assert done.returncode == 0, done.stderr
@@ -47,7 +51,10 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     labels = [[row["label"] for row in rows if row["label"] != "step"] for rows in (one, two)]
     assert labels[0] == labels[1]  # steps before a touch depend on rounding
     for column in EXACT:
-        a, b = (np.array([float(row[column]) for row in rows if row["label"] == "target"]) for rows in (one, two))
+        a, b = (
+            np.array([float(row[column]) for row in rows if row["label"] == "target"])
+            for rows in (one, two)
+        )
         largest = np.nanmax(np.abs([float(row[column]) for row in one]))
         most = {"contact_force": PRESSED, "contact_gap_over_h": 1.0}.get(column, largest)
         part = 1e-8 if column.startswith("contact") else 1e-9
@@ -64,10 +71,25 @@ def test_ranks_and_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 def pressed_caps(down: float, points: int, **mesh: Any) -> dict[str, Any]:
     """The upper cap is pressed down on the lower one, which it soon touches."""
-    shell = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 2, "thickness": 0.036, "poisson_ratio": 0.3}
-    lower, upper = ({"shell": shell | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (6, 1))
+    shell = {
+        "geometry": "cap",
+        "radius": 1,
+        "polar": 20,
+        "hole": 2,
+        "thickness": 0.036,
+        "poisson_ratio": 0.3,
+    }
+    lower, upper = (
+        {"shell": shell | {"youngs_modulus": E}, "boundary": {"rim": "hinged"}} for E in (6, 1)
+    )
     force = {"edge": "upper.hole", "force": [0, 0, -1]}
-    loading = {"kind": "dead", "control": "displacement", "until": "target", "loads": [force], "displacement": down}
+    loading = {
+        "kind": "dead",
+        "control": "displacement",
+        "until": "target",
+        "loads": [force],
+        "displacement": down,
+    }
     return {
         "shells": {"lower": lower, "upper": upper | {"place": {"position": [0, 0, 0.05]}}},
         "contact": [["upper", "lower"]],
@@ -81,9 +103,15 @@ FEW = 4  # looks of the undeformed shells, and of the last point
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("symmetry", "mesh"), [("auto", {"refinement": 0.3}), ("half", {"size": 0.15})])
+@pytest.mark.parametrize(
+    ("symmetry", "mesh"), [("auto", {"refinement": 0.3}), ("half", {"size": 0.15})]
+)
 def test_a_resumed_run_looks_at_no_known_contact_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pictures: None, symmetry: str, mesh: dict[str, Any]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    no_pictures: None,
+    symmetry: str,
+    mesh: dict[str, Any],
 ) -> None:
     """The folder as it was at a moment after the touch, as kill -9 leaves it; the same rows to the
     last digit.
@@ -110,7 +138,9 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
     monkeypatch.setattr(Checkpoint, "record", recorded)
     for kind, name in LOOKS:
         own = getattr(kind, name)
-        monkeypatch.setattr(kind, name, lambda *a, own=own, **b: (looks.append(own.__name__), own(*a, **b))[1])
+        monkeypatch.setattr(
+            kind, name, lambda *a, own=own, **b: (looks.append(own.__name__), own(*a, **b))[1]
+        )
     assert magshell("run", case, "--out", whole).returncode == 0
     before, looked = read_path(killed), at_end[-1]
     assert any(float(row["contact_force"]) > 0 for row in before)
@@ -135,7 +165,9 @@ def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> No
     ends = list[dict[str, str]]()
     for name, (ranks, model) in models.items():
         (tmp_path / f"{name}.yaml").write_text(json.dumps(pressed_caps(0.015, 1) | model))
-        done = started("run", tmp_path / f"{name}.yaml", "--no-pictures", "--out", tmp_path / name, ranks=ranks)
+        done = started(
+            "run", tmp_path / f"{name}.yaml", "--no-pictures", "--out", tmp_path / name, ranks=ranks
+        )
         assert done.returncode == 0, done.stderr
         ends.append(read_path(tmp_path / name)[-1])
     assert float(ends[0]["contact_force"]) > 0
@@ -145,16 +177,37 @@ def test_pressed_caps_on_other_models(tmp_path: Path, symmetry: str | int) -> No
 
 @pytest.mark.slow
 def test_ranks_of_supports_that_push(tmp_path: Path) -> None:
-    """Two caps on their meridian, of which one is pushed on the other: each rank has all of it, with the same rows."""
-    cap = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 3, "thickness": 0.02, "poisson_ratio": 0.3}
+    """Two caps on their meridian, of which one is pushed on the other: each rank has all of it,
+    with the same rows.
+    """
+    cap = {
+        "geometry": "cap",
+        "radius": 1,
+        "polar": 20,
+        "hole": 3,
+        "thickness": 0.02,
+        "poisson_ratio": 0.3,
+    }
     lower = {"shell": cap, "boundary": {"rim": "clamped"}}
     upper = {"shell": cap, "boundary": {"hole": "clamped"}, "place": {"position": [0, 0, 0.025]}}
     moves = [{"supports": ["upper.hole"], "translation": [0, 0, -0.01]}]
     loading = {"kind": "edge", "name": "way", "points": 1, "moves": moves}
-    case = {"shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "loading": loading}
-    (tmp_path / "case.yaml").write_text(json.dumps(case | {"mesh": {"refinement": 0.5, "degree": 3}}))
+    case = {
+        "shells": {"lower": lower, "upper": upper},
+        "contact": [["upper", "lower"]],
+        "loading": loading,
+    }
+    (tmp_path / "case.yaml").write_text(
+        json.dumps(case | {"mesh": {"refinement": 0.5, "degree": 3}})
+    )
     for ranks in (1, 2):
-        run = ["run", str(tmp_path / "case.yaml"), "--no-pictures", "--out", str(tmp_path / str(ranks))]
+        run = [
+            "run",
+            str(tmp_path / "case.yaml"),
+            "--no-pictures",
+            "--out",
+            str(tmp_path / str(ranks)),
+        ]
         done = all_started([run], ranks)
         assert done.returncode == 0, done.stderr
     one, two = (read_path(tmp_path / str(ranks))[-1] for ranks in (1, 2))

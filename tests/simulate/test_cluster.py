@@ -26,7 +26,9 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
     u[0] = 0.9
     path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.03, 0.03, 1e-6))
     walk = Walk(path, path.start(State(u, {"load": 0.9})), Goal("target", [1.1]))
-    sentences = [(point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))]
+    sentences = [
+        (point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))
+    ]
     ((point, said),) = sentences
     first, last = (end.state.mu["load"] for end in walk.clusters[0])
     assert said == (

@@ -1,6 +1,8 @@
-"""Gradients by the drawn shape at a shape that deviates, against new cases on the same triangulation of the chart.
+"""Gradients by the drawn shape at a shape that deviates, against new cases on the same
+triangulation of the chart.
 
-What formulas say by the place, loads per area and along normals, widths of cells: all are those of the new shape.
+What formulas say by the place, loads per area and along normals, widths of cells: all are those of
+the new shape.
 """
 
 from copy import deepcopy
@@ -94,4 +96,6 @@ def test_new_cases(data: dict[str, Any], way: str, load: str, results: list[str]
         found = gradient(scene, last, of=of, by="deviation")["deviation"]
         assert isinstance(found, FieldGradient)
         w0 = scene.problem.material.h * (along if way == ALONG else around)(found.places)
-        assert found.along(w0[..., None]) == pytest.approx((8 * (c - b) - (d - a)) / (12 * STEP), rel=1e-6), of
+        assert found.along(w0[..., None]) == pytest.approx(
+            (8 * (c - b) - (d - a)) / (12 * STEP), rel=1e-6
+        ), of

@@ -1,4 +1,6 @@
-"""Thickness, natural curvature and deviation as fields: against differences of states and folds solved again."""
+"""Thickness, natural curvature and deviation as fields: against differences of states and folds
+solved again.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -49,7 +51,9 @@ def by_difference(f: Callable[[float], float], step: float) -> float:
 
 
 class Direction:
-    """A random smooth change of a field; even in y, as halves are, and the same along every meridian."""
+    """A random smooth change of a field; even in y, as halves are, and the same along every
+    meridian.
+    """
 
     def __init__(self, seed: int, *, around: bool = False) -> None:
         self._a, self._around = np.random.default_rng(seed).standard_normal((3, 4)), around
@@ -68,12 +72,16 @@ def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
     if name == "thickness":
         one = Thickness(lambda x, y, z: 1 + c * along(np.stack([x, y, z], axis=-1)))
         return Scene(replace(problem, thickness=one))
-    natural = problem.loads.natural or Natural(np.zeros(3), None, frame(scene.problem.context, problem.azimuth))
+    natural = problem.loads.natural or Natural(
+        np.zeros(3), None, frame(scene.problem.context, problem.azimuth)
+    )
     drawn = natural.curvature
 
     def curvature(r0: Array, n0: Array) -> Array:
         known = drawn(r0, n0) if callable(drawn) else np.asarray(drawn)
-        return np.asarray(known + c * np.stack([along(r0, i) for i in range(3)], axis=-1) * [1, 1, 0])
+        return np.asarray(
+            known + c * np.stack([along(r0, i) for i in range(3)], axis=-1) * [1, 1, 0]
+        )
 
     other = Natural(curvature, natural.stretch, natural.along)
     return Scene(replace(problem, loads=replace(problem.loads, natural=other)))
@@ -82,7 +90,9 @@ def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
 def directional(scene: Scene, found: object, name: str, along: Direction) -> float:
     assert isinstance(found, FieldGradient)
     if name == "curvature":
-        return found.along(np.stack([along(found.places, i) for i in range(3)], axis=-1) * [1, 1, 0])
+        return found.along(
+            np.stack([along(found.places, i) for i in range(3)], axis=-1) * [1, 1, 0]
+        )
     unit = scene.problem.material.h if name == "deviation" else 1.0
     return found.along(unit * along(found.places)[..., None])
 
@@ -92,7 +102,9 @@ def solved(scene: Scene) -> Record:
     return last
 
 
-def state_with(scene: Scene, last: Record, name: str, along: Direction, c: float) -> tuple[Scene, State]:
+def state_with(
+    scene: Scene, last: Record, name: str, along: Direction, c: float
+) -> tuple[Scene, State]:
     """The state at the same loads with another field, by Newton's method from that without."""
     other = changed(scene, name, along, c)
     near = State(last.point.state.u, {"natural_curvature": 1.0, **last.point.state.mu})
@@ -117,22 +129,42 @@ def test_state(tmp_path: Path, symmetry: str) -> None:
         for of, by in found.items():
             values = {c: functional(*each, of).value for c, each in states.items()}
             expected = by_difference(values.__getitem__, 1) / step
-            assert directional(scene, by[name], name, along) == pytest.approx(expected, rel=1e-5), (name, of)
+            assert directional(scene, by[name], name, along) == pytest.approx(expected, rel=1e-5), (
+                name,
+                of,
+            )
 
 
 def test_reaction(tmp_path: Path) -> None:
-    """The forces of a strip's two supports: against states again, and no load but theirs lets them sum to zero."""
+    """The forces of a strip's two supports: against states again, and no load but theirs lets them
+    sum to zero.
+    """
     (tmp_path / "strip.yaml").write_text(STRIP.replace("tip:", "end:"))
-    settings = ["boundary={root: clamped, tip: {held: [z]}}", "reactions=true", "magnetic.remanent.polar=75"]
+    settings = [
+        "boundary={root: clamped, tip: {held: [z]}}",
+        "reactions=true",
+        "magnetic.remanent.polar=75",
+    ]
     scene, along, step = Scene(Case.load(tmp_path / "strip.yaml", settings)), Direction(0), 2e-3
     last = solved(scene)
     fields = ("thickness", "deviation")
-    found = {of: gradient(scene, last, of=of, by=[*fields, "lambda_m"]) for of in ("root_fz", "tip_fz")}
+    found = {
+        of: gradient(scene, last, of=of, by=[*fields, "lambda_m"]) for of in ("root_fz", "tip_fz")
+    }
     states = {c: state_with(scene, last, "thickness", along, c * step) for c in (-2, -1, 1, 2)}
     for of, by in found.items():
-        assert functional(scene, last.point.state, of).value == pytest.approx(scene.observe(last.point.state)[of])
-        expected = by_difference({c: functional(*each, of).value for c, each in states.items()}.__getitem__, 1) / step
-        assert directional(scene, by["thickness"], "thickness", along) == pytest.approx(expected, rel=1e-6), of
+        assert functional(scene, last.point.state, of).value == pytest.approx(
+            scene.observe(last.point.state)[of]
+        )
+        expected = (
+            by_difference(
+                {c: functional(*each, of).value for c, each in states.items()}.__getitem__, 1
+            )
+            / step
+        )
+        assert directional(scene, by["thickness"], "thickness", along) == pytest.approx(
+            expected, rel=1e-6
+        ), of
     for name in fields:
         root, tip = (directional(scene, by[name], name, Direction(3)) for by in found.values())
         assert root == pytest.approx(-tip, rel=1e-6), name
@@ -156,7 +188,8 @@ HALF = [FIELD, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.3"]
 
 
 @pytest.mark.parametrize(
-    "settings", [pytest.param([FIELD], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
+    "settings",
+    [pytest.param([FIELD], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)],
 )
 def test_fold(settings: list[str]) -> None:
     """The knockdown factor of the dimpled hemisphere; no factorisation but those of the fold."""
@@ -164,7 +197,9 @@ def test_fold(settings: list[str]) -> None:
     last = solved(scene)
     fold = fold_at(scene, last)
     before = scene.newton.factorisation.count
-    found = gradient(scene, last, of="instability", by=(*FIELDS, "remanence", "magnitude", "lambda_m"), fold=fold)
+    found = gradient(
+        scene, last, of="instability", by=(*FIELDS, "remanence", "magnitude", "lambda_m"), fold=fold
+    )
     assert scene.newton.factorisation.count == before
     mu = {"natural_curvature": 1.0, **fold.state.mu}
     for seed, name in enumerate(FIELDS):
@@ -173,13 +208,19 @@ def test_fold(settings: list[str]) -> None:
 
         def again(c: float, name: str = name, along: Direction = along) -> float:
             other = changed(scene, name, along, c)
-            return find_fold(other.newton, Guess(State(fold.state.u, mu), fold.phi), "pressure").value
+            return find_fold(
+                other.newton, Guess(State(fold.state.u, mu), fold.phi), "pressure"
+            ).value
 
         expected = by_difference(again, step)
-        assert directional(scene, found[name], name, along) == pytest.approx(expected, rel=1e-4), name
+        assert directional(scene, found[name], name, along) == pytest.approx(expected, rel=1e-4), (
+            name
+        )
     factor = found["magnitude"]
     assert isinstance(factor, FieldGradient)
-    assert factor.along(np.ones_like(factor.forces)) == pytest.approx(0.001 * found["lambda_m"], rel=1e-8)
+    assert factor.along(np.ones_like(factor.forces)) == pytest.approx(
+        0.001 * found["lambda_m"], rel=1e-8
+    )
 
 
 def neutral(scene: Scene, wave: Record) -> float:
@@ -199,7 +240,13 @@ def neutral(scene: Scene, wave: Record) -> float:
 def test_neutral_wave() -> None:
     """A wave around the axis, found again where all fields change together."""
     path = "loading={kind: pressure, until: bifurcation, control: arc}"
-    settings = [FIELD, path, "shell.radius_to_thickness=20", "shell.defect.amplitude=0.005", "mesh.degree=3"]
+    settings = [
+        FIELD,
+        path,
+        "shell.radius_to_thickness=20",
+        "shell.defect.amplitude=0.005",
+        "mesh.degree=3",
+    ]
     settings += ["natural={curvature: 0.02}"]
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
     wave = solved(scene)

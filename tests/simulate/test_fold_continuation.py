@@ -24,16 +24,22 @@ COARSE = ["mesh.degree=3", "mesh.refinement=0.4"]
 ANGLES = "magnetic.applied.polar"
 
 
-def outcomes(file: Path, over: str, settings: list[str], out: Path, *, full_paths: bool = False) -> list[Outcome]:
+def outcomes(
+    file: Path, over: str, settings: list[str], out: Path, *, full_paths: bool = False
+) -> list[Outcome]:
     return sweep(file, [over], settings, out, say=lambda line: None, full_paths=full_paths).outcomes
 
 
 def test_a_grid_takes_one_path(tmp_path: Path) -> None:
-    """Each line begins at the fold of the line before it; nine digits of the axisymmetric reference in README."""
+    """Each line begins at the fold of the line before it; nine digits of the axisymmetric reference
+    in README.
+    """
     over = ["magnetic.lambda_m=-0.00184,0.0005,0.00184", "shell.defect.amplitude=1.64,2"]
     found = sweep(DIMPLE, over, [], tmp_path / "grid", say=lambda line: None).outcomes
     assert [outcome.found for outcome in found] == ["path"] + 5 * ["fold"]
-    assert [found[0].knockdown, found[4].knockdown] == pytest.approx([0.120723865, 0.552053784], abs=2e-8)
+    assert [found[0].knockdown, found[4].knockdown] == pytest.approx(
+        [0.120723865, 0.552053784], abs=2e-8
+    )
     last = Case.load(DIMPLE, ["magnetic.lambda_m=0.00184", "shell.defect.amplitude=2"])
     assert found[5].knockdown == pytest.approx(run(last).knockdown, rel=1e-7)
 
@@ -68,17 +74,23 @@ def test_meridian_chains(tmp_path: Path, over: str, most: int) -> None:
 
 @pytest.mark.slow
 def test_half_shell_through_the_angles_of_the_figure(tmp_path: Path) -> None:
-    """At most 4 factorisations an angle after the first; the first and the last have a path of its own too."""
+    """At most 4 factorisations an angle after the first; the first and the last have a path of its
+    own too.
+    """
     followed = outcomes(COPLANAR, f"{ANGLES}=0:90:5", COARSE, tmp_path / "folds")
     paths = outcomes(COPLANAR, f"{ANGLES}=0:90:2", COARSE, tmp_path / "paths", full_paths=True)
     assert [o.found for o in followed] == ["path"] + ["fold"] * 4
     assert max(o.factorisations for o in followed[1:]) <= 4
-    assert [o.knockdown for o in followed[::4]] == pytest.approx([o.knockdown for o in paths], rel=1e-7)
+    assert [o.knockdown for o in followed[::4]] == pytest.approx(
+        [o.knockdown for o in paths], rel=1e-7
+    )
 
 
 @pytest.mark.slow
 def test_chain_has_the_model_of_its_least_symmetric_point(tmp_path: Path) -> None:
-    """With the field along the axis the meridian would do; beside tilted fields it is a half shell too."""
+    """With the field along the axis the meridian would do; beside tilted fields it is a half shell
+    too.
+    """
     settings = [*COARSE, "magnetic.lambda_m=0.001"]
     followed = outcomes(DIMPLE, f"{ANGLES}=0,10", settings, tmp_path / "auto")
     half = outcomes(DIMPLE, f"{ANGLES}=0,10", [*settings, "symmetry=half"], tmp_path / "half")
@@ -90,7 +102,9 @@ def test_chain_has_the_model_of_its_least_symmetric_point(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_fold_behind_a_bifurcation_is_not_a_knockdown(tmp_path: Path) -> None:
-    """R/h = 300, lambda_m = 0.00184: 28 waves come at p/p_c = 1.0145, the fold at 1.093385 (reference solver)."""
+    """R/h = 300, lambda_m = 0.00184: 28 waves come at p/p_c = 1.0145, the fold at 1.093385
+    (reference solver).
+    """
     settings = ["shell.radius_to_thickness=300"]
     chain = outcomes(DIMPLE, "magnetic.lambda_m=0.0006,0.001,0.00184", settings, tmp_path)
     assert [o.found for o in chain] == ["path", "fold", "path"]
@@ -116,14 +130,18 @@ def test_fold_below_no_pressure_is_refused() -> None:
     """At the critical field -0.0033554 (R/h = 90, nu = 1/2) the fold passes through p = 0."""
     scene, fold = polished("magnetic.lambda_m=-0.0032")
     continuation = Continuation(-0.0032, scene, fold.state)
-    assert continuation.follow(-0.0033, Scene(Case.load(DIMPLE, ["magnetic.lambda_m=-0.0033"]))).value > 0
+    assert (
+        continuation.follow(-0.0033, Scene(Case.load(DIMPLE, ["magnetic.lambda_m=-0.0033"]))).value
+        > 0
+    )
     with pytest.raises(FoldLost, match="not a maximum of the pressure"):
         continuation.follow(-0.0034, Scene(Case.load(DIMPLE, ["magnetic.lambda_m=-0.0034"])))
 
 
 @pytest.mark.parametrize("model", ["axisymmetric", pytest.param("half", marks=pytest.mark.slow)])
 def test_shallow_shells_are_similar(model: str) -> None:
-    """At equal defects in units of h and of sqrt(Rh), the fold's u/h changes little from R/h = 90 to 100.
+    """At equal defects in units of h and of sqrt(Rh), the fold's u/h changes little from R/h = 90
+    to 100.
 
     What is left of the change of u is a tenth of what scaling with h takes away.
     """
@@ -142,9 +160,21 @@ def test_shallow_caps_are_similar() -> None:
 
     def at(R: int) -> tuple[Scene, Fold]:
         dimple = {"kind": "dimple", "amplitude": 1.64, "width": 3.2}
-        shell = {"geometry": "cap", "radius": R, "thickness": 1, "polar": 35, "poisson_ratio": 0.5, "defect": dimple}
+        shell = {
+            "geometry": "cap",
+            "radius": R,
+            "thickness": 1,
+            "polar": 35,
+            "poisson_ratio": 0.5,
+            "defect": dimple,
+        }
         mesh = {"degree": 4, "refinement": 0.4}
-        data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": mesh, "loading": {"kind": "pressure"}}
+        data = {
+            "shell": shell,
+            "boundary": {"rim": "clamped"},
+            "mesh": mesh,
+            "loading": {"kind": "pressure"},
+        }
         result = run(Case.from_source(data))
         return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
 
@@ -188,12 +218,16 @@ if MPI.COMM_WORLD.rank == 0:
 
 @pytest.mark.slow
 def test_ranks_do_not_matter() -> None:
-    """A half shell without field on one rank and on two: fold, sensitivities, transfer to another mesh."""
+    """A half shell without field on one rank and on two: fold, sensitivities, transfer to another
+    mesh.
+    """
     found = []
     for ranks in (1, 2):
         command = [*mpirun(ranks), sys.executable, "-c", SHARED]
         settings = [*COARSE, "mesh.refinement=0.25", "magnetic.lambda_m=0"]
-        done = subprocess.run([*command, COPLANAR, *settings], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [*command, COPLANAR, *settings], capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
         found.append(json.loads(done.stdout))
     for other in found[1:]:
@@ -211,6 +245,8 @@ def test_chains_are_dealt_to_ranks(tmp_path: Path) -> None:
         done = magshell("sweep", DIMPLE, *over, "--out", tmp_path / str(ranks), ranks=ranks)
         assert done.returncode == 0, done.stderr
         with (tmp_path / str(ranks) / "sweep.csv").open(encoding="utf-8") as stream:
-            tables.append([{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(stream)])
+            tables.append(
+                [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(stream)]
+            )
     assert tables[0] == tables[1]
     assert [row["found"] for row in tables[0]] == ["path", "fold", "path", "fold"]

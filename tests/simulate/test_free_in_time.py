@@ -59,14 +59,22 @@ def test_a_magnetised_plate_is_a_compass_needle() -> None:
     omega = np.sqrt(REMANENCE * FIELD / MU0 / (DENSITY * LENGTH**2 / 12))
     quarter = np.pi / 2 / omega * (1 + np.radians(ANGLE) ** 2 / 16)
     height = CubicSpline(found["time"][1:], found["tip_uz"][1:])
-    along_field = LENGTH / 2 * np.sin(np.radians(ANGLE)) * found["tip_uz"].max() / np.abs(found["tip_uz"]).max()
+    along_field = (
+        LENGTH
+        / 2
+        * np.sin(np.radians(ANGLE))
+        * found["tip_uz"].max()
+        / np.abs(found["tip_uz"]).max()
+    )
     reached = brentq(lambda t: height(t) - along_field, 0.05, 0.09)
     assert reached == pytest.approx(quarter, rel=1e-4)
     assert NOT_COUNTED in scene.warnings
     assert not found["negative_pivots"].any()
 
 
-@pytest.mark.parametrize("change", [{"until": "rest"}, {"push": {"velocity": 1.0}}, {"until": "instability"}])
+@pytest.mark.parametrize(
+    "change", [{"until": "rest"}, {"push": {"velocity": 1.0}}, {"until": "instability"}]
+)
 def test_what_needs_a_shell_that_is_held(change: dict[str, Any]) -> None:
     with pytest.raises(MeshError, match="not held"):
         Scene(case_of(loading={**SWING, **change}))
@@ -74,8 +82,17 @@ def test_what_needs_a_shell_that_is_held(change: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 def test_two_free_magnets_attract() -> None:
-    """The equation of motion of two rigid coaxial current loops, force by Maxwell's elliptic integrals."""
-    radius, thickness, density, remanence, distance, duration = 5e-3, 0.4e-3, 2000.0, 0.1, 10e-3, 0.01
+    """The equation of motion of two rigid coaxial current loops, force by Maxwell's elliptic
+    integrals.
+    """
+    radius, thickness, density, remanence, distance, duration = (
+        5e-3,
+        0.4e-3,
+        2000.0,
+        0.1,
+        10e-3,
+        0.01,
+    )
     sizes = {"radius": f"{radius} m", "thickness": f"{thickness} m", "density": f"{density} kg/m^3"}
     disc = {
         "shell": {"geometry": "disc", "youngs_modulus": "10 MPa", "poisson_ratio": 0.3, **sizes},
@@ -103,6 +120,8 @@ def test_two_free_magnets_attract() -> None:
         return float(current**2 * slope)
 
     mass = density * np.pi * radius**2 * thickness
-    motion = solve_ivp(lambda t, y: [y[1], 2 * force(y[0]) / mass], (0, duration), [distance, 0], rtol=1e-9)
+    motion = solve_ivp(
+        lambda t, y: [y[1], 2 * force(y[0]) / mass], (0, duration), [distance, 0], rtol=1e-9
+    )
     fallen = (distance - motion.y[0, -1]) / 2 / thickness
     assert end == pytest.approx(fallen, rel=3e-3)  # the discs are 0.4 mm thick, the loops are not

@@ -1,4 +1,6 @@
-"""Branches, further solutions and sensitivities of shells that touch, each reached in another way too."""
+"""Branches, further solutions and sensitivities of shells that touch, each reached in another way
+too.
+"""
 
 from typing import Any
 
@@ -30,19 +32,33 @@ def domes(load: dict[str, Any], gap: float, modulus: float = 6, **lower: Any) ->
         "lower": of | {"shell": CAP | {"youngs_modulus": modulus} | lower},
         "upper": of | {"shell": CAP | {"youngs_modulus": 1}, "place": {"position": [0, 0, gap]}},
     }
-    return {"shells": shells, "contact": [["upper", "lower"]], "mesh": {"size": 0.03}, "loading": PUSH | load}
+    return {
+        "shells": shells,
+        "contact": [["upper", "lower"]],
+        "mesh": {"size": 0.03},
+        "loading": PUSH | load,
+    }
 
 
 @pytest.mark.slow
 def test_search() -> None:
-    """At one load the snapped dome in the air and the one that lies on the other: as on the path by arc length."""
+    """At one load the snapped dome in the air and the one that lies on the other: as on the path by
+    arc length.
+    """
     search = {"solutions": 2, "guesses": 14}
-    scene = Scene(Case.from_source(domes({"control": "load", "factor": 8e-5, "points": 1, "search": search}, 0.115)))
+    scene = Scene(
+        Case.from_source(
+            domes({"control": "load", "factor": 8e-5, "points": 1, "search": search}, 0.115)
+        )
+    )
     _, start, *found = (record.point.state for record in follow(scene))
     stage = plain(scene)
     path, here = stage.begin("load", "arc", start, 1e-5, 1e-4)
     way = _walk(stage, path, here, Goal("points", [start.mu["load"]], "load", steps=50))
-    reached = [point.state for _, (_, point) in zip(found, (it for it in way if it[0] == "target"), strict=False)]
+    reached = [
+        point.state
+        for _, (_, point) in zip(found, (it for it in way if it[0] == "target"), strict=False)
+    ]
     assert len(found) == len(reached) == 2
     for one, other in zip(found, reached, strict=True):
         assert np.abs(one.u - other.u).max() < 1e-8 * h
@@ -50,7 +66,9 @@ def test_search() -> None:
     for guess in dented(scene, start):  # those of the upper dome end before it is in the lower one
         assert not passes(stage, start, before_passing(stage, start, guess))
     below = State(np.array(start.u), start.mu)
-    below.u.reshape(-1, 2)[np.unique(scene.model.V.dofmap.list[scene.model.meridian.patches["upper"]]), 1] -= 0.3
+    below.u.reshape(-1, 2)[
+        np.unique(scene.model.V.dofmap.list[scene.model.meridian.patches["upper"]]), 1
+    ] -= 0.3
     assert passes(stage, start, scene.model.system.placed(below))
 
 
@@ -63,7 +81,9 @@ def fold_of(data: dict[str, Any], base: Scene | None = None) -> tuple[Scene, Rec
 
 @pytest.mark.slow
 def test_sensitivities() -> None:
-    """By the size of an imperfection and the field: folds of whole runs, 1e-4; the remanences add up to the field."""
+    """By the size of an imperfection and the field: folds of whole runs, 1e-4; the remanences add
+    up to the field.
+    """
 
     def data(amplitude: float = 0.1, field: float = 1e-5) -> dict[str, Any]:
         flaw = {"kind": "gaussian", "amplitude": amplitude, "width": 6}
@@ -83,43 +103,80 @@ def test_sensitivities() -> None:
         ends = (fold_of(data(**{name: value * (1 + way)}), scene) for way in (0.01, -0.01))
         a, b = (fold_at(*end).value for end in ends)
         assert found[key] == pytest.approx((a - b) / (0.02 * value), rel=1e-4), key
-    assert found["remanence lower"] + found["remanence upper"] == pytest.approx(1e-5 * found["lambda_m"], rel=1e-9)
+    assert found["remanence lower"] + found["remanence upper"] == pytest.approx(
+        1e-5 * found["lambda_m"], rel=1e-9
+    )
 
 
 def column(load: dict[str, Any], w0: str = "") -> Scene:
     """One between two others, clamped at one end and pressed at the other."""
-    strip = {"geometry": "strip", "radius": "1 m", "thickness": "0.02 m", "width": "0.1 m", "poisson_ratio": 0}
-    own = {"youngs_modulus": "1 MPa", **({"imperfections": [{"kind": "formula", "w0": w0}]} if w0 else {})}
+    strip = {
+        "geometry": "strip",
+        "radius": "1 m",
+        "thickness": "0.02 m",
+        "width": "0.1 m",
+        "poisson_ratio": 0,
+    }
+    own = {
+        "youngs_modulus": "1 MPa",
+        **({"imperfections": [{"kind": "formula", "w0": w0}]} if w0 else {}),
+    }
     root = {"boundary": {"root": "clamped"}}
     shells = {"column": root | {"shell": strip | own, "points": {"tip": ["1 m", 0, 0]}}}
     for name, z in (("above", "0.05 m"), ("below", "-0.05 m")):
-        shells[name] = root | {"shell": strip | {"youngs_modulus": "0.3 MPa"}, "place": {"position": [0, 0, z]}}
-    dead = {"kind": "dead", "control": "arc", "loads": [{"edge": "column.tip", "force": ["-1 N", 0, 0]}]}
-    data = {"shells": shells, "contact": [["column", "above"], ["column", "below"]], "loading": dead | load}
+        shells[name] = root | {
+            "shell": strip | {"youngs_modulus": "0.3 MPa"},
+            "place": {"position": [0, 0, z]},
+        }
+    dead = {
+        "kind": "dead",
+        "control": "arc",
+        "loads": [{"edge": "column.tip", "force": ["-1 N", 0, 0]}],
+    }
+    data = {
+        "shells": shells,
+        "contact": [["column", "above"], ["column", "below"]],
+        "loading": dead | load,
+    }
     return Scene(Case.from_source(data | {"mesh": {"size": "0.25 m", "degree": 3}}))
 
 
 @pytest.mark.slow
 def test_a_column_leans_on_another_one() -> None:
-    """It buckles at Euler's load; on the branch it touches: as a column that is a little bent from the start, 1e-3."""
+    """It buckles at Euler's load; on the branch it touches: as a column that is a little bent from
+    the start, 1e-3.
+    """
     perfect = column({"until": "bifurcation", "then": "follow", "factor": 0.2})
     ways = list(follow(perfect))
     euler = np.pi**2 / 4 * 1e6 * 0.1 * 0.02**3 / 12
     at = next(record.point.state.mu["load"] for record in ways if record.label == "bifurcation")
-    assert perfect.observe(State(ways[-1].point.state.u, ways[-1].point.state.mu))["load_factor"] == pytest.approx(0.2)
+    assert perfect.observe(State(ways[-1].point.state.u, ways[-1].point.state.mu))[
+        "load_factor"
+    ] == pytest.approx(0.2)
     assert at / ways[-1].point.state.mu["load"] == pytest.approx(euler / 0.2, rel=1e-3)
     bent = column({"until": "target", "factor": 0.2, "points": 2}, "2e-4*x**2")
     *_, last = follow(bent)
     one, other = (scene.observe(r.point.state) for scene, r in ((perfect, ways[-1]), (bent, last)))
-    forces = [seen["contact_force_column_above"] + seen["contact_force_column_below"] for seen in (one, other)]
+    forces = [
+        seen["contact_force_column_above"] + seen["contact_force_column_below"]
+        for seen in (one, other)
+    ]
     assert forces[0] > 0
     assert forces[0] == pytest.approx(forces[1], rel=1e-3)
     assert abs(one["column_tip_uz"]) == pytest.approx(abs(other["column_tip_uz"]), rel=1e-3)
 
 
 def test_what_a_larger_model_is_given() -> None:
-    """Each of two arches that nearly touch has its own displacement in the whole, and not the other one's."""
-    arch = {"geometry": "cylinder", "radius": 1, "length": 0.12, "azimuth": [60, 120], "thickness": 0.02}
+    """Each of two arches that nearly touch has its own displacement in the whole, and not the other
+    one's.
+    """
+    arch = {
+        "geometry": "cylinder",
+        "radius": 1,
+        "length": 0.12,
+        "azimuth": [60, 120],
+        "thickness": 0.02,
+    }
     one = {
         "shell": arch | {"youngs_modulus": 1, "poisson_ratio": 0.3},
         "boundary": {"left": "hinged", "right": "hinged"},

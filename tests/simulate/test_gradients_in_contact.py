@@ -32,7 +32,14 @@ from magshell_fenicsx.simulate.results import functional
 Array = NDArray[np.float64]
 h, GAP = 0.02, 1.001 * (0.02 + 0.025) / 2  # between mid-surfaces of 1 and 1.25 h
 STEP = 1e-4  # of a number
-CAP = {"geometry": "cap", "radius": 1, "polar": 30, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+CAP = {
+    "geometry": "cap",
+    "radius": 1,
+    "polar": 30,
+    "thickness": h,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0.3,
+}
 LOWER = {"shell": CAP, "boundary": {"rim": "clamped"}, "points": {"top": [0, 0, 1]}}
 CAPS: dict[str, Any] = {
     "shells": {
@@ -88,7 +95,9 @@ def solved(scene: Scene) -> Record:
     return last
 
 
-def by_difference(scene: Scene, data: dict[str, Any], key: str, value: float, results: Sequence[str]) -> Array:
+def by_difference(
+    scene: Scene, data: dict[str, Any], key: str, value: float, results: Sequence[str]
+) -> Array:
     """Of whole runs with other numbers."""
 
     def run(change: float) -> Array:
@@ -99,7 +108,9 @@ def by_difference(scene: Scene, data: dict[str, Any], key: str, value: float, re
     return np.asarray((run(STEP) - run(-STEP)) / (2 * STEP * value))
 
 
-def ends_of(scene: Scene, last: Record, key: str, value: float, change: float) -> list[tuple[Scene, State]]:
+def ends_of(
+    scene: Scene, last: Record, key: str, value: float, change: float
+) -> list[tuple[Scene, State]]:
     """Both caps with a number that is larger and smaller, at the same load."""
     cases = (case(CAPS, {key: value * (1 + way * change)}) for way in (1, -1))
     scenes = (Scene(on_mesh_of(scene, each.problem())) for each in cases)
@@ -119,7 +130,9 @@ def test_on_meridians() -> None:
     found = gradient(scene, last, of="lower_top_uz", by=[THICKNESS, MODULUS])
     assert scene.newton.factorisation.count <= before + 1
     for key, value in ((THICKNESS, 0.025), (MODULUS, 1.0)):
-        ahead, back = (functional(*end, "lower_top_uz").value for end in ends_of(scene, last, key, value, STEP))
+        ahead, back = (
+            functional(*end, "lower_top_uz").value for end in ends_of(scene, last, key, value, STEP)
+        )
         assert found[key] == pytest.approx((ahead - back) / (2 * STEP * value), rel=1e-6), key
 
 
@@ -128,7 +141,9 @@ def test_frequency_on_meridians() -> None:
     """By a modulus; a wave has no gradient where shells touch."""
     scene = Scene(case(CAPS, {}))
     last = solved(scene)
-    with pytest.raises(CaseError, match=r"omega2_1: m = 1: has no gradient where shells touch \(upper and lower\)"):
+    with pytest.raises(
+        CaseError, match=r"omega2_1: m = 1: has no gradient where shells touch \(upper and lower\)"
+    ):
         gradient(scene, last, of="omega2_1", by="w")
     found = gradient(scene, last, of="omega2_2", by=[MODULUS])
     ahead, back = (lowest(*end) for end in ends_of(scene, last, MODULUS, 1.0, 1e-3))
@@ -160,21 +175,28 @@ def smooth(x: Array) -> Array:
 
 @pytest.mark.slow
 def test_half_of_two_arches() -> None:
-    """By a thickness, the field and the remanence: displacements of the shell that is pressed, and the energy."""
+    """By a thickness, the field and the remanence: displacements of the shell that is pressed, and
+    the energy.
+    """
     scene = Scene(case(ARCHES, {}))
     last = solved(scene)
     assert scene.problem.half
     assert scene.observe(last.point.state)["contact_force"] > 0.01
     results = ("lower_top_uy", "energy")
     found = [gradient(scene, last, of=of, by=[THICKNESS, "lambda_m"]) for of in results]
-    for key, name, value in ((THICKNESS, THICKNESS, 0.025), ("magnetic.lambda_m", "lambda_m", 5e-3)):
+    for key, name, value in (
+        (THICKNESS, THICKNESS, 0.025),
+        ("magnetic.lambda_m", "lambda_m", 5e-3),
+    ):
         expected = by_difference(scene, ARCHES, key, value, results)
         assert [each[name] for each in found] == pytest.approx(expected, rel=1e-6), name
     magnet = with_remanence(scene, smooth, 0.0)
     by_field = gradient(magnet, solved(magnet), of="lower_top_uy", by="remanence")["remanence"]
     assert isinstance(by_field, FieldGradient)
     ahead, back = (with_remanence(scene, smooth, way * 1e-3) for way in (1, -1))
-    values = [functional(each, solved(each).point.state, "lower_top_uy").value for each in (ahead, back)]
+    values = [
+        functional(each, solved(each).point.state, "lower_top_uy").value for each in (ahead, back)
+    ]
     expected = (values[0] - values[1]) / 2e-3
     assert by_field.along(smooth(by_field.places)) == pytest.approx(expected, rel=1e-5)
 
@@ -185,7 +207,9 @@ def thicker(scene: Scene, c: float) -> Scene:
     assert given.patches
     own = Thickness(lambda x, y, z: 1 + c * even(np.stack([x, y, z], axis=-1)))
     space = Place(np.eye(3), np.zeros(3), 1.0)
-    patches = {name: PlacedFactor(own, space, float(times)) for name, times in given.patches.items()}  # type: ignore
+    patches = {
+        name: PlacedFactor(own, space, float(times)) for name, times in given.patches.items()
+    }  # type: ignore
     return Scene(replace(scene.problem, thickness=replace(given, patches=patches)))
 
 
@@ -195,9 +219,13 @@ def deviated(scene: Scene, c: float, data: dict[str, Any]) -> Scene:
 
 
 def imperfect(data: dict[str, Any], c: float = 0.0) -> dict[str, Any]:
-    """With deviations that are zero where the shells touch but for c, and a thickness that follows from them."""
+    """With deviations that are zero where the shells touch but for c, and a thickness that follows
+    from them.
+    """
     data = deepcopy(data)
-    x, square = ("x", "x**2 + y**2") if "magnetic" in data else ("sqrt(x**2 + y**2)", "x**2 + y**2 + z**2")
+    x, square = (
+        ("x", "x**2 + y**2") if "magnetic" in data else ("sqrt(x**2 + y**2)", "x**2 + y**2 + z**2")
+    )
     for each in data["shells"].values():
         flaws = [f"0.5*cos(5*{x}) - 0.5", f"{c!r}*cos(3*{x})"]
         each["shell"] |= {"imperfections": [{"kind": "formula", "w0": w0} for w0 in flaws]}
@@ -224,26 +252,38 @@ def agrees(scene: Scene, last: Record, by: str, ends: list[tuple[Scene, State]])
         times = np.where(upper & (THICKER in str(scene.problem.document.data)), 1.25, 1.0)
         along = even(found.places) * times * (h if by == "deviation" else 1.0)
         values = [functional(*each, of).value for each in ends]
-        assert found.along(along[..., None]) == pytest.approx((values[0] - values[1]) / (2 * STEP), rel=1e-5), (by, of)
+        assert found.along(along[..., None]) == pytest.approx(
+            (values[0] - values[1]) / (2 * STEP), rel=1e-5
+        ), (by, of)
 
 
 @pytest.mark.slow
 def test_by_fields_of_the_shape() -> None:
-    """By the thickness of both arches, on which the gap depends, and by their place; the lower one is of rubber."""
+    """By the thickness of both arches, on which the gap depends, and by their place; the lower one
+    is of rubber.
+    """
     data = deepcopy(ARCHES)
     data["shells"]["lower"]["shell"] |= {"law": "neo-hookean", "poisson_ratio": 0.5}
-    makes = {"thickness": (data, thicker), "deviation": (imperfect(data), partial(deviated, data=data))}
+    makes = {
+        "thickness": (data, thicker),
+        "deviation": (imperfect(data), partial(deviated, data=data)),
+    }
     for name, (given, make) in makes.items():
         scene = Scene(Case.from_source(given))
         last = solved(scene)
         assert scene.observe(last.point.state)["contact_force"] > 0.01
-        ends = [(made, with_same_cuts(scene, last, made)) for made in (make(scene, way * STEP) for way in (1, -1))]
+        ends = [
+            (made, with_same_cuts(scene, last, made))
+            for made in (make(scene, way * STEP) for way in (1, -1))
+        ]
         agrees(scene, last, name, ends)
 
 
 @pytest.mark.slow
 def test_ranks(tmp_path: Path) -> None:
-    """A run's section `gradients` on 1 and 2 ranks, of a displacement and a frequency, by numbers and the shape."""
+    """A run's section `gradients` on 1 and 2 ranks, of a displacement and a frequency, by numbers
+    and the shape.
+    """
     asked = {"of": ["lower_top_uy", "omega2_1"], "by": [THICKNESS, "lambda_m", "deviation"]}
     data = imperfect(ARCHES) | {"gradients": asked, "symmetry": "none"}
     (tmp_path / "arches.yaml").write_text(yaml.safe_dump(data))
@@ -256,20 +296,29 @@ def test_ranks(tmp_path: Path) -> None:
     for of in asked["of"]:
         one, two = (each[of] for each in found)
         assert two["numbers"] == pytest.approx(one["numbers"], rel=1e-6)
-        assert two["fields"]["deviation"]["alike"] == pytest.approx(one["fields"]["deviation"]["alike"], rel=1e-6)
+        assert two["fields"]["deviation"]["alike"] == pytest.approx(
+            one["fields"]["deviation"]["alike"], rel=1e-6
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("upper", [{}, {"thickness": h}])
 def test_by_fields_on_meridians(upper: dict[str, Any]) -> None:
-    """The same of two caps on their meridians, also where the thickness is no field in what was solved."""
+    """The same of two caps on their meridians, also where the thickness is no field in what was
+    solved.
+    """
     data = deepcopy(CAPS)
     data["shells"]["upper"]["shell"] |= upper
-    makes = {"thickness": (data, thicker), "deviation": (imperfect(data), partial(deviated, data=data))}
+    makes = {
+        "thickness": (data, thicker),
+        "deviation": (imperfect(data), partial(deviated, data=data)),
+    }
     for name, (given, make) in makes.items():
         scene = Scene(Case.from_source(given))
         last = solved(scene)
-        ends = [(made, held_at(made, last)) for made in (make(scene, way * STEP) for way in (1, -1))]
+        ends = [
+            (made, held_at(made, last)) for made in (make(scene, way * STEP) for way in (1, -1))
+        ]
         agrees(scene, last, name, ends)
 
 
@@ -280,14 +329,18 @@ def held_at(scene: Scene, last: Record, name: str = "w") -> State:
     assert solution.converged
     state = solution.state
     for _ in range(2):  # to rounding, for differences
-        correction = scene.newton.factor_at(state).solve(-scene.model.system.residual(state.u, state.mu))
+        correction = scene.newton.factor_at(state).solve(
+            -scene.model.system.residual(state.u, state.mu)
+        )
         state = State(state.u + correction, state.mu)
     return state
 
 
 def lowest(scene: Scene, state: State) -> float:
     """The lowest frequency that the model sees itself."""
-    return next(mode.eigenvalue for mode in ShellModes(scene.model).vibrations(state, 6) if not mode.label)
+    return next(
+        mode.eigenvalue for mode in ShellModes(scene.model).vibrations(state, 6) if not mode.label
+    )
 
 
 @pytest.mark.slow
@@ -310,4 +363,6 @@ def test_frequencies_of_two_arches() -> None:
     expected = (at(1e-6, THICKNESS, 0.025) - at(-1e-6, THICKNESS, 0.025)) / 2e-6
     assert found[THICKNESS] == pytest.approx(expected, rel=1e-5)
     along = (h * times * even(of_shape.places))[..., None]
-    assert of_shape.along(along) == pytest.approx((at(1e-5) - at(-1e-5)) / 2e-5, rel=3e-4)  # it nearly cancels
+    assert of_shape.along(along) == pytest.approx(
+        (at(1e-5) - at(-1e-5)) / 2e-5, rel=3e-4
+    )  # it nearly cancels

@@ -32,12 +32,24 @@ from magshell_fenicsx.simulate.scene import Scene
 Array = NDArray[np.float64]
 FOLLOWED = {"kind": "pressure", "until": "bifurcation", "then": "follow", "points": 3}
 CAP = {
-    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.01, "polar": 30.0, "poisson_ratio": 0.3},
+    "shell": {
+        "geometry": "cap",
+        "radius": 1.0,
+        "thickness": 0.01,
+        "polar": 30.0,
+        "poisson_ratio": 0.3,
+    },
     "boundary": {"rim": "clamped"},
     "loading": FOLLOWED,
 }
 TUBE = {
-    "shell": {"geometry": "cylinder", "radius": 1.0, "length": 2.0, "thickness": 0.05, "poisson_ratio": 0.3},
+    "shell": {
+        "geometry": "cylinder",
+        "radius": 1.0,
+        "length": 2.0,
+        "thickness": 0.05,
+        "poisson_ratio": 0.3,
+    },
     "boundary": {"bottom": "clamped", "top": "clamped"},
     "loading": FOLLOWED,
 }
@@ -53,27 +65,51 @@ BARREL = {
     "loading": FOLLOWED,
 }
 BALL = {  # more than half of a sphere
-    "shell": {"geometry": "cap", "radius": 1.0, "thickness": 0.04, "polar": 120.0, "poisson_ratio": 0.3},
+    "shell": {
+        "geometry": "cap",
+        "radius": 1.0,
+        "thickness": 0.04,
+        "polar": 120.0,
+        "poisson_ratio": 0.3,
+    },
     "boundary": {"rim": "clamped"},
     "loading": FOLLOWED,
 }
-WAVES = {  # the larger model's mesh, and w0 of h/10000 at most: it changes the load by its part of the waves' height
+# the larger model's mesh, and w0 of h/10000 at most: it changes the load by its part of the waves'
+# height
+WAVES = {
     "cap": (CAP | FINER, 5, FINER, "0.003*(x**5 - 10*x**3*y**2 + 5*x*y**4)"),
     "barrel": (BARREL | FINER, 6, FINER, "0.0001*cos(6*arctan2(y, x))"),
-    "ball": (BALL | FINER, 8, FINER, "1e-5*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)"),
+    "ball": (
+        BALL | FINER,
+        8,
+        FINER,
+        "1e-5*(x**8 - 28*x**6*y**2 + 70*x**4*y**4 - 28*x**2*y**6 + y**8)",
+    ),
 }
 
 
 def _on_larger(small: ShellModel, u: Array, large: ShellModel) -> Array:
-    """A displacement of a sector and its images at the nodes of a larger model (n, 3), by its elements."""
+    """A displacement of a sector and its images at the nodes of a larger model (n, 3), by its
+    elements.
+    """
     assert isinstance(small.mirror, Sector)
-    folding, chart = Folding(small.mirror.angle, small.mirror.waves, small.midsurface.patch), large.chart()
+    folding, chart = (
+        Folding(small.mirror.angle, small.mirror.waves, small.midsurface.patch),
+        large.chart(),
+    )
     nodes = small.V.dofmap.list
     corners = small.chart()[nodes[:, :3]]
-    sides = np.linalg.inv(np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2))
+    sides = np.linalg.inv(
+        np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+    )
     local = np.einsum("cij,ncj->nci", sides, folding.back(chart)[:, None] - corners[:, 0])
-    cells = np.minimum(local.min(axis=2), 1 - local.sum(axis=2)).argmax(axis=1)  # beyond a curved rim the nearest
-    table = small.V.element.basix_element.tabulate(0, local[np.arange(len(chart)), cells])[0, :, :, 0]
+    cells = np.minimum(local.min(axis=2), 1 - local.sum(axis=2)).argmax(
+        axis=1
+    )  # beyond a curved rim the nearest
+    table = small.V.element.basix_element.tabulate(0, local[np.arange(len(chart)), cells])[
+        0, :, :, 0
+    ]
     turns = np.array([folding.turn(k) for k in range(folding.count)])[folding.copies(chart)]
     return np.asarray(np.einsum("nij,np,npj->ni", turns, table, u.reshape(-1, 3)[nodes[cells]]))
 
@@ -81,11 +117,12 @@ def _on_larger(small: ShellModel, u: Array, large: ShellModel) -> Array:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WAVES)
 def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
-    """Of shells of their own meshes, with an imperfection of h/10000 in the mode's waves, at the same volumes.
+    """Of shells of their own meshes, with an imperfection of h/10000 in the mode's waves, at the
+    same volumes.
 
-    They carry the same pressure to 1e-3 at three amplitudes, and have as many unstable directions. They are halves,
-    whose plane holds the waves where they are: a whole shell may turn them about e3 almost without a force. Their own
-    count of antisymmetric modes has this one or not.
+    They carry the same pressure to 1e-3 at three amplitudes, and have as many unstable directions.
+    They are halves, whose plane holds the waves where they are: a whole shell may turn them about
+    e3 almost without a force. Their own count of antisymmetric modes has this one or not.
     """
     case, m, mesh, waves = WAVES[name]
     records = list(follow(Scene(problem_of(case)), remark=lambda said: None))
@@ -114,8 +151,15 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
 
 @pytest.mark.slow
 def test_an_instability_is_located_on_the_path() -> None:
-    """Of a cap on a bed: other branches pass near its first bifurcation, at smaller loads (0.760 and 0.783)."""
-    cap = CAP["shell"] | {"radius": "25 mm", "thickness": "0.25 mm", "youngs_modulus": "1 MPa", "polar": 22.0}
+    """Of a cap on a bed: other branches pass near its first bifurcation, at smaller loads (0.760
+    and 0.783).
+    """
+    cap = CAP["shell"] | {
+        "radius": "25 mm",
+        "thickness": "0.25 mm",
+        "youngs_modulus": "1 MPa",
+        "polar": 22.0,
+    }
     case = CAP | {
         "shell": cap,
         "foundation": {"stiffness": "40 kPa/m"},
@@ -134,7 +178,10 @@ def test_an_instability_is_located_on_the_path() -> None:
 
 def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     """Load, energy and deflection of the meridian; the mode's stiffness is zero in both models."""
-    way, records = follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None), []
+    way, records = (
+        follow(Scene(problem_of({**CAP, "mesh": {"refinement": 1.5}})), remark=lambda said: None),
+        [],
+    )
     for record in way:
         records.append(record)
         if record.scene is not records[0].scene:  # what follows is the branch
@@ -155,16 +202,30 @@ def test_handing_over_is_continuous_to_the_meshes_error() -> None:
 
 
 def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
-    """p/p_c = 1 + (27/32) (w/R)^2 of an inextensible ring under hydrostatic pressure, p_c = 3 D/R^3.
+    """p/p_c = 1 + (27/32) (w/R)^2 of an inextensible ring under hydrostatic pressure, p_c = 3
+    D/R^3.
 
-    Budiansky, Theory of buckling and post-buckling behavior of elastic structures, Adv. Appl. Mech. 14 (1974). The ring
-    is held by nothing, which a case is not allowed: a sector excludes its rigid motions.
+    Budiansky, Theory of buckling and post-buckling behavior of elastic structures, Adv. Appl. Mech.
+    14 (1974). The ring is held by nothing, which a case is not allowed: a sector excludes its rigid
+    motions.
     """
     own = BoundarySection.leaves
-    monkeypatch.setattr(BoundarySection, "leaves", lambda self, context, outline: own(self, context, outline)[:-1])
+    monkeypatch.setattr(
+        BoundarySection, "leaves", lambda self, context, outline: own(self, context, outline)[:-1]
+    )
     h = 0.01
-    shell = {"geometry": "cylinder", "radius": 1.0, "length": 0.12, "thickness": h, "poisson_ratio": 0.0}
-    case = {"shell": shell, "boundary": {"bottom": "symmetry", "top": "symmetry"}, "mesh": {"size": 0.24, "degree": 4}}
+    shell = {
+        "geometry": "cylinder",
+        "radius": 1.0,
+        "length": 0.12,
+        "thickness": h,
+        "poisson_ratio": 0.0,
+    }
+    case = {
+        "shell": shell,
+        "boundary": {"bottom": "symmetry", "top": "symmetry"},
+        "mesh": {"size": 0.24, "degree": 4},
+    }
     scene = Scene(problem_of({**case, "symmetry": 2, "loading": FOLLOWED}))
     records = list(follow(scene, remark=lambda said: None))
     x, unit = scene.model.r0.x.array.reshape(-1, 3), scene.problem.material.classical_pressure
@@ -177,14 +238,18 @@ def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.Mo
     pressures = [record.point.state.mu["pressure"] for record in records]
     assert pressures[1] * unit == pytest.approx(3 * h**3 / 12, rel=1e-4)
     squares = np.array([bend(record) ** 2 for record in records[3:]])
-    rises = np.diff(pressures[3:]) / pressures[1]  # along the branch: at its begin rounding hides 1e-5 of the pressure
+    rises = (
+        np.diff(pressures[3:]) / pressures[1]
+    )  # along the branch: at its begin rounding hides 1e-5 of the pressure
     assert rises / np.diff(squares) == pytest.approx(27 / 32, rel=0.01)
     begin = np.polyfit(squares, pressures[3:], len(squares) - 1)[-1]  # of the branch
     assert abs(begin - pressures[1]) <= records[1].point.load_error < 1e-4 * begin
 
 
 @pytest.mark.slow
-def test_the_branch_of_a_tube_has_the_curvature_of_koiters_theory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_branch_of_a_tube_has_the_curvature_of_koiters_theory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Load and b of p/p_c = 1 + b (w/h)^2 by Ritz's method, w the height of four waves: -0.1300."""
     h, length = TUBE["shell"]["thickness"], TUBE["shell"]["length"]
     critical, b = koiter(h, length, 0.3, 4)
@@ -192,31 +257,55 @@ def test_the_branch_of_a_tube_has_the_curvature_of_koiters_theory(monkeypatch: p
     for size in (0.15, 0.3):  # of the first step along the mode, in thicknesses
         monkeypatch.setattr(bifurcation, "SIZES", (size,))
         records = follow(Scene(problem_of(TUBE)), remark=lambda said: None)
-        buckled, first = islice((r for r in records if r.scene and isinstance(r.scene.problem.mirror, Sector)), 2)
+        buckled, first = islice(
+            (r for r in records if r.scene and isinstance(r.scene.problem.mirror, Sector)), 2
+        )
         assert first.scene
         x, u = first.scene.model.r0.x.array.reshape(-1, 3), first.point.state.u.reshape(-1, 3)
-        normals = np.array([[1.0, 0.0, 0.0], [np.cos(pi / 4), np.sin(pi / 4), 0.0]])  # of a crest and a trough
+        normals = np.array(
+            [[1.0, 0.0, 0.0], [np.cos(pi / 4), np.sin(pi / 4), 0.0]]
+        )  # of a crest and a trough
         nodes = [np.argmin(np.linalg.norm(x - n - [0.0, 0.0, length / 2], axis=1)) for n in normals]
         crest, trough = (n @ u[node] for n, node in zip(normals, nodes, strict=True))
         height = (crest - trough) / 2 / h
         p_c = buckled.point.state.mu["pressure"]
         seen.append((height**2, (first.point.state.mu["pressure"] / p_c - 1) / height**2))
-        assert p_c * first.scene.problem.material.classical_pressure == pytest.approx(critical, rel=2e-4)
+        assert p_c * first.scene.problem.material.classical_pressure == pytest.approx(
+            critical, rel=2e-4
+        )
     (x0, b0), (x1, b1) = seen
     assert b0 - x0 * (b1 - b0) / (x1 - x0) == pytest.approx(b, rel=0.02)
 
 
 @pytest.mark.slow
 def test_a_half_hands_over_to_the_whole_shell() -> None:
-    """A shallow pinned arch of rise parameter 2.6 buckles to one side before its fold (Fung and Kaplan 1952).
+    """A shallow pinned arch of rise parameter 2.6 buckles to one side before its fold (Fung and
+    Kaplan 1952).
 
     The half finds an antisymmetric mode; on its branch, in the whole shell, the load falls.
     """
-    shell = {"geometry": "plate", "length": 1.0, "width": 0.05, "thickness": 0.01, "youngs_modulus": 1.0}
-    shell |= {"poisson_ratio": 0.0, "imperfections": [{"kind": "formula", "w0": "sin(pi*x)", "amplitude": 1.50111}]}
-    dead = {"over": "all", "per_area": ["0", "0", f"{-4 * pi**4 / 12 * 1e-8 * 0.577350269 / 2 / 2!r}*sin(pi*x)"]}
+    shell = {
+        "geometry": "plate",
+        "length": 1.0,
+        "width": 0.05,
+        "thickness": 0.01,
+        "youngs_modulus": 1.0,
+    }
+    shell |= {
+        "poisson_ratio": 0.0,
+        "imperfections": [{"kind": "formula", "w0": "sin(pi*x)", "amplitude": 1.50111}],
+    }
+    dead = {
+        "over": "all",
+        "per_area": ["0", "0", f"{-4 * pi**4 / 12 * 1e-8 * 0.577350269 / 2 / 2!r}*sin(pi*x)"],
+    }
     load = {"kind": "dead", "loads": [dead], "until": "bifurcation", "then": "follow", "points": 2}
-    case = {"shell": shell, "boundary": {"left": "hinged", "right": "hinged"}, "mesh": {"size": 0.05}, "loading": load}
+    case = {
+        "shell": shell,
+        "boundary": {"left": "hinged", "right": "hinged"},
+        "mesh": {"size": 0.05},
+        "loading": load,
+    }
     records = list(follow(Scene(problem_of(case)), remark=lambda said: None))
     old, new = next((a, b) for a, b in pairwise(records) if a.mode == "antisymmetric")
     assert old.scene
@@ -229,24 +318,35 @@ def test_a_half_hands_over_to_the_whole_shell() -> None:
     assert abs(phi.eigenvalue) < 1e-9
     assert records[-1].point.state.mu["load"] < old.point.state.mu["load"]
     alone = list[Record]()
-    with pytest.raises(Stopped, match="in which nothing is read for this command"):  # as `identify` follows it
+    with pytest.raises(
+        Stopped, match="in which nothing is read for this command"
+    ):  # as `identify` follows it
         alone.extend(follow_alone(old.scene, remark=lambda said: None))
 
 
 @pytest.mark.slow
 def test_a_torus_that_is_closed_in_both_directions() -> None:
-    """Held at four points; its half hands an antisymmetric mode over to all of it, which finds the branch alone too."""
+    """Held at four points; its half hands an antisymmetric mode over to all of it, which finds the
+    branch alone too.
+    """
     around = {"a": [1.4, 0, 0], "b": [-1.4, 0, 0], "c": [0, 1.4, 0], "d": [0, -1.4, 0]}
     held = {"a": ["x", "y", "z"], "b": ["y", "z"], "c": ["z"], "d": ["z"]}
     case = {
-        "shell": {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4, "thickness": 0.08, "poisson_ratio": 0.3},
+        "shell": {
+            "geometry": "torus",
+            "radius": 1.0,
+            "tube_radius": 0.4,
+            "thickness": 0.08,
+            "poisson_ratio": 0.3,
+        },
         "points": around,
         "boundary": {name: {"held": axes} for name, axes in held.items()},
         "mesh": {"degree": 3, "refinement": 0.5},
         "loading": FOLLOWED | {"points": 2},
     }
     half, whole = (
-        list(follow(Scene(problem_of(case | {"symmetry": how})), remark=lambda said: None)) for how in ("auto", "none")
+        list(follow(Scene(problem_of(case | {"symmetry": how})), remark=lambda said: None))
+        for how in ("auto", "none")
     )
     assert next(record.mode for record in half if record.label == "bifurcation") == "antisymmetric"
     ends = [records[-1] for records in (half, whole)]
@@ -287,12 +387,16 @@ def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: P
                 there["excluded_pivots"],
             )
             for column in ("p_over_pc", "w_over_h", "energy"):
-                assert float(row[column]) == pytest.approx(float(there[column]), rel=1e-5, abs=1e-12)
+                assert float(row[column]) == pytest.approx(
+                    float(there[column]), rel=1e-5, abs=1e-12
+                )
 
 
 @pytest.mark.slow
 def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
-    """Gradients of the instability are of the first model, those at the end of the last; differences of runs agree."""
+    """Gradients of the instability are of the first model, those at the end of the last;
+    differences of runs agree.
+    """
     target = "{kind: pressure, control: load, until: target, pressure: 0.505, points: 1}"
     text = (
         "shell: {geometry: cap, radius: 1, thickness: %r, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
@@ -306,7 +410,10 @@ def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
         case.write_text(text % (h, target))
         more = ["--set", asked] if h == 0.01 else []
         out = tmp_path / f"{h}"
-        assert magshell("run", case, "--set", coarse, *more, "--out", out, "--no-pictures").returncode == 0
+        assert (
+            magshell("run", case, "--set", coarse, *more, "--out", out, "--no-pictures").returncode
+            == 0
+        )
         last = float(read_path(out)[-1]["volume_change"])
         found[h] = json.loads((out / "summary.json").read_text()) | {"volume_change": last}
     slopes = found[0.01]["gradients"]
@@ -318,9 +425,11 @@ def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_tolerance_holds_on_the_branch() -> None:
-    """The first mesh of the sector has 3 % of error; that of the run less than 1 %, as a mesh of degree 5 says.
+    """The first mesh of the sector has 3 % of error; that of the run less than 1 %, as a mesh of
+    degree 5 says.
 
-    The load there at the same volume lies beside by less than the estimate, and more than a quarter of it.
+    The load there at the same volume lies beside by less than the estimate, and more than a quarter
+    of it.
     """
     problem = problem_of({**CAP, "mesh": {"tolerance": 0.01}})
     result = run(problem)
@@ -343,4 +452,6 @@ def test_a_tolerance_holds_on_the_branch() -> None:
     assert again.branch
     assert again.branch.best == chosen.branch.best
     assert again.branch.choice.size
-    assert again.branch.choice.size(np.array([0.2, 0.1])) == chosen.branch.choice.size(np.array([0.2, 0.1]))  # type: ignore[misc]
+    assert again.branch.choice.size(np.array([0.2, 0.1])) == chosen.branch.choice.size(
+        np.array([0.2, 0.1])
+    )  # type: ignore[misc]

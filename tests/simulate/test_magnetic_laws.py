@@ -22,11 +22,17 @@ def thin(R_over_h: float) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["shell", "solid"])
 def test_laws_agree_where_nothing_stretches(model: str) -> None:
-    """A strip bends far and stretches by 3e-7 at L/h = 1000: to 1e-6. The shells at 100 are 30 times as far apart."""
+    """A strip bends far and stretches by 3e-7 at L/h = 1000: to 1e-6.
+
+    The shells at 100 are 30 times as far apart.
+    """
     coarse = SOLID if model == "solid" else ["mesh.refinement=0.4"]
     apart = []
     for R_over_h in (1000, 100) if model == "shell" else (1000,):
-        found = [tip([*thin(R_over_h), *coarse, f"magnetic.remanence={law}"]) for law in ("deformation", "rotation")]
+        found = [
+            tip([*thin(R_over_h), *coarse, f"magnetic.remanence={law}"])
+            for law in ("deformation", "rotation")
+        ]
         apart.append(abs(found[1] / found[0] - 1))
     assert apart[0] < 1e-6
     assert all(30 * apart[0] < other < 1e-4 for other in apart[1:])

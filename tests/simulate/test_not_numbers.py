@@ -10,7 +10,13 @@ from magshell_fenicsx import Case, Jet, OwnTerm
 from magshell_fenicsx.public import run
 
 CAP = {
-    "shell": {"geometry": "cap", "polar": 30, "radius": 1.0, "thickness": 0.016, "poisson_ratio": 0.3},
+    "shell": {
+        "geometry": "cap",
+        "polar": 30,
+        "radius": 1.0,
+        "thickness": 0.016,
+        "poisson_ratio": 0.3,
+    },
     "boundary": {"rim": "clamped"},
     "symmetry": "none",
     "mesh": {"degree": 2, "refinement": 0.2},

@@ -1,4 +1,6 @@
-"""What a state shows is a function of the state: whether it is observed at once, alone, later or in another order."""
+"""What a state shows is a function of the state: whether it is observed at once, alone, later or in
+another order.
+"""
 
 from math import pi
 from typing import Any
@@ -16,7 +18,9 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
-MOMENT = [{"edge": "tip", "moment": -2 * pi * 0.01**3 / 12}]  # rolls a strip of length 1 up to a circle
+MOMENT = [
+    {"edge": "tip", "moment": -2 * pi * 0.01**3 / 12}
+]  # rolls a strip of length 1 up to a circle
 ROLLED = {
     "shell": {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0.0},
     "boundary": {"root": "clamped"},
@@ -45,7 +49,9 @@ def energies(scene: Scene, records: list[Record]) -> list[float]:
 
 @pytest.mark.slow
 def test_a_strip_rolled_up() -> None:
-    """Seen on the way, and without what came before: the energy of a moment M on a strip is -M angle/2."""
+    """Seen on the way, and without what came before: the energy of a moment M on a strip is -M
+    angle/2.
+    """
     scene, seen, records = Scene(strip(BY_LOAD)), list[float](), list[Record]()
     for record in follow(scene):
         records.append(record)
@@ -60,21 +66,34 @@ def test_a_strip_rolled_up() -> None:
 
 @pytest.mark.slow
 def test_a_strip_rolled_up_in_time() -> None:
-    """Kinetic, stored and dissipated energy are the work of the moment, from rows more than half a turn apart."""
+    """Kinetic, stored and dissipated energy are the work of the moment, from rows more than half a
+    turn apart.
+    """
     scene = Scene(strip(IN_TIME))
     *_, begin, middle, last = follow(scene)
     for record in (last, middle):
         energy = scene.observe(record.point.state)["energy"]
-        stored = scene.stored(record.point.state, energy) - scene.stored(begin.point.state, energies(scene, [begin])[0])
+        stored = scene.stored(record.point.state, energy) - scene.stored(
+            begin.point.state, energies(scene, [begin])[0]
+        )
         clock = record.clock
-        assert clock["kinetic"] + stored + clock["dissipated"] == pytest.approx(clock["work"], rel=1e-3)
+        assert clock["kinetic"] + stored + clock["dissipated"] == pytest.approx(
+            clock["work"], rel=1e-3
+        )
     assert clock["work"] > 0
 
 
 HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.5}
 DIMPLE = {"kind": "dimple", "amplitude": 1.64, "width": 3.2}
 BALL = {"kind": "sphere", "radius": 0.3, "stiffness": 1e3}
-PLATE = {"geometry": "plate", "length": 1.0, "width": 0.2, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0}
+PLATE = {
+    "geometry": "plate",
+    "length": 1.0,
+    "width": 0.2,
+    "thickness": 0.02,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0,
+}
 MAGNET = {
     "kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T", "axis": {"polar": -90},
     "position": ["55 mm", 0, "-30 mm"],
@@ -134,7 +153,9 @@ def rough_states(scene: Scene, count: int) -> list[State]:
     for number in range(count):
         u = system.held(1e-3 * np.random.default_rng(number).standard_normal(system.size))
         mu = {name: 0.05 * (1 + i) * (number - 1.3) for i, name in enumerate(start.mu)}
-        past = {name: (1.0 + number) * (value or 3.0) for name, (_, value) in system.history.items()}
+        past = {
+            name: (1.0 + number) * (value or 3.0) for name, (_, value) in system.history.items()
+        }
         states.append(system.placed(State(u, mu | past)))
     return states
 
@@ -151,8 +172,17 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     parts = (tangent.K, tangent.N) if isinstance(tangent, Skewed) else (tangent,)
     values = [np.array(part.getValuesCSR()[2]) for part in parts]
     if isinstance(scene.model, MeridianModel):
-        values.append(np.array(scene.model.excluded_modes.waves.tangent(state, 2).getValuesCSR()[2]))
-    return [shown, np.array(numbers), system.residual(u, mu), system.forces(u, mu), *columns, *values]
+        values.append(
+            np.array(scene.model.excluded_modes.waves.tangent(state, 2).getValuesCSR()[2])
+        )
+    return [
+        shown,
+        np.array(numbers),
+        system.residual(u, mu),
+        system.forces(u, mu),
+        *columns,
+        *values,
+    ]
 
 
 SLOW = "contact and growing dimple of half a shell"

@@ -22,7 +22,14 @@ EDGE = {"kind": "edge", "name": "w", "control": "load", "factor": 1, "points": 1
 
 def strip(z: float) -> dict[str, Any]:
     """A clamped strip at a height."""
-    shell = {"geometry": "plate", "length": 1, "width": 0.2, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0}
+    shell = {
+        "geometry": "plate",
+        "length": 1,
+        "width": 0.2,
+        "thickness": h,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0,
+    }
     return {"shell": shell, "boundary": {"left": "clamped"}, "place": {"position": [0, 0, z]}}
 
 
@@ -32,7 +39,9 @@ def stack() -> Scene:
     shells = {"lower": strip(-2 * h), "middle": strip(0), "upper": strip(2 * h)}
     pairs = [["upper", "middle"], ["lower", "middle"]]
     mesh = {"degree": 2, "size": 0.2}
-    return Scene(Case.from_source({"shells": shells, "contact": pairs, "mesh": mesh, "loading": EDGE}))
+    return Scene(
+        Case.from_source({"shells": shells, "contact": pairs, "mesh": mesh, "loading": EDGE})
+    )
 
 
 def lifted(scene: Scene, **up: float) -> State:
@@ -44,7 +53,9 @@ def lifted(scene: Scene, **up: float) -> State:
 
 
 def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
-    """The gap of the other pair, from h to -h, is 0.002 h left at 0.499 of the way; with nothing else alike."""
+    """The gap of the other pair, from h to -h, is 0.002 h left at 0.499 of the way; with nothing
+    else alike.
+    """
     here, guess = lifted(stack, upper=-1.001), lifted(stack, lower=2)
     ahead = way_to_touch(stack, lambda state: state, here, guess)
     assert ahead.lets_go
@@ -55,7 +66,9 @@ def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
     assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == Ahead(lets_go=True)
 
 
-def test_a_step_on_which_one_lets_go_ends_before_another_meets(stack: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_on_which_one_lets_go_ends_before_another_meets(
+    stack: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The tangent alone foresees it, and is looked along again."""
     asked = list[State]()
 
@@ -68,17 +81,36 @@ def test_a_step_on_which_one_lets_go_ends_before_another_meets(stack: Scene, mon
     assert point.s == pytest.approx(0.05, rel=1e-12)
 
 
-CAP = {"geometry": "cap", "radius": 1, "polar": 30, "thickness": 2 * h, "youngs_modulus": 1, "poisson_ratio": 0.3}
+CAP = {
+    "geometry": "cap",
+    "radius": 1,
+    "polar": 30,
+    "thickness": 2 * h,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0.3,
+}
 
 
 @pytest.mark.parametrize("symmetry", ["auto", "half"])
 def test_check_says_by_how_much_shells_overlap(symmetry: str) -> None:
-    """A gap of 0.75 of the thickness is an overlap by 0.25; in the words of a run, which may see another place."""
-    lower, upper = ({"shell": CAP | {"radius": r}, "boundary": {"rim": "clamped"}} for r in (1, 1.4))
+    """A gap of 0.75 of the thickness is an overlap by 0.25; in the words of a run, which may see
+    another place.
+    """
+    lower, upper = (
+        {"shell": CAP | {"radius": r}, "boundary": {"rim": "clamped"}} for r in (1, 1.4)
+    )
     upper["place"] = {"position": [0, 0, 2.4 + 0.75 * 2 * h], "axis": {"polar": 180}}
-    shells = {"shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "symmetry": symmetry}
-    case = Case.from_source(shells | {"loading": {"kind": "pressure", "pressure": 0.1, "until": "target", "points": 1}})
-    said = r"contact: upper and lower overlap undeformed, by 0.2[45]\d* h at \(.*\) R: move them apart"
+    shells = {
+        "shells": {"lower": lower, "upper": upper},
+        "contact": [["upper", "lower"]],
+        "symmetry": symmetry,
+    }
+    case = Case.from_source(
+        shells | {"loading": {"kind": "pressure", "pressure": 0.1, "until": "target", "points": 1}}
+    )
+    said = (
+        r"contact: upper and lower overlap undeformed, by 0.2[45]\d* h at \(.*\) R: move them apart"
+    )
     with pytest.raises(CaseError, match=said):
         describe(case)
     with pytest.raises(MeshError, match=said):

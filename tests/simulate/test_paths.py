@@ -14,7 +14,11 @@ from magshell_fenicsx import Result
 
 
 def events(found: Result) -> list[tuple[str, str, Any]]:
-    return [(p["amplitude"], p["kind"], p["value"]) for p in found.limit_points if not p["mode"].startswith("m =")]
+    return [
+        (p["amplitude"], p["kind"], p["value"])
+        for p in found.limit_points
+        if not p["mode"].startswith("m =")
+    ]
 
 
 @pytest.mark.slow
@@ -23,7 +27,10 @@ def test_volume_snaps_back() -> None:
     found = result("snap_back.yaml")
     assert found.stopped is None
     assert found.knockdown == pytest.approx(0.325723564, rel=1e-6)
-    volume, w = (np.array([row[key] for row in found.rows], dtype=float) for key in ("volume_change", "w_pole_over_h"))
+    volume, w = (
+        np.array([row[key] for row in found.rows], dtype=float)
+        for key in ("volume_change", "w_pole_over_h")
+    )
     smallest = int(np.argmin(volume[:12]))
     back = smallest + int(np.argmax(volume[smallest:]))
     assert volume[back] - volume[smallest] > 0.3 * abs(volume[smallest])
@@ -46,7 +53,14 @@ def test_waves_before_the_fold() -> None:
 @pytest.mark.parametrize(
     ("settings", "critical"),
     [
-        (("shell.radius_to_thickness=300", "shell.poisson_ratio=0.3", "magnetic.lambda_m=-0.00184"), -0.000946554),
+        (
+            (
+                "shell.radius_to_thickness=300",
+                "shell.poisson_ratio=0.3",
+                "magnetic.lambda_m=-0.00184",
+            ),
+            -0.000946554,
+        ),
         (("magnetic.lambda_m=-0.005",), -0.0033554),
         (("magnetic.lambda_m=-0.0034",), -0.0033554),
         (("magnetic.lambda_m=-0.02",), -0.0033554),
@@ -78,17 +92,24 @@ def test_target_beyond_the_fold_in_units() -> None:
     shell = "shell={geometry: hemisphere, radius: 40 mm, thickness: 1 mm, youngs_modulus: 1.3 MPa, poisson_ratio: 0.5, "
     shell += "defect: {kind: dimple, amplitude: 1, width: 3}}"
     found = result(
-        "dimple_buckling.yaml", shell, "loading={kind: pressure, until: target, pressure: 900 Pa, points: 2}"
+        "dimple_buckling.yaml",
+        shell,
+        "loading={kind: pressure, until: target, pressure: 900 Pa, points: 2}",
     )
     pascals = (found.knockdown or 0) * 1.3e6 * 4 / 3 / 40**2
     assert found.stopped
-    assert f"cannot pass the fold at pressure = {found.knockdown:.6g} ({pascals:.6g} Pa), before" in found.stopped
+    assert (
+        f"cannot pass the fold at pressure = {found.knockdown:.6g} ({pascals:.6g} Pa), before"
+        in found.stopped
+    )
     assert "(900 Pa); load control stopped" in found.stopped
 
 
 @pytest.mark.slow
 def test_indentation_through_its_fold_in_displacement() -> None:
-    """Mixed reference (hybridised Hellan-Herrmann-Johnson): peak 2.10, 1.3149 at w/h = 5, w turns back at 5.9."""
+    """Mixed reference (hybridised Hellan-Herrmann-Johnson): peak 2.10, 1.3149 at w/h = 5, w turns
+    back at 5.9.
+    """
     found = result("indentation_snap_back.yaml")
     assert found.stopped is None
     forces = [value for amplitude, kind, value in events(found) if kind == "fold"]
@@ -99,17 +120,25 @@ def test_indentation_through_its_fold_in_displacement() -> None:
     assert w[top] == pytest.approx(5.95, abs=0.05)
     assert w[top:].min() < 0.2 < 5 < w[-1]
     held = [int(row["negative_pivots_held"]) for row in rows]
-    assert held[: top - 1] == [0] * (top - 1)  # a testing machine sees nothing before the fold in displacement
+    assert held[: top - 1] == [0] * (
+        top - 1
+    )  # a testing machine sees nothing before the fold in displacement
     assert held[top + 2] == 1
 
 
 @pytest.mark.slow
 def test_strip_bends_to_both_sides() -> None:
-    """Elastica: q = pi^2/4, and at a tip angle of 90 degrees q = K(1/2)^2 and tip deflection 2 sin 45/sqrt(q)."""
+    """Elastica: q = pi^2/4, and at a tip angle of 90 degrees q = K(1/2)^2 and tip deflection 2 sin
+    45/sqrt(q).
+    """
     found = result("strip_buckling.yaml")
     assert found.stopped is None
     ((amplitude, kind, value),) = events(found)
-    assert (amplitude, kind, found.limit_points[0]["mode"]) == ("lambda_m", "bifurcation", "symmetric")
+    assert (amplitude, kind, found.limit_points[0]["mode"]) == (
+        "lambda_m",
+        "bifurcation",
+        "symmetric",
+    )
     assert 12 * value * 100**2 == pytest.approx(np.pi**2 / 4, rel=1e-4)
     K = ellipk(0.5)
     tips = []
@@ -120,5 +149,7 @@ def test_strip_bends_to_both_sides() -> None:
         tips.append(float(last["w_pole_over_h"]) / 100)
     assert tips[0] == pytest.approx(0, abs=1e-6)
     straight = [row for row in found.rows if row["branch"] == 0 and row["label"] != "bifurcation"]
-    assert [row["negative_pivots"] for row in straight] == [int(row["lambda_m"] > value) for row in straight]
+    assert [row["negative_pivots"] for row in straight] == [
+        int(row["lambda_m"] > value) for row in straight
+    ]
     assert sorted(tips[1:]) == pytest.approx([-np.sqrt(2) / K, np.sqrt(2) / K], rel=1e-3)

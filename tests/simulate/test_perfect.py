@@ -1,4 +1,6 @@
-"""Modes of the perfect shell as imperfections: the same by several ways, and the law of a symmetric bifurcation."""
+"""Modes of the perfect shell as imperfections: the same by several ways, and the law of a symmetric
+bifurcation.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,9 @@ HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 12, "poisson_rati
 def case(*amplitudes: float, folder: Path = Path(), **item: Any) -> Case:
     items = [{"kind": "modes", "amplitudes": list(amplitudes), **item}] if amplitudes else []
     data = {"shell": {**HEMISPHERE, "imperfections": items}, "boundary": {"equator": "clamped"}}
-    return Case.from_source(Source("case.yaml", data | {"loading": {"kind": "pressure"}}, folder=folder))
+    return Case.from_source(
+        Source("case.yaml", data | {"loading": {"kind": "pressure"}}, folder=folder)
+    )
 
 
 def alike(here: Array, there: Array, tolerance: float) -> bool:
@@ -35,8 +39,12 @@ def alike(here: Array, there: Array, tolerance: float) -> bool:
 
 @pytest.mark.slow
 def test_two_thirds_law() -> None:
-    """At a symmetric, unstable bifurcation 1 - k_d/k_c falls as the imperfection to the power of 2/3 (Koiter 1945)."""
-    critical, first, second = (run(case(*amplitude)).knockdown for amplitude in ((), (0.005,), (0.01,)))
+    """At a symmetric, unstable bifurcation 1 - k_d/k_c falls as the imperfection to the power of
+    2/3 (Koiter 1945).
+    """
+    critical, first, second = (
+        run(case(*amplitude)).knockdown for amplitude in ((), (0.005,), (0.01,))
+    )
     assert critical
     assert first
     assert second
@@ -70,11 +78,24 @@ def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
 
 
 def test_modes_of_half_and_full_shells() -> None:
-    """A panel by half and whole: two meshes, the same lowest modes, exactly even or odd in the plane of the half."""
-    shell = {"geometry": "cylinder", "radius": 1.0, "length": 0.8, "azimuth": [-30, 30], "thickness": 0.05}
+    """A panel by half and whole: two meshes, the same lowest modes, exactly even or odd in the
+    plane of the half.
+    """
+    shell = {
+        "geometry": "cylinder",
+        "radius": 1.0,
+        "length": 0.8,
+        "azimuth": [-30, 30],
+        "thickness": 0.05,
+    }
     edges = dict.fromkeys(("left", "right", "bottom", "top"), "clamped")
     load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05}
-    data = {"shell": {**shell, "poisson_ratio": 0.3}, "boundary": edges, "loading": load, "mesh": {"degree": 3}}
+    data = {
+        "shell": {**shell, "poisson_ratio": 0.3},
+        "boundary": edges,
+        "loading": load,
+        "mesh": {"degree": 3},
+    }
     panel = Case.from_source(Source("panel.yaml", data))
     x = outline(panel.shell).sample()
     whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}).problem(), 2, MPI.COMM_SELF)
@@ -84,7 +105,8 @@ def test_modes_of_half_and_full_shells() -> None:
         assert alike(one(x), other(x), 0.02)
     images = x * [1.0, -1.0, 1.0], [0.0, 0.0, 0.8] + x * [1.0, 1.0, -1.0]
     assert all(
-        any(np.allclose(np.abs(f(image)), np.abs(f(x)), rtol=1e-9, atol=1e-12) for image in images) for f in halves
+        any(np.allclose(np.abs(f(image)), np.abs(f(x)), rtol=1e-9, atol=1e-12) for image in images)
+        for f in halves
     )
 
 
@@ -97,7 +119,8 @@ def of(data: dict[str, Any]) -> Case:
 
 @pytest.mark.slow
 def test_modes_of_several_shells() -> None:
-    """The thinner of two caps apart, upside down, buckles as it does alone, 1e-8, and the other one stays.
+    """The thinner of two caps apart, upside down, buckles as it does alone, 1e-8, and the other one
+    stays.
 
     Its mode, m = 4, has crests where the troughs are of one that is not upside down.
     """
@@ -117,33 +140,57 @@ def test_modes_of_several_shells() -> None:
     assert together
     assert together == pytest.approx(alone * (0.02 / 0.03) ** 2, rel=1e-8)
     lower = one(0.03, 0.2)
-    with pytest.raises(CaseError, match=r"shells\.lower\.shell\.imperfections\.0\.amplitudes: of the 1 lowest modes"):
+    with pytest.raises(
+        CaseError,
+        match=r"shells\.lower\.shell\.imperfections\.0\.amplitudes: of the 1 lowest modes",
+    ):
         run(two(one(0.02, **place)))
 
 
 @pytest.mark.slow
 def test_modes_of_shells_that_are_joined() -> None:
-    """A column of two plates, each with its part of the mode, bends as one plate with it does: 1e-3, by the mesh."""
+    """A column of two plates, each with its part of the mode, bends as one plate with it does:
+    1e-3, by the mesh.
+    """
 
     def plate(length: float, **keys: Any) -> dict[str, Any]:
-        size = {"length": length, "width": 0.3, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0.3}
+        size = {
+            "length": length,
+            "width": 0.3,
+            "thickness": 0.02,
+            "youngs_modulus": 1,
+            "poisson_ratio": 0.3,
+        }
         flaw = {"imperfections": [{"kind": "modes", "amplitudes": [0.1]}]}
         return {"shell": {"geometry": "plate", **size, **flaw}} | keys
 
     def pushed(edge: str) -> dict[str, Any]:
         force = {"edge": edge, "force": [-1, 0, 0]}
-        return {"loading": {"kind": "dead", "control": "load", "loads": [force], "factor": 5e-8, "points": 1}}
+        return {
+            "loading": {
+                "kind": "dead",
+                "control": "load",
+                "loads": [force],
+                "factor": 5e-8,
+                "points": 1,
+            }
+        }
 
     root = {"boundary": {"left": "clamped"}}
     whole = run(of(plate(2, points={"tip": [2, 0, 0]}) | root | pushed("right"))).rows[-1]
-    parts = {"one": plate(1) | root, "two": plate(1, points={"tip": [1, 0, 0]}, place={"position": [1, 0, 0]})}
+    parts = {
+        "one": plate(1) | root,
+        "two": plate(1, points={"tip": [1, 0, 0]}, place={"position": [1, 0, 0]}),
+    }
     joint = {"joints": [{"edges": ["one.right", "two.left"], "kind": "rigid"}]}
     joined = run(of({"shells": parts} | joint | pushed("two.right"))).rows[-1]
     assert abs(joined["two_tip_uz"]) == pytest.approx(abs(whole["tip_uz"]), rel=1e-3)
 
 
 def test_amplitudes_are_parameters() -> None:
-    found = changed(case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05)["imperfections.0"]
+    found = changed(case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05)[
+        "imperfections.0"
+    ]
     assert isinstance(found, ModesSection)
     assert found.amplitudes == [0.1, 0.25]
     assert found.parameters == ("amplitudes.0", "amplitudes.1")
@@ -157,5 +204,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mode.vtu").write_text("no file of VTK")
     for name in ("mode.vtu", "other.vtu"):
         read = case(0.1, file=name, folder=tmp_path)
-        with pytest.raises(CaseError, match=rf"shell\.imperfections\.0\.file: {name}: is no mode file"):
+        with pytest.raises(
+            CaseError, match=rf"shell\.imperfections\.0\.file: {name}: is no mode file"
+        ):
             flaws(read.imperfections, ground_of(read.shell))

@@ -1,7 +1,7 @@
 """Programmes: steps that drive one load and hold the others, in any order.
 
-Elastic equilibria do not depend on the order of the loads that lead to them, and the work of all loads is the change of
-the energy: these are the independent sources here.
+Elastic equilibria do not depend on the order of the loads that lead to them, and the work of all
+loads is the change of the energy: these are the independent sources here.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,9 @@ def test_a_closed_cycle_returns_to_zero() -> None:
 
 
 def test_the_work_of_all_loads_is_the_change_of_the_energy() -> None:
-    """The elastic and magnetic energy U = Pi + sum mu q; dU = sum mu dq, by Hermite's quadrature of mu over q."""
+    """The elastic and magnetic energy U = Pi + sum mu q; dU = sum mu dq, by Hermite's quadrature of
+    mu over q.
+    """
     poke = {**POKE, "points": 40, "hold": {"pressure": "conjugate"}}
     scene, records = history(case({**PRESSURE, "points": 10}, poke, magnetic=None))
     system, work = scene.model.system, 0.0
@@ -80,14 +82,19 @@ def test_the_work_of_all_loads_is_the_change_of_the_energy() -> None:
         begin = 1 / (-system.load(start.state.u, start.state.mu, name) @ start.du)
         work += scipy.interpolate.CubicHermiteSpline(q, mu, [begin, *slopes]).integrate(q[0], q[-1])
     end = records[-1].point.state
-    inner = sum(system.energies(end.u)[name] for name in ("membrane", "bending", "interior edges", "clamped edges"))
+    inner = sum(
+        system.energies(end.u)[name]
+        for name in ("membrane", "bending", "interior edges", "clamped edges")
+    )
     assert work == pytest.approx(inner, rel=1e-6)
 
 
 def unstable_at_constant_volume(scene: Scene, state: State) -> int:
     """Negative eigenvalues of the dense tangent on the displacements that keep the volume."""
     system = scene.model.system
-    whole = system.tangent(state.u, state.mu).convert("dense", PETSc.Mat())  # its array lives no longer than it
+    whole = system.tangent(state.u, state.mu).convert(
+        "dense", PETSc.Mat()
+    )  # its array lives no longer than it
     upper = np.triu(whole.getDenseArray())
     dense = upper + np.triu(upper, 1).T
     free = np.array(system.held(np.ones(system.size)), dtype=bool)
@@ -97,25 +104,35 @@ def unstable_at_constant_volume(scene: Scene, state: State) -> int:
 
 
 def test_stability_under_a_held_volume() -> None:
-    """Over the hill of the probing force: unstable under the pressure, and under the volume by the dense tangent."""
+    """Over the hill of the probing force: unstable under the pressure, and under the volume by the
+    dense tangent.
+    """
     probe = {**POKE, "depth": None, "control": "arc", "until": "zero"}
     counts = {}
     for hold in ("load", "conjugate"):
-        scene, records = history(case({**PRESSURE, "pressure": 0.6}, {**probe, "hold": {"pressure": hold}}))
+        scene, records = history(
+            case({**PRESSURE, "pressure": 0.6}, {**probe, "hold": {"pressure": hold}})
+        )
         counts[hold] = [record.point.negative_pivots for record in records if record.step == 2]
         for record in records[-6::2]:
             expected = unstable_at_constant_volume(scene, record.point.state)
-            sealed = scene.problem.programme[1].load.model_copy(update={"hold": {"pressure": "conjugate"}})
+            sealed = scene.problem.programme[1].load.model_copy(
+                update={"hold": {"pressure": "conjugate"}}
+            )
             step = type(scene.problem.programme[1])(2, "force", "loading.1", sealed)
             stage = stage_of(scene, step, record.point.state)
-            assert stage.newton.factor_at(stage.enter(record.point.state)).negative_pivots == expected
+            assert (
+                stage.newton.factor_at(stage.enter(record.point.state)).negative_pivots == expected
+            )
     assert counts["load"][0] == counts["conjugate"][0] == 0
     assert counts["load"][-1] == 1
 
 
 @pytest.mark.slow
 def test_a_gas_keeps_pressure_times_volume() -> None:
-    """Boyle's law; with little gas the shell is nearly sealed, with much of it nearly under a constant pressure."""
+    """Boyle's law; with little gas the shell is nearly sealed, with much of it nearly under a
+    constant pressure.
+    """
     ends = {}
     for volume in (0.1, 1e5):
         gas = {"gas": {"ambient_over_pc": 3.0, "volume": volume}}
@@ -127,17 +144,23 @@ def test_a_gas_keeps_pressure_times_volume() -> None:
         assert inside[poked] * under[poked] == pytest.approx(inside[first] * under[first], rel=1e-9)
         ends[volume] = found["p_over_pc"][-1]
     assert ends[1e5] == pytest.approx(0.3, abs=1e-6)
-    sealed = history(case(PRESSURE, {**POKE, "hold": {"pressure": "conjugate"}}, magnetic=None))[1][-1]
+    sealed = history(case(PRESSURE, {**POKE, "hold": {"pressure": "conjugate"}}, magnetic=None))[1][
+        -1
+    ]
     assert ends[0.1] < ends[1e5]
     assert sealed.point.state.mu["pressure"] < ends[0.1]
 
 
 def test_the_field_first_as_in_the_paper() -> None:
-    """The same numbers as with the field of `magnetic` before one load; those are compared with the paper elsewhere."""
+    """The same numbers as with the field of `magnetic` before one load; those are compared with the
+    paper elsewhere.
+    """
     settings = ["magnetic.lambda_m=0.00184", "mesh.refinement=0.5"]
     file = CASES / "dimple_buckling.yaml"
     alone = run(Case.load(file, settings))
-    steps = "loading=[{kind: field, until: target}, {kind: pressure, control: volume, until: limit}]"
+    steps = (
+        "loading=[{kind: field, until: target}, {kind: pressure, control: volume, until: limit}]"
+    )
     programme = run(Case.load(file, [*settings, steps]))
     assert alone.knockdown
     assert programme.knockdown == pytest.approx(alone.knockdown, rel=1e-9)
@@ -146,7 +169,13 @@ def test_the_field_first_as_in_the_paper() -> None:
 
 def test_forces_at_two_places() -> None:
     """Each has its columns; the order does not matter."""
-    other = {"kind": "indentation", "at": {"polar": 40}, "control": "load", "force": 0.5, "points": 1}
+    other = {
+        "kind": "indentation",
+        "at": {"polar": 40},
+        "control": "load",
+        "force": 0.5,
+        "points": 1,
+    }
     first = {**POKE, "depth": None, "control": "load", "force": 1, "points": 2}
     coarse = {"mesh": {"degree": 2, "refinement": 0.3}, "magnetic": None}
     ends = []
@@ -154,7 +183,12 @@ def test_forces_at_two_places() -> None:
         scene, records = history(case(*steps, **coarse))
         found = columns(scene, records)
         assert scene.problem.half
-        ends.append({name: found[name][-1] for name in ("w_over_h", "w_force_2_over_h", "force", "force_2", "energy")})
+        ends.append(
+            {
+                name: found[name][-1]
+                for name in ("w_over_h", "w_force_2_over_h", "force", "force_2", "energy")
+            }
+        )
     here, there = ends
     assert (here["force"], here["force_2"]) == (1, 0.5)
     assert here["energy"] == pytest.approx(there["energy"], rel=1e-8)
@@ -162,7 +196,9 @@ def test_forces_at_two_places() -> None:
 
 
 def test_the_field_turns_twice() -> None:
-    """The end is that of a field that grows in the last direction, and then the field goes back to zero."""
+    """The end is that of a field that grows in the last direction, and then the field goes back to
+    zero.
+    """
     strip = {
         "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0},
         "boundary": {"root": "clamped"},
@@ -172,10 +208,16 @@ def test_the_field_turns_twice() -> None:
     steps = [{"kind": "rotation", "to": to, "points": 2} for to in turns]
     off = {"kind": "field", "factor": 0, "points": 2}
     field = {"remanent": {"polar": 90}, "lambda_m": 2e-4}
-    scene, records = history(case(FIELD, *steps, off, magnetic={**field, "applied": {"polar": 20}}, **strip))
+    scene, records = history(
+        case(FIELD, *steps, off, magnetic={**field, "applied": {"polar": 20}}, **strip)
+    )
     turned = [record for record in records if record.step == 3][-1]
-    other, direct = history(case(FIELD, magnetic={**field, "applied": turns[1]}, **strip, symmetry="none"))
-    w = [s.observe(r.point.state)["w_pole_over_h"] for s, r in ((scene, turned), (other, direct[-1]))]
+    other, direct = history(
+        case(FIELD, magnetic={**field, "applied": turns[1]}, **strip, symmetry="none")
+    )
+    w = [
+        s.observe(r.point.state)["w_pole_over_h"] for s, r in ((scene, turned), (other, direct[-1]))
+    ]
     assert w[0] == pytest.approx(w[1], rel=1e-8)
     assert abs(scene.observe(records[-1].point.state)["w_pole_over_h"]) < 1e-8 * abs(w[0])
     assert scene.observe(turned.point.state)["lambda_m"] == pytest.approx(2e-4, rel=1e-12)
@@ -184,9 +226,18 @@ def test_the_field_turns_twice() -> None:
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([PRESSURE, {**POKE, "hold": {"presure": "load"}}], "loading.1.hold.presure: the programme has no such"),
-        ([PRESSURE, {**POKE, "hold": {"pressure": "kept"}}], "loading.1.hold.pressure: 'kept': must be 'load'"),
-        ([FIELD, {**POKE, "hold": {"lambda_m": "conjugate"}}], "nothing that can be held is conjugate"),
+        (
+            [PRESSURE, {**POKE, "hold": {"presure": "load"}}],
+            "loading.1.hold.presure: the programme has no such",
+        ),
+        (
+            [PRESSURE, {**POKE, "hold": {"pressure": "kept"}}],
+            "loading.1.hold.pressure: 'kept': must be 'load'",
+        ),
+        (
+            [FIELD, {**POKE, "hold": {"lambda_m": "conjugate"}}],
+            "nothing that can be held is conjugate",
+        ),
         ([PRESSURE, {**PRESSURE, "hold": {"pressure": "load"}}], "this step drives pressure"),
         ([{**PRESSURE, "pressure": 0}], "loading.0: the target must not be zero"),
         ([PRESSURE, {"kind": "rotation", "to": {"polar": 9}}], "a step of kind: field before it"),
@@ -204,7 +255,10 @@ def test_mistakes_in_a_programme(steps: Sequence[dict[str, Any]], said: str) -> 
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([{**PRESSURE, "pressure": 1.5}, POKE], "step 1 of 2 (pressure): load control cannot pass the fold"),
+        (
+            [{**PRESSURE, "pressure": 1.5}, POKE],
+            "step 1 of 2 (pressure): load control cannot pass the fold",
+        ),
         ([{"kind": "pressure", "until": "limit"}, POKE], "step 1 of 2 (pressure): ends at a"),
     ],
 )
@@ -225,16 +279,29 @@ def test_first_instability_on_the_way_to_a_target() -> None:
     critical = []
     for size, factor in ((-0.01, 3), (0.01, -3)):
         scene, records = history(
-            case({**load, "factor": factor}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": size})
+            case(
+                {**load, "factor": factor},
+                shell=dome,
+                boundary={"rim": "hinged"},
+                magnetic={"lambda_m": size},
+            )
         )
-        assert [record.label for record in records if record.label != "step"] == ["start", "target", "fold"]
+        assert [record.label for record in records if record.label != "step"] == [
+            "start",
+            "target",
+            "fold",
+        ]
         critical.append(scene.observe(records[-1].point.state)["lambda_m"])
     assert critical[0] == pytest.approx(critical[1], rel=1e-8)
-    near = case({**load, "factor": -1}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": 0.01})
+    near = case(
+        {**load, "factor": -1}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": 0.01}
+    )
     said = list[str]()
     *_, last = follow(Scene(near), remark=said.append)
     assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
-    assert said == ["step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"]
+    assert said == [
+        "step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"
+    ]
 
 
 def test_a_way_that_ends_before_the_first_contact_ends_there() -> None:
@@ -253,8 +320,14 @@ def test_a_way_that_ends_before_the_first_contact_ends_there() -> None:
 @pytest.mark.parametrize(
     ("step", "message"),
     [
-        ({"until": "bifurcation", "factor": -3}, "loading.0: factor is a target: it goes with until: target or limit"),
-        ({"until": "limit", "factor": -3, "control": "load"}, "factor: beside until: limit stands one target"),
+        (
+            {"until": "bifurcation", "factor": -3},
+            "loading.0: factor is a target: it goes with until: target or limit",
+        ),
+        (
+            {"until": "limit", "factor": -3, "control": "load"},
+            "factor: beside until: limit stands one target",
+        ),
         ({"until": "limit", "factor": 0}, "the target must not be zero"),
     ],
 )

@@ -32,12 +32,17 @@ def test_the_path_of_a_case(plain: ms.Scene) -> None:
     assert ms.run(FILE).knockdown == pytest.approx(0.32623, rel=1e-4)
     with pytest.raises(ms.CaseError, match=r"nowhere\.yaml: cannot be read"):
         ms.Scene("nowhere.yaml")
-    with pytest.raises(ms.CaseError, match="give a problem, a Case, its mapping or the path of a case file, not a int"):
+    with pytest.raises(
+        ms.CaseError,
+        match="give a problem, a Case, its mapping or the path of a case file, not a int",
+    ):
         ms.run(1)  # type: ignore[arg-type]
 
 
 def test_what_makes_a_problem(tmp_path: Path) -> None:
-    """A case, its mapping and the problem itself; a problem has its energies, and is remade by a case alone."""
+    """A case, its mapping and the problem itself; a problem has its energies, and is remade by a
+    case alone.
+    """
     case = ms.Case.load(FILE)
     problem = case.problem()
     assert ms.Scene(problem).problem is problem
@@ -92,10 +97,14 @@ def test_mistaken_targets(with_units: ms.Scene, more: dict[str, Any], said: str)
 
 
 def test_units_that_the_case_has_not(plain: ms.Scene) -> None:
-    with pytest.raises(ValueError, match=r"trace: targets: '20 Pa': has a unit: that needs youngs_modulus"):
+    with pytest.raises(
+        ValueError, match=r"trace: targets: '20 Pa': has a unit: that needs youngs_modulus"
+    ):
         next(ms.trace(plain, "pressure", targets=["20 Pa"]))
     own = ms.Scene(FILE, terms=[ms.OwnTerm("foundation", lambda r0, u: u.r[2] ** 2)])
-    with pytest.raises(ValueError, match="trace: targets: '20 Pa': foundation has no unit here: give a number"):
+    with pytest.raises(
+        ValueError, match="trace: targets: '20 Pa': foundation has no unit here: give a number"
+    ):
         next(ms.trace(own, "foundation", targets=["20 Pa"]))
 
 
@@ -104,6 +113,9 @@ def test_curves_of_nothing(plain: ms.Scene) -> None:
     for none in ([], records[:1]):
         with pytest.raises(ValueError, match="curve: nothing has varied in these records"):
             ms.curve(plain, none)
-    with pytest.raises(ValueError, match="curve: lambda: the scene has no such amplitude; these records vary pressure"):
+    with pytest.raises(
+        ValueError,
+        match="curve: lambda: the scene has no such amplitude; these records vary pressure",
+    ):
         ms.curve(plain, records, "lambda")
     assert ms.curve(plain, records).axes

@@ -1,4 +1,6 @@
-"""Readings at places of a path: their slopes against differences of whole paths, which know nothing of adjoints."""
+"""Readings at places of a path: their slopes against differences of whole paths, which know nothing
+of adjoints.
+"""
 
 from pathlib import Path
 
@@ -42,7 +44,11 @@ def differences(case: ms.Case, wanted: list[Reading], key: str, step: float) -> 
         pytest.param(
             STRIP,
             [],
-            [Reading("tip_uz_mm", 5.0), Reading("tip_ux_mm", 20.0), Reading("tip_uz_mm", 12.0, change=True)],
+            [
+                Reading("tip_uz_mm", 5.0),
+                Reading("tip_ux_mm", 20.0),
+                Reading("tip_uz_mm", 12.0, change=True),
+            ],
             ["magnetic.remanent.polar", "shell.thickness"],
             marks=pytest.mark.slow,
         ),
@@ -62,13 +68,17 @@ def differences(case: ms.Case, wanted: list[Reading], key: str, step: float) -> 
     ],
     ids=["strip", "pressure", "depth"],
 )
-def test_slopes(text: str, settings: list[str], wanted: list[Reading], keys: list[str], tmp_path: Path) -> None:
+def test_slopes(
+    text: str, settings: list[str], wanted: list[Reading], keys: list[str], tmp_path: Path
+) -> None:
     """1e-6 of differences of second order over 2e-4 of the number."""
     case = case_of(text, tmp_path, *settings)
     found = read(ms.Scene(case), wanted, keys)
     for i, key in enumerate(keys):
         by_runs = differences(case, wanted, key, 1e-4)
-        assert found.slopes[:, i] == pytest.approx(by_runs, rel=1e-6, abs=1e-6 * np.abs(by_runs).max()), key
+        assert found.slopes[:, i] == pytest.approx(
+            by_runs, rel=1e-6, abs=1e-6 * np.abs(by_runs).max()
+        ), key
 
 
 def test_a_place_is_where_the_path_passes_it(tmp_path: Path) -> None:
@@ -77,15 +87,23 @@ def test_a_place_is_where_the_path_passes_it(tmp_path: Path) -> None:
     scene = ms.Scene(case)
     assert (Places(scene).column, Places(scene).by_conjugate) == ("applied_mT", False)
     (row,) = (row for row in ms.run(case).rows if float(row["applied_mT"]) == pytest.approx(15.0))
-    assert read(scene, [Reading("tip_uz_mm", 15.0)], []).values == pytest.approx([float(row["tip_uz_mm"])], rel=1e-8)
+    assert read(scene, [Reading("tip_uz_mm", 15.0)], []).values == pytest.approx(
+        [float(row["tip_uz_mm"])], rel=1e-8
+    )
 
 
 def test_what_is_not_on_the_path(tmp_path: Path) -> None:
     scene = ms.Scene(case_of(STRIP, tmp_path))
-    with pytest.raises(Outside, match="applied_mT = 25 is outside the path, which goes from 0 to 20"):
+    with pytest.raises(
+        Outside, match="applied_mT = 25 is outside the path, which goes from 0 to 20"
+    ):
         read(scene, [Reading("tip_uz_mm", 25.0)], [])
-    bare = case_of(CAP, tmp_path, "loading={kind: indentation, at: {polar: 0}, depth: 1.5, points: 3}")
-    with pytest.raises(CaseError, match=r"shell.thickness: changes the unit of w_\w*mm: give the target of loading"):
+    bare = case_of(
+        CAP, tmp_path, "loading={kind: indentation, at: {polar: 0}, depth: 1.5, points: 3}"
+    )
+    with pytest.raises(
+        CaseError, match=r"shell.thickness: changes the unit of w_\w*mm: give the target of loading"
+    ):
         read(ms.Scene(bare), [Reading("force_N", 0.3)], ["shell.thickness"])
     data = yaml.safe_load(STRIP)
     del data["loading"], data["magnetic"]

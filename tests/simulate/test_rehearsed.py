@@ -1,6 +1,8 @@
-"""The error of a whole motion against fixed, far finer steps, which come to SciPy's motion (`test_semi_discrete.py`).
+"""The error of a whole motion against fixed, far finer steps, which come to SciPy's motion
+(`test_semi_discrete.py`).
 
-A departure from a fold magnifies the errors of steps, and so does one from a fold that a ramp passes.
+A departure from a fold magnifies the errors of steps, and so does one from a fold that a ramp
+passes.
 """
 
 from collections.abc import Callable
@@ -22,7 +24,13 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 
 THICKNESS = 0.02
-SHELL = {"geometry": "cap", "polar": 20, "radius": 1.0, "thickness": THICKNESS, "poisson_ratio": 0.3}
+SHELL = {
+    "geometry": "cap",
+    "polar": 20,
+    "radius": 1.0,
+    "thickness": THICKNESS,
+    "poisson_ratio": 0.3,
+}
 MESH = {"degree": 3, "refinement": 0.5}  # 58 unknowns
 ROWS = 45  # of a snap, until it rings
 END, TOP, DRAG = 60.0, 0.65, 0.3  # a ramp beyond the fold at 0.574
@@ -32,16 +40,28 @@ Array = NDArray[np.float64]
 
 def rows_of(step: dict[str, Any]) -> tuple[Scene, Record, list[Record]]:
     """With the last record before those in time."""
-    sections = {"shell": SHELL, "boundary": {"rim": "clamped"}, "symmetry": "axisymmetric", "mesh": MESH}
+    sections = {
+        "shell": SHELL,
+        "boundary": {"rim": "clamped"},
+        "symmetry": "axisymmetric",
+        "mesh": MESH,
+    }
     scene = Scene(Case.from_source(sections | {"loading": [step]}))
     records = list(follow(scene))
-    moving = [record for record in records if record.clock and record.point.dmu]  # not the equilibrium at rest
+    moving = [
+        record for record in records if record.clock and record.point.dmu
+    ]  # not the equilibrium at rest
     return scene, records[records.index(moving[0]) - 1], moving
 
 
 def snap(tolerance: float, **how: str) -> tuple[Scene, Record, list[Record]]:
     scene, fold, rows = rows_of(
-        {"kind": "pressure", "until": "limit", "then": "snap", "snap": {"tolerance": tolerance, **how}}
+        {
+            "kind": "pressure",
+            "until": "limit",
+            "then": "snap",
+            "snap": {"tolerance": tolerance, **how},
+        }
     )
     return scene, fold, rows[:ROWS]
 
@@ -52,12 +72,18 @@ def ramp(tolerance: float, **how: str) -> tuple[Scene, Record, list[Record]]:
     return rows_of(moving | {"tolerance": tolerance, **how})
 
 
-def exact(scene: Scene, u: Vector, drag: float, pressure: Callable[[float], float], times: list[float]) -> Array:
+def exact(
+    scene: Scene, u: Vector, drag: float, pressure: Callable[[float], float], times: list[float]
+) -> Array:
     """From rest at u: the displacements in thicknesses, extrapolated to no step."""
     found = list[list[Vector]]()
     for parts in (32, 64):
         integrator = Integrator(
-            scene.model.system, mass(scene.model), lambda t, before: {"pressure": pressure(t)}, 0.8, drag
+            scene.model.system,
+            mass(scene.model),
+            lambda t, before: {"pressure": pressure(t)},
+            0.8,
+            drag,
         )
         now, dt = integrator.begin(0.0, u, 0.0 * u), times[0] / parts
         found.append([])
@@ -70,14 +96,25 @@ def exact(scene: Scene, u: Vector, drag: float, pressure: Callable[[float], floa
 
 
 def errors(rows: list[Record], reference: Array) -> Array:
-    return np.array([np.abs(row.point.state.u / THICKNESS - u).max() for row, u in zip(rows, reference, strict=True)])
+    return np.array(
+        [
+            np.abs(row.point.state.u / THICKNESS - u).max()
+            for row, u in zip(rows, reference, strict=True)
+        ]
+    )
 
 
 @pytest.mark.slow
 def test_the_error_of_a_snap_is_below_its_tolerance() -> None:
-    """And the estimate is right within a factor of two; where steps have that error it is 30 times the tolerance."""
+    """And the estimate is right within a factor of two; where steps have that error it is 30 times
+    the tolerance.
+    """
     scene, fold, rows = snap(1.0, errors="step")
-    own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(fold.point.state, 3) if not mode.label]
+    own = [
+        mode.eigenvalue
+        for mode in ShellModes(scene.model).lowest(fold.point.state, 3)
+        if not mode.label
+    ]
     away, p = scene.model.system.held(fold.point.du), fold.point.state.mu["pressure"]
     u = fold.point.state.u + 0.05 * THICKNESS * away / np.abs(away).max()
     times = [row.clock["time"] for row in rows]
@@ -93,7 +130,9 @@ def test_the_error_of_a_snap_is_below_its_tolerance() -> None:
 
 @pytest.mark.slow
 def test_a_ramp_passes_a_fold() -> None:
-    """Which it does late; the error of the whole motion is below the tolerance, or is said to be magnified."""
+    """Which it does late; the error of the whole motion is below the tolerance, or is said to be
+    magnified.
+    """
     scene, begin, rows = ramp(1e-2, errors="step")
     times = [row.clock["time"] for row in rows]
     (said,) = departures(scene.problem.programme, table_of(scene, rows))

@@ -29,7 +29,10 @@ CASE: dict[str, Any] = {
 
 
 def _case(**keys: float) -> ms.Case:
-    data = {name: dict(section) if isinstance(section, dict) else section for name, section in CASE.items()}
+    data = {
+        name: dict(section) if isinstance(section, dict) else section
+        for name, section in CASE.items()
+    }
     for key, value in keys.items():
         section, name = key.split("_", 1)
         data[section][name] = value
@@ -39,7 +42,15 @@ def _case(**keys: float) -> ms.Case:
 def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
     """Residual, load, tangent and numbers of waves; one after the other, and again after that."""
     first = ms.Scene(_case())
-    cases = _case(), _case(shell_thickness=0.022, shell_polar=32, shell_poisson_ratio=0.4, foundation_stiffness=2e-3)
+    cases = (
+        _case(),
+        _case(
+            shell_thickness=0.022,
+            shell_polar=32,
+            shell_poisson_ratio=0.4,
+            foundation_stiffness=2e-3,
+        ),
+    )
     problems = {float(i): moved(first, case.problem()) for i, case in enumerate(cases)}
     alone = {value: Scene(problem) for value, problem in problems.items()}
     shared = Renumbered.of(first)
@@ -49,7 +60,9 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
     for value in (0.0, 1.0, 0.0):
         scene, own = scenes[value], alone[value]
         assert scene
-        state = State(own.model.system.held(u), {**own.unloaded().mu, "pressure": 0.8, "lambda_m": 0.002})
+        state = State(
+            own.model.system.held(u), {**own.unloaded().mu, "pressure": 0.8, "lambda_m": 0.002}
+        )
         mine, theirs = (
             [
                 each.model.system.residual(state.u, state.mu),

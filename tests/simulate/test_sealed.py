@@ -44,14 +44,18 @@ assert abs(volumes[0]) < 1e-7 * abs(volumes[1]), volumes
 
 def sealed(ranks: int) -> dict[str, float]:
     command = [*mpirun(ranks), sys.executable, "-c", SEALED]
-    done = subprocess.run([*command, str(CASES / "dimple_buckling.yaml")], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, str(CASES / "dimple_buckling.yaml")], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 @pytest.mark.slow
 def test_sealed_shell_on_ranks() -> None:
-    """The state is that of the weight with the pressure that restores the volume, and the same on two ranks."""
+    """The state is that of the weight with the pressure that restores the volume, and the same on
+    two ranks.
+    """
     one, *others = (sealed(ranks) for ranks in (1, 2))
     assert one["pressure"] == pytest.approx(one["again"], rel=1e-8)
     assert abs(one["pressure"]) > 0.01

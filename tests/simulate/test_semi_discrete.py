@@ -1,4 +1,6 @@
-"""A small shell in motion against SciPy's integration of the same M u'' + c M u' + R(u, t) = 0, and its cost."""
+"""A small shell in motion against SciPy's integration of the same M u'' + c M u' + R(u, t) = 0, and
+its cost.
+"""
 
 import time
 from statistics import median
@@ -32,7 +34,9 @@ def slow(t: float, before: bool = True) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_second_order_towards_scipy() -> None:
-    """Displacement and velocity of every node to 1e-6 of the largest; a half of the step leaves a quarter."""
+    """Displacement and velocity of every node to 1e-6 of the largest; a half of the step leaves a
+    quarter.
+    """
     scene = scene_of("axisymmetric", degree=2, refinement=0.2)
     system = scene.model.system
     u, M = scene.unloaded().u, mass(scene.model)
@@ -62,7 +66,9 @@ def test_second_order_towards_scipy() -> None:
 
 @pytest.mark.slow
 def test_cost_of_a_step() -> None:
-    """At most twice an iteration of Newton's method: a tangent, its factors and solution, and a residual."""
+    """At most twice an iteration of Newton's method: a tangent, its factors and solution, and a
+    residual.
+    """
     scene = scene_of("half", degree=3, refinement=1.0)
     system = scene.model.system
     state = scene.unloaded()

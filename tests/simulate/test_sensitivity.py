@@ -1,4 +1,6 @@
-"""Sensitivities from the null vector against finite differences of separately computed knockdown factors."""
+"""Sensitivities from the null vector against finite differences of separately computed knockdown
+factors.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,8 +18,17 @@ from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 
 MERIDIAN = ["magnetic.lambda_m=0.001"]
-HALF = [*MERIDIAN, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.3", "magnetic.applied.polar=30"]
-SHELLS = [pytest.param(MERIDIAN, id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
+HALF = [
+    *MERIDIAN,
+    "symmetry=half",
+    "mesh.degree=3",
+    "mesh.refinement=0.3",
+    "magnetic.applied.polar=30",
+]
+SHELLS = [
+    pytest.param(MERIDIAN, id="meridian"),
+    pytest.param(HALF, id="half", marks=pytest.mark.slow),
+]
 
 
 def case(*settings: str) -> Case:
@@ -53,7 +64,8 @@ def test_field_and_defect(settings: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "remanent"), [(MERIDIAN, "kind: radial"), pytest.param(HALF, "polar: 0", marks=pytest.mark.slow)]
+    ("settings", "remanent"),
+    [(MERIDIAN, "kind: radial"), pytest.param(HALF, "polar: 0", marks=pytest.mark.slow)],
 )
 def test_patches_add_up_to_the_field(settings: list[str], remanent: str) -> None:
     """The magnetic energy is linear in the remanence and in lambda_m alike."""
@@ -74,15 +86,21 @@ def test_remanence_of_the_dimple() -> None:
     rim, B = scene.problem.within["dimple"], np.array([0.0, 0.0, 1.0])
 
     def stronger(change: float) -> float:
-        loads = replace(model.loads, magnetic=replace(field, remanent=WithinRims(((rim, (1 + change) * B),), B)))
+        loads = replace(
+            model.loads, magnetic=replace(field, remanent=WithinRims(((rim, (1 + change) * B),), B))
+        )
         other = MeridianModel(model.meridian, model.material, model.degree, model.conditions, loads)
-        return find_fold(BorderedNewton(other.system), Guess(fold.state, fold.phi), "pressure").value
+        return find_fold(
+            BorderedNewton(other.system), Guess(fold.state, fold.phi), "pressure"
+        ).value
 
     expected = derivative(stronger, 0.02)
     assert sensitivities(scene, fold)["remanence dimple"] == pytest.approx(expected, rel=1e-6)
 
 
 def test_without_a_field() -> None:
-    """The derivative by the field is there, for its value see test_own_runs.py; that by a remanence is not."""
+    """The derivative by the field is there, for its value see test_own_runs.py; that by a remanence
+    is not.
+    """
     scene, fold = fold_of("magnetic.lambda_m=0")
     assert list(sensitivities(scene, fold)) == ["lambda_m", "defect.amplitude", "defect.width"]

@@ -33,7 +33,13 @@ def test_accelerated_support() -> None:
     """A root that is accelerated evenly bends a strip as a sudden load of its mass times that does."""
     found = moved(f"{SMALL} + {ACCELERATION / 2}*t**2")
     area = {"kind": "dead", "loads": [{"over": "all", "per_area": [0, 0, -ACCELERATION / 50]}]}
-    sudden = {"kind": "time", "duration": PERIOD, "points": 10, "step": PERIOD / 50, "history": {"load": "1"}}
+    sudden = {
+        "kind": "time",
+        "duration": PERIOD,
+        "points": 10,
+        "step": PERIOD / 50,
+        "history": {"load": "1"},
+    }
     first = area | {"control": "load", "factor": SMALL, "points": 1, "until": "target"}
     loaded = columns_of(case_of(SHAKEN, first, sudden, symmetry="half"))
     bent = loaded["tip_uz"][loaded["step"] == 2]
@@ -47,7 +53,10 @@ def test_accelerated_support() -> None:
 def test_a_kink_is_an_impulse() -> None:
     """A root that starts and stops at once: the energies add up over both impulses."""
     found = moved(
-        [[0, SMALL], [PERIOD / 4, 0.05], [PERIOD / 2, 0.05]], duration=PERIOD / 2, step=PERIOD / 200, rho_inf=1.0
+        [[0, SMALL], [PERIOD / 4, 0.05], [PERIOD / 2, 0.05]],
+        duration=PERIOD / 2,
+        step=PERIOD / 200,
+        rho_inf=1.0,
     )
     energy = found["kinetic"] + found["stored"] - found["work"]
     assert np.ptp(energy) < 1e-3 * found["work"].max()

@@ -8,13 +8,22 @@ from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.sensitivity import Along, _deviation, changed, fold_at, reshaped, sensitivities
+from magshell_fenicsx.simulate.sensitivity import (
+    Along,
+    _deviation,
+    changed,
+    fold_at,
+    reshaped,
+    sensitivities,
+)
 from magshell_fenicsx.simulate.transfer import transfer
 
 
 @pytest.mark.parametrize("kind", [pytest.param("dimple", marks=pytest.mark.slow), "gaussian"])
 def test_of_the_meridian(kind: str) -> None:
-    """On meshes that follow the rim; off the pole the derivative is zero by symmetry, and is not asked for there."""
+    """On meshes that follow the rim; off the pole the derivative is zero by symmetry, and is not
+    asked for there.
+    """
     one = f"[{{kind: {kind}, amplitude: 1.2, width: 2.5}}, {{kind: formula, w0: x**2 + y**2, amplitude: 0.1}}]"
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", [f"shell.imperfections={one}"]))
     *_, last = follow(scene)
@@ -37,15 +46,30 @@ def test_of_the_meridian(kind: str) -> None:
 
 @pytest.mark.slow
 def test_beside_the_pole() -> None:
-    """Depth, width and both angles of the deeper of two dimples, on the same mesh with the dimple itself changed."""
-    flaws = ("amplitude: 1, width: 2.5, at: {polar: 20, azimuth: 70}", "amplitude: 0.7, width: 3, at: {polar: 45}")
+    """Depth, width and both angles of the deeper of two dimples, on the same mesh with the dimple
+    itself changed.
+    """
+    flaws = (
+        "amplitude: 1, width: 2.5, at: {polar: 20, azimuth: 70}",
+        "amplitude: 0.7, width: 3, at: {polar: 45}",
+    )
     several = ", ".join(f"{{kind: gaussian, {numbers}}}" for numbers in flaws)
-    sets = [f"shell.imperfections=[{several}]", "shell.radius_to_thickness=30", "mesh.degree=3", "mesh.refinement=0.4"]
+    sets = [
+        f"shell.imperfections=[{several}]",
+        "shell.radius_to_thickness=30",
+        "mesh.degree=3",
+        "mesh.refinement=0.4",
+    ]
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", [*sets, "symmetry=none"]))
     *_, last = follow(scene)
     found = sensitivities(scene, fold := fold_at(scene, last))
     key, old = "imperfections.0", _deviation(scene, scene.problem.imperfections, "imperfections.0")
-    for number, step in (("amplitude", 0.004), ("width", 0.01), ("at.polar", 0.1), ("at.azimuth", 0.1)):
+    for number, step in (
+        ("amplitude", 0.004),
+        ("width", 0.01),
+        ("at.polar", 0.1),
+        ("at.azimuth", 0.1),
+    ):
 
         def value(change: float, number: str = number) -> float:
             sections = changed(scene.problem.imperfections, key, number, change)

@@ -1,4 +1,6 @@
-"""Snaps of a dimpled hemisphere, the pressure held or the volume: at rest it is on a branch of the static path."""
+"""Snaps of a dimpled hemisphere, the pressure held or the volume: at rest it is on a branch of the
+static path.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,15 +21,27 @@ from magshell_fenicsx.simulate.trace import trace
 
 def case_of(radius: float, amplitude: float, **load: Any) -> Case:
     dimple = {"kind": "dimple", "amplitude": amplitude, "width": 3.2}
-    shell = {"geometry": "hemisphere", "radius_to_thickness": radius, "poisson_ratio": 0.5, "imperfections": [dimple]}
+    shell = {
+        "geometry": "hemisphere",
+        "radius_to_thickness": radius,
+        "poisson_ratio": 0.5,
+        "imperfections": [dimple],
+    }
     pressed = {"kind": "pressure", "until": "limit"} | load
-    data = {"shell": shell, "boundary": {"equator": "clamped"}, "symmetry": "axisymmetric", "mesh": {"refinement": 0.4}}
+    data = {
+        "shell": shell,
+        "boundary": {"equator": "clamped"},
+        "symmetry": "axisymmetric",
+        "mesh": {"refinement": 0.4},
+    }
     return Case.from_source(data | {"loading": pressed})
 
 
 @pytest.mark.slow
 def test_volume_held() -> None:
-    """The volume turns just beyond the largest pressure; the shell snaps to the branch on which it grows again."""
+    """The volume turns just beyond the largest pressure; the shell snaps to the branch on which it
+    grows again.
+    """
     scene = Scene(case_of(100, 0.5, then="snap", hold={"pressure": "conjugate"}))
     records = list(follow(scene))
     table = rows(scene, records)
@@ -36,22 +50,32 @@ def test_volume_held() -> None:
     volumes = [row["volume_change"] for row in table[made["point"] :]]
     assert volumes == pytest.approx(np.full(len(volumes), volumes[0]), rel=1e-9)
     assert table[made["rest"]]["p_over_pc"] < 0.9 * table[made["point"]]["p_over_pc"]
-    assert made["dissipated"] == pytest.approx(table[made["point"]]["stored"] - table[made["rest"]]["stored"], rel=0.05)
+    assert made["dissipated"] == pytest.approx(
+        table[made["point"]]["stored"] - table[made["rest"]]["stored"], rel=0.05
+    )
     unit, there = scene.conjugate_unit("pressure"), []
     path = trace(scene, "pressure", fold, first=-0.01, until="points", steps=30)
     for record in path:  # by arc length past the fold, to a larger change of volume
         there.append(record.point.state)
-        if record.point.negative_pivots == 1 and record.point.negative_pivots_held == 0 and len(there) > 5:
+        if (
+            record.point.negative_pivots == 1
+            and record.point.negative_pivots_held == 0
+            and len(there) > 5
+        ):
             break
     target = [volumes[0] * unit]
-    *_, static = trace(scene, "pressure", there[-1], control="conjugate", until="target", targets=target)
+    *_, static = trace(
+        scene, "pressure", there[-1], control="conjugate", until="target", targets=target
+    )
     assert rest.point.state.u == pytest.approx(static.point.state.u, abs=1e-6 * 0.01)
     assert rest.point.state.mu == pytest.approx(static.point.state.mu, rel=1e-6)
 
 
 @pytest.mark.slow
 def test_pressure_held() -> None:
-    """A thick shell everts and holds the pressure; the static path comes there through all folds, and from above."""
+    """A thick shell everts and holds the pressure; the static path comes there through all folds,
+    and from above.
+    """
     scene = Scene(case_of(20, 3.0, then="snap", snap={"tolerance": 0.1}))
     *_, rest = follow(scene)
     assert rest.label == "target"
@@ -68,7 +92,9 @@ def test_own_conjugate_goes_with_a_limit() -> None:
 
 
 class Kept:
-    """A journal in memory that begins with known results, and stops a motion at a number of steps in time."""
+    """A journal in memory that begins with known results, and stops a motion at a number of steps
+    in time.
+    """
 
     def __init__(self, known: Sequence[Point | str] = (), steps: float = np.inf) -> None:
         self.found, self._known, self._steps = list[Point | str](), list(known), steps
@@ -102,7 +128,12 @@ def test_a_resumed_snap_is_the_same() -> None:
         return columns(scene, follow(scene))
 
     defect = {"kind": "dimple", "amplitude": 1, "width": 3}
-    shell = {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3, "defect": defect}
+    shell = {
+        "geometry": "hemisphere",
+        "radius_to_thickness": 50,
+        "poisson_ratio": 0.3,
+        "defect": defect,
+    }
     snap = {"kind": "pressure", "until": "limit", "then": "snap", "snap": {"tolerance": 0.1}}
     data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": snap}
     case = Case.from_source(data | {"mesh": {"refinement": 0.5, "degree": 3}})
@@ -116,7 +147,9 @@ def test_a_resumed_snap_is_the_same() -> None:
         found = numbers(Kept(known))
         for column, values in wanted.items():
             if values.dtype.kind == "f":
-                assert np.nanmax(np.abs(found[column] - values), initial=0) <= 1e-12 * np.nanmax(np.abs(values)), column
+                assert np.nanmax(np.abs(found[column] - values), initial=0) <= 1e-12 * np.nanmax(
+                    np.abs(values)
+                ), column
 
 
 @pytest.mark.parametrize("late", [20.0, 60.0])
@@ -137,7 +170,12 @@ def test_departure_and_jump(late: float) -> None:
     assert snap["departure"] == pytest.approx(late - np.log(9), abs=2e-3)
     assert snap["time"] == pytest.approx(late, abs=2e-3)
     bare, *_ = _snaps({"snaps": [snap]})
-    assert bare.startswith("The snap takes 4.394 from 10 to 90 % of its way, after a departure from the fold of ")
+    assert bare.startswith(
+        "The snap takes 4.394 from 10 to 90 % of its way, after a departure from the fold of "
+    )
     assert bare.endswith("(times in R √(ρ/E); with a density of the shell they are in ms).")
     (in_ms,) = _snaps({"snaps": [snap], "snap_jump_ms": 3.1, "snap_departure_ms": 28.0})
-    assert in_ms == "The snap takes 3.1 ms from 10 to 90 % of its way, after a departure from the fold of 28 ms."
+    assert (
+        in_ms
+        == "The snap takes 3.1 ms from 10 to 90 % of its way, after a departure from the fold of 28 ms."
+    )

@@ -14,8 +14,20 @@ from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
 def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
     shell = {"geometry": "disc", "radius_to_thickness": 10, "poisson_ratio": 0.3}
-    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.01, "points": 1}
-    data = {"model": "solid", "shell": shell, "boundary": {"rim": "clamped"}, "loading": loading, "mesh": mesh}
+    loading = {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": 0.01,
+        "points": 1,
+    }
+    data = {
+        "model": "solid",
+        "shell": shell,
+        "boundary": {"rim": "clamped"},
+        "loading": loading,
+        "mesh": mesh,
+    }
     return Case.from_source({**data, "solid": {"layers": layers}})
 
 

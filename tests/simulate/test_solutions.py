@@ -41,10 +41,17 @@ def apart(scene: ms.Scene, a: State, b: State) -> float:
 def crossings(
     scene: ms.Scene, name: str, start: State, first: float, most: int, quantity: Quantity = "load"
 ) -> Sequence[State]:
-    """The first states on a path by arc length at which an amplitude, or its conjugate, is as at the start again."""
+    """The first states on a path by arc length at which an amplitude, or its conjugate, is as at
+    the start again.
+    """
     path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
     walk = Walk(path, here, Goal("points", [path.value(quantity, start)], quantity))
-    return [point.state for _, (_, point) in zip(range(most), (it for it in walk if it[0] == "target"), strict=False)]
+    return [
+        point.state
+        for _, (_, point) in zip(
+            range(most), (it for it in walk if it[0] == "target"), strict=False
+        )
+    ]
 
 
 def test_a_roof_has_snapped_through() -> None:
@@ -59,7 +66,10 @@ def test_a_roof_has_snapped_through() -> None:
         assert it["error_over_h"] < 1e-9
     assert [it["stable"] for it in solutions(result)] == [False, True]
     by_hand = list(ms.solutions(scene, result.last, most=2))
-    assert [apart(scene, a.point.state, b) < 1e-8 for a, b in zip(by_hand, found, strict=True)] == [True, True]
+    assert [apart(scene, a.point.state, b) < 1e-8 for a, b in zip(by_hand, found, strict=True)] == [
+        True,
+        True,
+    ]
     back = list(ms.solutions(scene, by_hand[1], most=1, guesses=8))  # from the snapped roof
     assert min(apart(scene, back[0].point.state, other) for other in (result.last, found[0])) < 1e-8
 
@@ -77,11 +87,16 @@ def test_a_search_for_stable_solutions() -> None:
 
 @pytest.mark.slow
 def test_what_a_step_holds_stays_held() -> None:
-    """Sze's thin roof snaps back: under one displacement of its middle it has three equilibria, the second unstable."""
-    push, more = (f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5))
+    """Sze's thin roof snaps back: under one displacement of its middle it has three equilibria, the
+    second unstable.
+    """
+    push, more = (
+        f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5)
+    )
     first = push + "control: displacement, until: target, displacement: 15.875, points: 4}"
     second = (
-        more + "control: load, until: target, factor: 1, points: 1, hold: {load: conjugate}, search: {solutions: 2}}"
+        more
+        + "control: load, until: target, factor: 1, points: 1, hold: {load: conjugate}, search: {solutions: 2}}"
     )
     settings = ["mesh={degree: 3, size: 127}", f"loading=[{first}, {second}]"]
     result = ms.run(ms.Case.load(CASES / "benchmarks/hinged_roof_6.35.yaml", settings))
@@ -124,9 +139,12 @@ def test_a_search_whose_time_is_over_ends_the_run_well() -> None:
 
 @pytest.mark.slow
 def test_solid_roof() -> None:
-    """The solid has three equilibria near those of the shell; shear and the hinges in the middle line make 2 %."""
+    """The solid has three equilibria near those of the shell; shear and the hinges in the middle
+    line make 2 %.
+    """
     shell, solid = (
-        ms.run(roof("mesh={size: 127}", *more)).rows[-2:] for more in ([], ["model=solid", "solid={layers: 1}"])
+        ms.run(roof("mesh={size: 127}", *more)).rows[-2:]
+        for more in ([], ["model=solid", "solid={layers: 1}"])
     )
     for a, b in zip(solid, shell, strict=True):
         assert a["label"] == b["label"] == "solution"
@@ -135,9 +153,16 @@ def test_solid_roof() -> None:
 
 
 def test_dents_are_mirror_images() -> None:
-    """Above the fold the dented shell is the shell mirrored in a plane, below it is the shell itself."""
+    """Above the fold the dented shell is the shell mirrored in a plane, below it is the shell
+    itself.
+    """
     half, meridian = (
-        ms.Scene(ms.Case.load(CASES / "snapped.yaml", ["mesh.refinement=0.4", "mesh.degree=3", f"symmetry={symmetry}"]))
+        ms.Scene(
+            ms.Case.load(
+                CASES / "snapped.yaml",
+                ["mesh.refinement=0.4", "mesh.degree=3", f"symmetry={symmetry}"],
+            )
+        )
         for symmetry in ("half", "axisymmetric")
     )
     depths = []
@@ -159,7 +184,9 @@ def test_dents_are_mirror_images() -> None:
 
 @pytest.mark.slow
 def test_dimpled_shell_at_a_fifth_of_the_classical_pressure() -> None:
-    """The dent that is the barrier, and two everted shells, are on the path far beyond the fold at 0.326 p_c."""
+    """The dent that is the barrier, and two everted shells, are on the path far beyond the fold at
+    0.326 p_c.
+    """
     result = ms.run(ms.Case.load(CASES / "snapped.yaml"))
     scene = result.scene
     assert [row["label"] for row in result.rows[-4:]] == ["solution"] * 4

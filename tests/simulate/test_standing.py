@@ -22,9 +22,21 @@ natural: {curvature: [0, 0, 0]}
 mesh: {degree: 2, refinement: 0.4}
 loading: {kind: field, points: 2}
 """
-OTHER = ["magnetic.remanent.file=two.csv", "shell.thickness_factor=1 + x/5", "natural.curvature=[0.3*x, 0.1, 0]"]
-BUCKLING = ["shell.thickness_factor=1 + 0*z", "natural={curvature: [0, 0, 0]}", "magnetic.lambda_m=0.001"]
-THICKER = ["shell.thickness_factor=1 + z/10", "natural={curvature: [0.1, 0.2*z, 0]}", "magnetic.lambda_m=0.001"]
+OTHER = [
+    "magnetic.remanent.file=two.csv",
+    "shell.thickness_factor=1 + x/5",
+    "natural.curvature=[0.3*x, 0.1, 0]",
+]
+BUCKLING = [
+    "shell.thickness_factor=1 + 0*z",
+    "natural={curvature: [0, 0, 0]}",
+    "magnetic.lambda_m=0.001",
+]
+THICKER = [
+    "shell.thickness_factor=1 + z/10",
+    "natural={curvature: [0.1, 0.2*z, 0]}",
+    "magnetic.lambda_m=0.001",
+]
 
 
 def test_half_strip(tmp_path: Path) -> None:
@@ -38,7 +50,9 @@ def test_half_strip(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_meridian() -> None:
-    agree(*(Case.load(CASES / "dimple_buckling.yaml", settings) for settings in (BUCKLING, THICKER)))
+    agree(
+        *(Case.load(CASES / "dimple_buckling.yaml", settings) for settings in (BUCKLING, THICKER))
+    )
 
 
 def agree(first: Case, second: Case) -> None:
@@ -52,7 +66,9 @@ def agree(first: Case, second: Case) -> None:
         assert last.label == expected.label
         assert last.point.state.mu == pytest.approx(expected.point.state.mu, rel=1e-10)
         size = np.abs(expected.point.state.u).max()
-        np.testing.assert_allclose(last.point.state.u, expected.point.state.u, rtol=0, atol=1e-9 * size)
+        np.testing.assert_allclose(
+            last.point.state.u, expected.point.state.u, rtol=0, atol=1e-9 * size
+        )
 
 
 def test_another_case_is_another_scene() -> None:
@@ -62,6 +78,8 @@ def test_another_case_is_another_scene() -> None:
     scene = known.of(case.problem(), Scene(case).comm)
     assert known.of(case.problem(), scene.comm) is scene
     for setting in ("shell.poisson_ratio=0.3", "symmetry=half", "mesh.degree=3"):
-        assert not refilled(scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]).problem())
+        assert not refilled(
+            scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]).problem()
+        )
     bare = replace(case.problem(), document=Document())
     assert not refilled(Scene(bare), bare)

@@ -1,7 +1,9 @@
-"""A tolerance instead of a mesh size: the true error of the result is below it, and not ten times smaller.
+"""A tolerance instead of a mesh size: the true error of the result is below it, and not ten times
+smaller.
 
-k_d: an independent axisymmetric solver, nine digits. F at w/h = 10 under 45 degrees: degree 5 and refinement 1.6
-of this program, 15.14768, which the independent mixed elements have within 5e-5 (15.147).
+k_d: an independent axisymmetric solver, nine digits. F at w/h = 10 under 45 degrees: degree 5 and
+refinement 1.6 of this program, 15.14768, which the independent mixed elements have within 5e-5
+(15.147).
 """
 
 import json
@@ -20,7 +22,15 @@ from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, equidistributed
-from magshell_fenicsx.simulate.adapt.ending import CellFields, NoResult, NotCarried, by_path, carry, from_near, near_by
+from magshell_fenicsx.simulate.adapt.ending import (
+    CellFields,
+    NoResult,
+    NotCarried,
+    by_path,
+    carry,
+    from_near,
+    near_by,
+)
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
 FORCE = 15.14768
@@ -29,7 +39,11 @@ COMM = MPI.COMM_WORLD
 
 
 def buckling(tolerance: float, lambda_m: float = 0.0, symmetry: str = "half") -> Case:
-    settings = [f"mesh.tolerance={tolerance!r}", f"magnetic.lambda_m={lambda_m}", f"symmetry={symmetry}"]
+    settings = [
+        f"mesh.tolerance={tolerance!r}",
+        f"magnetic.lambda_m={lambda_m}",
+        f"symmetry={symmetry}",
+    ]
     return Case.load(CASES / "dimple_buckling.yaml", settings)
 
 
@@ -39,7 +53,8 @@ def indentation(tolerance: float) -> Case:
 
 
 def check(case: Case, reference: float, mesh: Adapted | None = None) -> None:
-    """The path on the mesh that was found ends where the rounds did, with an error as it was asked for.
+    """The path on the mesh that was found ends where the rounds did, with an error as it was asked
+    for.
 
     On a meridian, whose cells cost nothing, it may be far smaller.
     """
@@ -48,7 +63,11 @@ def check(case: Case, reference: float, mesh: Adapted | None = None) -> None:
     end = by_path(mesh.choice.scene(case.problem(), COMM))
     error = abs(end.value / reference - 1)
     assert end.value == pytest.approx(mesh.best.result, rel=1e-7)
-    assert (0.0 if mesh.choice.applied(case.problem()).axisymmetric else tolerance / 10) < error < tolerance
+    assert (
+        (0.0 if mesh.choice.applied(case.problem()).axisymmetric else tolerance / 10)
+        < error
+        < tolerance
+    )
     assert error < max(mesh.best.estimate, 1e-8)
 
 
@@ -93,17 +112,31 @@ def test_grading_by_the_indicator_takes_fewer_unknowns() -> None:
 
 
 def dome(thickness: float, height: float, **shell: object) -> dict[str, object]:
-    keys = {"geometry": "cap", "radius": 1, "polar": 40, "thickness": thickness, "poisson_ratio": 0.3}
-    return {"shell": keys | shell, "boundary": {"rim": "clamped"}, "place": {"position": [0, 0, height]}}
+    keys = {
+        "geometry": "cap",
+        "radius": 1,
+        "polar": 40,
+        "thickness": thickness,
+        "poisson_ratio": 0.3,
+    }
+    return {
+        "shell": keys | shell,
+        "boundary": {"rim": "clamped"},
+        "place": {"position": [0, 0, height]},
+    }
 
 
 @pytest.mark.slow
 def test_ends_of_several_shells_are_carried() -> None:
-    """Each gives its own to itself, though they cross in space: exact to a higher degree, and the fold of its path."""
+    """Each gives its own to itself, though they cross in space: exact to a higher degree, and the
+    fold of its path.
+    """
     flaw = {"kind": "gaussian", "amplitude": 0.5, "width": 1.5, "at": {"polar": 10}}
     shells = {"lower": dome(0.03, 0.0, imperfections=[flaw]), "upper": dome(0.04, 0.01)}
     case = Case.from_source({"shells": shells, "loading": {"kind": "pressure", "until": "limit"}})
-    low, high, finer = (Choice(*each).scene(case.problem(), COMM) for each in ((3, 0.4), (4, 0.4), (4, 0.6)))
+    low, high, finer = (
+        Choice(*each).scene(case.problem(), COMM) for each in ((3, 0.4), (4, 0.4), (4, 0.6))
+    )
     end = by_path(low)
     assert carry(high, low, carry(low, high, end.state.u)) == pytest.approx(end.state.u, abs=1e-9)
     found = near_by(finer, low, end)
@@ -113,11 +146,16 @@ def test_ends_of_several_shells_are_carried() -> None:
 
 @pytest.mark.slow
 def test_ends_of_shells_that_touch_are_carried() -> None:
-    """With cuts and penalties of their own, which the path changes elsewhere: its force, 8.80658e-6, to 1e-3.
+    """With cuts and penalties of their own, which the path changes elsewhere: its force,
+    8.80658e-6, to 1e-3.
 
-    From a coarser mesh than this Newton's method does not reach the end, and the path is computed anew.
+    From a coarser mesh than this Newton's method does not reach the end, and the path is computed
+    anew.
     """
-    case = Case.load(CASES / "stacked_domes.yaml", ["loading.displacement=0.1", "mesh={degree: 3, refinement: 0.722}"])
+    case = Case.load(
+        CASES / "stacked_domes.yaml",
+        ["loading.displacement=0.1", "mesh={degree: 3, refinement: 0.722}"],
+    )
     low, finer = (Choice(degree, 0.722).scene(case.problem(), COMM) for degree in (3, 4))
     found = near_by(finer, low, by_path(low))
     assert found
@@ -125,7 +163,9 @@ def test_ends_of_shells_that_touch_are_carried() -> None:
 
 
 def test_displacements_are_carried_to_a_higher_degree_without_loss() -> None:
-    """And back: polynomials of degree 3 are among those of degree 4, also on the curved edges at the dimple's rim."""
+    """And back: polynomials of degree 3 are among those of degree 4, also on the curved edges at
+    the dimple's rim.
+    """
     case = buckling(1e-2)
     low, high = (Choice(degree, 0.3).scene(case.problem(), COMM) for degree in (3, 4))
     u = np.random.default_rng(0).standard_normal(low.model.system.size)
@@ -138,7 +178,9 @@ def test_displacements_are_carried_to_a_higher_degree_without_loss() -> None:
 
 
 def test_equal_shares() -> None:
-    """Shares that grow e^4-fold across a square and go as size^8 are equal on the new mesh; the error is met."""
+    """Shares that grow e^4-fold across a square and go as size^8 are equal on the new mesh; the
+    error is met.
+    """
     n, order, reduction = 40, 6.0, 0.1
     x, y = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n)
     centres = np.column_stack([x.ravel(), y.ravel()])
@@ -148,7 +190,9 @@ def test_equal_shares() -> None:
     step = 2 ** (1 / 8)  # sizes are rounded to it
     inner = np.abs(centres - 0.5).max(axis=1) < 0.4
     assert np.ptp(np.log(shares * change ** (order + 2))[inner]) < (order + 2) * np.log(step) * 1.5
-    assert shares @ change**order / shares.sum() == pytest.approx(reduction, rel=order * np.log(step))
+    assert shares @ change**order / shares.sum() == pytest.approx(
+        reduction, rel=order * np.log(step)
+    )
     assert more == pytest.approx(np.mean(change**-2.0), rel=0.05)
 
 
@@ -158,7 +202,9 @@ def test_the_mesh_is_kept_for_a_run_that_is_resumed(half_mesh: Adapted) -> None:
     again = Adapted.from_json(mesh.asked, mesh.to_json())
     assert replace(again, choice=mesh.choice) == mesh
     for x in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
-        assert again.choice.applied(case.problem()).size(x) == mesh.choice.applied(case.problem()).size(x)
+        assert again.choice.applied(case.problem()).size(x) == mesh.choice.applied(
+            case.problem()
+        ).size(x)
 
 
 def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: None) -> None:
@@ -171,7 +217,9 @@ def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: No
     assert abs(summary["knockdown"] / KNOCKDOWN[0.0] - 1) < said["error_estimate"] <= 1e-2
     (chosen,) = [r for r in rounds if r["dofs"] == summary["mesh"]["dofs"]]
     assert chosen["result"] == pytest.approx(result.knockdown, rel=1e-7)
-    assert len([line for line in lines if line.startswith("tolerance 0.01: degree 3")]) == len(rounds)
+    assert len([line for line in lines if line.startswith("tolerance 0.01: degree 3")]) == len(
+        rounds
+    )
 
 
 def test_an_estimate_is_not_given_for_another_result() -> None:
@@ -189,7 +237,8 @@ def test_without_a_load_there_is_no_result() -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"), [("mesh.degree=3", "tolerance chooses degree"), ("mesh.tolerance=1e-7", "1e-07")]
+    ("setting", "said"),
+    [("mesh.degree=3", "tolerance chooses degree"), ("mesh.tolerance=1e-7", "1e-07")],
 )
 def test_refused(setting: str, said: str) -> None:
     with pytest.raises(CaseError, match=said):
@@ -198,9 +247,17 @@ def test_refused(setting: str, said: str) -> None:
 
 @pytest.mark.slow
 def test_a_tolerance_on_a_grid() -> None:
-    """A closed cylinder dented at one side, a seam in its chart: against degree 5 on 2.5 times as many cells."""
+    """A closed cylinder dented at one side, a seam in its chart: against degree 5 on 2.5 times as
+    many cells.
+    """
     data = {
-        "shell": {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3},
+        "shell": {
+            "geometry": "cylinder",
+            "radius": 1,
+            "length": 1,
+            "thickness": 0.02,
+            "poisson_ratio": 0.3,
+        },
         "boundary": {"bottom": "clamped", "top": "clamped"},
         "points": {"A": [1, 0, 0.5]},
         "loading": {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1},
@@ -217,8 +274,12 @@ def test_in_parallel(half_mesh: Adapted, tmp_path: Path) -> None:
     settings = ["--set", "mesh.tolerance=1e-2", "--set", "symmetry=half", "--out", str(tmp_path)]
     done = started("run", CASES / "dimple_buckling.yaml", *settings, ranks=2, pictures=False)
     assert done.returncode == 0, done.stderr
-    rounds = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["tolerance"]["rounds"]
-    assert [(r["cells"], r["dofs"]) for r in rounds] == [(r.cells, r.dofs) for r in half_mesh.rounds]
+    rounds = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["tolerance"][
+        "rounds"
+    ]
+    assert [(r["cells"], r["dofs"]) for r in rounds] == [
+        (r.cells, r.dofs) for r in half_mesh.rounds
+    ]
     for there, here in zip(rounds, half_mesh.rounds, strict=True):
         assert there["result"] == pytest.approx(here.result, rel=1e-9)
         assert there["estimate"] == pytest.approx(here.estimate, rel=1e-6)
@@ -230,7 +291,8 @@ def test_a_point_in_a_large_cell_beside_small_ones_is_found() -> None:
     along = np.linspace(2.0, 8.0, 101)[:-1]
     small = [[[10 - t, t], [10 - t + 0.06, t], [10 - t, t + 0.06]] for t in along]
     cells = CellFields(
-        np.array([large, *small]), basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 1)
+        np.array([large, *small]),
+        basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 1),
     )
     values = np.tile(np.arange(101.0)[:, None, None], (1, 3, 1))
     inside, beside = np.array([[4.9, 4.9], [1.0, 1.0]]), np.array([[-0.01, 5.0]])
@@ -245,10 +307,25 @@ def test_a_place_that_the_other_mesh_has_not_is_refused(symmetry: str) -> None:
     """Polynomials that are exact inside grow without limit outside."""
 
     def cap(polar: float) -> Scene:
-        shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "polar": polar, "poisson_ratio": 0.3}
+        shell = {
+            "geometry": "cap",
+            "radius": 1.0,
+            "thickness": 0.02,
+            "polar": polar,
+            "poisson_ratio": 0.3,
+        }
         shell["youngs_modulus"] = 1.0
-        sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2}, "symmetry": symmetry}
-        return Scene(Case.from_source(Source("cap", sections | {"loading": {"kind": "pressure", "until": "limit"}})))
+        sections = {
+            "shell": shell,
+            "boundary": {"rim": "clamped"},
+            "mesh": {"degree": 2},
+            "symmetry": symmetry,
+        }
+        return Scene(
+            Case.from_source(
+                Source("cap", sections | {"loading": {"kind": "pressure", "until": "limit"}})
+            )
+        )
 
     low, wide = cap(30), cap(60)
     with pytest.raises(NotCarried, match="cells beside the other mesh"):

@@ -36,27 +36,37 @@ def with_stiffness(scene: ms.Scene, k: float) -> State:
 
 @pytest.mark.parametrize("symmetry", ["auto", "half"])
 def test_plate_on_a_foundation(symmetry: str) -> None:
-    """D w'''' + k w = q: w = q/k + A ber(x) + B bei(x), x = r (k/D)^(1/4), clamped at r = 1 (Timoshenko)."""
+    """D w'''' + k w = q: w = q/k + A ber(x) + B bei(x), x = r (k/D)^(1/4), clamped at r = 1
+    (Timoshenko).
+    """
     scene = on_foundation(f"symmetry={symmetry}", "mesh.degree=4", file="clamped_plate.yaml")
     h, nu, k, load = 1 / 50, 0.3, 1e-3, 1e-5
     D, q = h**2 / (12 * (1 - nu**2)), load * scene.problem.material.classical_pressure / h
     edge = (k / D) ** 0.25
     A = np.linalg.solve([[ber(edge), bei(edge)], [berp(edge), beip(edge)]], [-q / k, 0])[0]
-    *_, point = ms.trace(scene, "pressure", with_stiffness(scene, k), control="load", targets=[load])
+    *_, point = ms.trace(
+        scene, "pressure", with_stiffness(scene, k), control="load", targets=[load]
+    )
     found = scene.observe(point.point.state)["w_pole_over_h"] * h
     assert found == pytest.approx(q / k + A, rel=2e-5)  # ber(0) = 1, bei(0) = 0
     assert abs(A) > 0.1 * q / k, "the foundation carries all of the load: nothing is tested"
 
 
 def test_every_control_finds_the_same_point() -> None:
-    """A foundation under a shell that has pressure already; conjugate displacements as of the load-controlled point."""
+    """A foundation under a shell that has pressure already; conjugate displacements as of the
+    load-controlled point.
+    """
     scene, k = on_foundation(), 0.02
     *_, pressed = ms.trace(scene, "pressure", targets=[0.2])
     *_, reference = ms.trace(scene, "foundation", pressed, control="load", targets=[k])
     conjugate = -scene.model.system.potential(reference.point.state.u, {}, "foundation")
     ways: list[tuple[Control, float, str]] = [("arc", k, "load"), ("conjugate", conjugate, "load")]
     for control, target, quantity in ways:
-        records = list(ms.trace(scene, "foundation", pressed, control=control, targets=[target], quantity=quantity))
+        records = list(
+            ms.trace(
+                scene, "foundation", pressed, control=control, targets=[target], quantity=quantity
+            )
+        )
         assert records[-1].label == "target"
         assert records[-1].point.state.mu["foundation"] == pytest.approx(k, rel=1e-6)
         difference = records[-1].point.state.u - reference.point.state.u
@@ -64,7 +74,8 @@ def test_every_control_finds_the_same_point() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [pytest.param([], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
+    "settings",
+    [pytest.param([], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)],
 )
 def test_sensitivity_to_ones_own_term(settings: list[str]) -> None:
     """From the null vector against differences of folds that are found for themselves."""
@@ -76,7 +87,9 @@ def test_sensitivity_to_ones_own_term(settings: list[str]) -> None:
         return last
 
     folds = {d: ms.fold_at(scene, fold(k + d)).value for d in (-2 * step, -step, step, 2 * step)}
-    expected = (8 * (folds[step] - folds[-step]) - (folds[2 * step] - folds[-2 * step])) / (12 * step)
+    expected = (8 * (folds[step] - folds[-step]) - (folds[2 * step] - folds[-2 * step])) / (
+        12 * step
+    )
     found = ms.sensitivities(scene, ms.fold_at(scene, fold(k)))
     assert found["foundation"] == pytest.approx(expected, rel=1e-5)
     assert {"lambda_m", "defect.amplitude", "remanence dimple"} < set(found)
@@ -88,7 +101,9 @@ def test_trace_is_the_history_of_the_case() -> None:
     *_, last = ms.follow(ms.Scene(case))
     *_, traced = ms.trace(ms.Scene(case), "pressure", first=0.1)
     assert traced.label == last.label == "fold"
-    assert traced.point.state.mu["pressure"] == pytest.approx(last.point.state.mu["pressure"], rel=1e-7)
+    assert traced.point.state.mu["pressure"] == pytest.approx(
+        last.point.state.mu["pressure"], rel=1e-7
+    )
 
 
 def test_path_through_the_fold() -> None:
@@ -137,17 +152,27 @@ def test_columns_are_those_of_the_table(tmp_path: Path, no_pictures: None) -> No
     ms.run(case, tmp_path)
     scene = ms.Scene(case)
     found, written = ms.columns(scene, ms.follow(scene)), read_path(tmp_path)
-    assert list(found) == [name for name in COLUMNS if name != "wall_s"] == [n for n in written[0] if n != "wall_s"]
+    assert (
+        list(found)
+        == [name for name in COLUMNS if name != "wall_s"]
+        == [n for n in written[0] if n != "wall_s"]
+    )
     for name, values in found.items():
         assert values.shape == (len(written),)
         assert [str(value) for value in values.tolist()] == [row[name] for row in written], name
-    frame = pandas.read_csv(tmp_path / "path.csv", float_precision="round_trip", keep_default_na=False)
-    pandas.testing.assert_frame_equal(pandas.DataFrame(found), frame.drop(columns="wall_s"), check_exact=True)
+    frame = pandas.read_csv(
+        tmp_path / "path.csv", float_precision="round_trip", keep_default_na=False
+    )
+    pandas.testing.assert_frame_equal(
+        pandas.DataFrame(found), frame.drop(columns="wall_s"), check_exact=True
+    )
 
 
 def test_surface_is_the_deformed_shell() -> None:
     """A half is completed; the volume changes as the model integrates it."""
-    scene = ms.Scene(ms.Case.load(CASES / "pole_indentation.yaml", ["symmetry=half", "mesh.degree=3"]))
+    scene = ms.Scene(
+        ms.Case.load(CASES / "pole_indentation.yaml", ["symmetry=half", "mesh.degree=3"])
+    )
     *_, last = ms.follow(scene)
     surface, triangles = ms.surface(scene, last), ms.polydata(scene, last)
     assert surface
@@ -156,7 +181,8 @@ def test_surface_is_the_deformed_shell() -> None:
     assert surface.w.max() / scene.problem.material.h == pytest.approx(6, rel=1e-6)
     faces = triangles.regular_faces
     cones = [
-        np.abs(np.linalg.det(points.astype(float)[faces])) / 6 for points in (triangles.points, triangles["r0"])
+        np.abs(np.linalg.det(points.astype(float)[faces])) / 6
+        for points in (triangles.points, triangles["r0"])
     ]  # to the centre
     assert cones[1].sum() == pytest.approx(2 * np.pi / 3, rel=1e-3)
     change = scene.observe(last.point.state)["volume_change"]
@@ -185,7 +211,9 @@ if MPI.COMM_WORLD.rank == 0:
 
 @pytest.mark.slow
 def test_same_on_ranks() -> None:
-    """A term without symmetry, on one rank and on two: the fold, the sensitivities and what is shown."""
+    """A term without symmetry, on one rank and on two: the fold, the sensitivities and what is
+    shown.
+    """
     found = []
     for ranks in (1, 2):
         script = RANKS.format(file=CASES / "dimple_buckling.yaml")

@@ -1,11 +1,22 @@
-"""Gradients of natural frequencies and of energy barriers, against differences of what is solved again."""
+"""Gradients of natural frequencies and of energy barriers, against differences of what is solved
+again.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from conftest import CASES
-from test_field_gradients import FIELDS, STRIP, Direction, by_difference, changed, directional, solved, state_with
+from test_field_gradients import (
+    FIELDS,
+    STRIP,
+    Direction,
+    by_difference,
+    changed,
+    directional,
+    solved,
+    state_with,
+)
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.control import Bordered, GivenConjugate
@@ -20,7 +31,9 @@ from magshell_fenicsx.simulate.numbers import scene_with
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import barrier
 
-VOLUME = "loading={kind: pressure, control: volume, until: target, volume_change: -0.004, points: 1}"
+VOLUME = (
+    "loading={kind: pressure, control: volume, until: target, volume_change: -0.004, points: 1}"
+)
 
 
 def omega2(scene: Scene, record: Record, name: str) -> float:
@@ -29,7 +42,9 @@ def omega2(scene: Scene, record: Record, name: str) -> float:
 
 @pytest.mark.parametrize("symmetry", ["auto", pytest.param("none", marks=pytest.mark.slow)])
 def test_strip(tmp_path: Path, symmetry: str) -> None:
-    """The first bending and, of the whole strip, the first torsion of a strip that a field has bent."""
+    """The first bending and, of the whole strip, the first torsion of a strip that a field has
+    bent.
+    """
     (tmp_path / "strip.yaml").write_text(STRIP)
     scene = Scene(Case.load(tmp_path / "strip.yaml", [f"symmetry={symmetry}"]))
     last = solved(scene)
@@ -38,17 +53,26 @@ def test_strip(tmp_path: Path, symmetry: str) -> None:
     found = {name: gradient(scene, last, of=name, by=fields) for name in names}
     for seed, field in enumerate(fields, FIELDS.index(fields[0])):
         # by a deviation omega2 changes little: shorter steps show rounding, 1e-5 at 0.05
-        along, step = Direction(seed), {"thickness": 1e-2, "curvature": 5e-2, "deviation": 0.4}[field]
+        along, step = (
+            Direction(seed),
+            {"thickness": 1e-2, "curvature": 5e-2, "deviation": 0.4}[field],
+        )
         states = {c: state_with(scene, last, field, along, c * step) for c in (-2, -1, 1, 2)}
         for name in names:
             values = {c: vibration(*each, name).value for c, each in states.items()}
             expected = by_difference(values.__getitem__, 1) / step
-            assert directional(scene, found[name][field], field, along) == pytest.approx(expected, rel=1e-5), name
+            assert directional(scene, found[name][field], field, along) == pytest.approx(
+                expected, rel=1e-5
+            ), name
 
 
 def at_volume(scene: Scene, near: State) -> State:
-    """The equilibrium with the volume that the step prescribes, by Newton's method from a state near by."""
-    volume = GivenConjugate(scene.model.system, "pressure", -0.004 * scene.conjugate_unit("pressure"))
+    """The equilibrium with the volume that the step prescribes, by Newton's method from a state
+    near by.
+    """
+    volume = GivenConjugate(
+        scene.model.system, "pressure", -0.004 * scene.conjugate_unit("pressure")
+    )
     solution = scene.newton.solve(near, "pressure", volume)
     assert solution.converged
     system, state = scene.model.system, solution.state
@@ -59,19 +83,28 @@ def at_volume(scene: Scene, near: State) -> State:
 
 @pytest.mark.slow
 def test_meridian() -> None:
-    """A wave and m = 0 of the dimpled hemisphere in a field, its volume held, by thickness, amplitude and number."""
+    """A wave and m = 0 of the dimpled hemisphere in a field, its volume held, by thickness,
+    amplitude and number.
+    """
     coarse = ["mesh.refinement=0.5"]
     settings = ["magnetic.lambda_m=0.001", "shell.poisson_ratio=0.45", VOLUME, *coarse]
-    scene, along = Scene(Case.load(CASES / "dimple_buckling.yaml", settings)), Direction(3, around=True)
+    scene, along = (
+        Scene(Case.load(CASES / "dimple_buckling.yaml", settings)),
+        Direction(3, around=True),
+    )
     last = solved(scene)
     labels = [mode.label for mode in ShellModes(scene.model).vibrations(last.point.state, 12)]
     key, step = "shell.poisson_ratio", 4e-3
     thicker = {c: changed(scene, "thickness", along, c * step) for c in (-2, -1, 1, 2)}
     softer = {c: scene_with(scene, key, 0.45 + c * step) for c in (-2, -1, 1, 2)}
-    states = {id(one): at_volume(one, last.point.state) for one in (*thicker.values(), *softer.values())}
+    states = {
+        id(one): at_volume(one, last.point.state) for one in (*thicker.values(), *softer.values())
+    }
     for label in ("m = 1", ""):
         name = f"omega2_{labels.index(label) + 1}"
-        found = gradient(scene, last, of=name, by=["thickness", "lambda_m", "magnetic.lambda_m", key])
+        found = gradient(
+            scene, last, of=name, by=["thickness", "lambda_m", "magnetic.lambda_m", key]
+        )
 
         def differences(scenes: dict[int, Scene], name: str = name) -> float:
             values = {c: vibration(one, states[id(one)], name).value for c, one in scenes.items()}
@@ -87,12 +120,22 @@ def test_meridian() -> None:
 def test_hertz(tmp_path: Path) -> None:
     """Of a strip of silicone: a frequency is inversely proportional to the root of the density."""
     (tmp_path / "strip.yaml").write_text(STRIP)
-    shell = {"radius": "30 mm", "thickness": "0.3 mm", "youngs_modulus": "1.2 MPa", "density": "1100 kg/m^3"}
+    shell = {
+        "radius": "30 mm",
+        "thickness": "0.3 mm",
+        "youngs_modulus": "1.2 MPa",
+        "density": "1100 kg/m^3",
+    }
     settings = [f"shell.{key}={value}" for key, value in shell.items()]
     scene = Scene(
         Case.load(
             tmp_path / "strip.yaml",
-            ["shell.radius_to_thickness=null", "points.tip=[30 mm, 0, 0]", "shell.imperfections=[]", *settings],
+            [
+                "shell.radius_to_thickness=null",
+                "points.tip=[30 mm, 0, 0]",
+                "shell.imperfections=[]",
+                *settings,
+            ],
         )
     )
     last = solved(scene)
@@ -100,15 +143,22 @@ def test_hertz(tmp_path: Path) -> None:
     hertz = frequency(scene.problem, "hertz_1", omega2(scene, last, "omega2_1"))
     assert found["shell.density"] == pytest.approx(-hertz / 2 / 1100, rel=1e-7)
     by_square = gradient(scene, last, of="omega2_1", by=["lambda_m"])["lambda_m"]
-    assert found["lambda_m"] == pytest.approx(by_square * hertz / (2 * omega2(scene, last, "omega2_1")), rel=1e-9)
+    assert found["lambda_m"] == pytest.approx(
+        by_square * hertz / (2 * omega2(scene, last, "omega2_1")), rel=1e-9
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", ["load", "conjugate"])
 def test_barrier(hold: str) -> None:
-    """The barrier of a probed spherical shell, at its pressure or its volume, by thickness and Poisson's ratio."""
+    """The barrier of a probed spherical shell, at its pressure or its volume, by thickness and
+    Poisson's ratio.
+    """
     file = CASES / "probing.yaml"
-    case = Case.load(file, ["shell.radius_to_thickness=40", f"loading.1.hold.pressure={hold}", "loading.0.points=1"])
+    case = Case.load(
+        file,
+        ["shell.radius_to_thickness=40", f"loading.1.hold.pressure={hold}", "loading.0.points=1"],
+    )
     scene, along, step = Scene(case), Direction(3, around=True), 3e-4
     history = history_of(scene)
     begin, end = history.begin, history.last
@@ -122,7 +172,9 @@ def test_barrier(hold: str) -> None:
     by_thickness = directional(scene, found["thickness"], "thickness", along)
     expected = differences(lambda c: changed(scene, "thickness", along, c))
     assert by_thickness == pytest.approx(expected, rel=1e-5)
-    assert found[key] == pytest.approx(differences(lambda c: scene_with(scene, key, 0.3 + c)), rel=1e-5)
+    assert found[key] == pytest.approx(
+        differences(lambda c: scene_with(scene, key, 0.3 + c)), rel=1e-5
+    )
 
 
 def history_of(scene: Scene) -> History:
@@ -136,4 +188,6 @@ def barrier_of(scene: Scene) -> float:
     found = history_of(scene)
     assert found.begin
     assert found.last
-    return barrier(scene, scene.problem.programme[-1], found.begin.point.state, found.last.point.state)
+    return barrier(
+        scene, scene.problem.programme[-1], found.begin.point.state, found.last.point.state
+    )

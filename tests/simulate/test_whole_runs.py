@@ -1,4 +1,6 @@
-"""Gradients by keys of a case against differences of whole runs of cases with another number, on the same mesh."""
+"""Gradients by keys of a case against differences of whole runs of cases with another number, on
+the same mesh.
+"""
 
 from collections.abc import Sequence
 from functools import cache
@@ -58,7 +60,9 @@ BUCKLED = """
 magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
 loading: {kind: pressure, until: limit}
 """
-SEALED = STATE.replace("depth: 0.1 mm, points: 1}", "depth: 0.1 mm, points: 1, hold: {pressure: conjugate}}")
+SEALED = STATE.replace(
+    "depth: 0.1 mm, points: 1}", "depth: 0.1 mm, points: 1, hold: {pressure: conjugate}}"
+)
 GAS = SEALED.replace("pressure: conjugate", "pressure: {gas: {ambient: 100 Pa}}")
 AGAIN = "  - {kind: field, factor: 1.5, points: 1, hold: {pressure: HELD, force: conjugate}}\nreactions: true\n"
 CHAIN = SEALED.replace("reactions: true\n", AGAIN.replace("HELD", "conjugate"))
@@ -145,12 +149,15 @@ def given(name: str) -> tuple[tuple[Scene, list[Record], History], dict[str, Adj
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KEYS)
 def test_numbers(name: str) -> None:
-    """Imperfections in both kinds of units, targets with units, stiffnesses of parts, and bodies follow their numbers.
+    """Imperfections in both kinds of units, targets with units, stiffnesses of parts, and bodies
+    follow their numbers.
 
     All change together, each by its own part.
     """
     (scene, *_), found = given(name)
-    values = {key: 1.0 if key == FIELD else number_of(scene.problem.context, key) for key in KEYS[name]}
+    values = {
+        key: 1.0 if key == FIELD else number_of(scene.problem.context, key) for key in KEYS[name]
+    }
     parts = dict(zip(values, (1.0, -0.7, 0.5, 1.3), strict=False))
     results = dict[int, dict[str, float]]()
     for way in (-1, 1):
@@ -158,7 +165,9 @@ def test_numbers(name: str) -> None:
         for key, unit in KEYS[name].items():
             number = values[key] * (1 + way * parts[key] * STEP) / si_size(unit)
             quoted = unit or key == FIELD
-            settings.append(f'{key}="{number!r}{" " * bool(unit)}{unit}"' if quoted else f"{key}={number!r}")
+            settings.append(
+                f'{key}="{number!r}{" " * bool(unit)}{unit}"' if quoted else f"{key}={number!r}"
+            )
         ran = run(Scene(on_mesh_of(scene, case_of(name, settings).problem()), scene.comm))
         results[way] = {of: adjoint(ran, of).shown for of in found}
     for of, each in found.items():
@@ -175,9 +184,14 @@ def test_numbers(name: str) -> None:
 @pytest.mark.slow
 def test_frequencies_where_a_body_touches() -> None:
     """They have no gradient there; where the body is apart they have one."""
-    apart = ["bodies.ball={kind: sphere, radius: 8 mm, position: [0, 0, 40 mm]}", "loading=[{kind: field, points: 1}]"]
+    apart = [
+        "bodies.ball={kind: sphere, radius: 8 mm, position: [0, 0, 40 mm]}",
+        "loading=[{kind: field, points: 1}]",
+    ]
     ran = {settings: run(Scene(case_of("pressed", settings))) for settings in ((), tuple(apart))}
-    with pytest.raises(CaseError, match=r"omega2_1: has no gradient where a body touches the shell \(ball\)"):
+    with pytest.raises(
+        CaseError, match=r"omega2_1: has no gradient where a body touches the shell \(ball\)"
+    ):
         adjoint(ran[()], "omega2_1")
     assert adjoint(ran[tuple(apart)], "omega2_1").value > 0
 
@@ -188,7 +202,9 @@ def test_a_conjugate_held_beside_a_body() -> None:
     pressed = "{kind: pressure, control: load, until: target, pressure: 20 Pa, points: 1}"
     steps = f"[{pressed}, {{kind: contact, approach: 0.3 mm, points: 1, hold: {{pressure: conjugate}}}}]"
     of_volume = adjoint(run(Scene(case_of("pressed", [f"loading={steps}"]))), "A_uz")
-    with pytest.raises(CaseError, match=r"shell\.poisson_ratio: has no derivative where a conjugate is held beside"):
+    with pytest.raises(
+        CaseError, match=r"shell\.poisson_ratio: has no derivative where a conjugate is held beside"
+    ):
         derivative(of_volume, "shell.poisson_ratio")
     assert derivative(of_volume, "bodies.ball.radius") != 0
 

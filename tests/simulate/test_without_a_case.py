@@ -1,6 +1,8 @@
-"""Problems without a case file, on meshes of dolfinx: the numbers of a case, fields as functions, displacements as one.
+"""Problems without a case file, on meshes of dolfinx: the numbers of a case, fields as functions,
+displacements as one.
 
-A function that a formula equals gives the numbers of the formula, a mesh those of the same mesh in a file.
+A function that a formula equals gives the numbers of the formula, a mesh those of the same mesh in
+a file.
 """
 
 import re
@@ -35,12 +37,16 @@ HOWTO = CASES.parent / "docs/howto.md"
 
 @pytest.fixture(scope="module")
 def dome(tmp_path_factory: pytest.TempPathFactory) -> tuple[mesh.Mesh, mesh.MeshTags, Path]:
-    """A coarse hemisphere of quadratic triangles, in mm, with the tag 2 of its rim; and the same as a file."""
+    """A coarse hemisphere of quadratic triangles, in mm, with the tag 2 of its rim; and the same as
+    a file.
+    """
     file = tmp_path_factory.mktemp("dome") / "dome.msh"
     gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.occ.addSphere(0, 0, 0, R, angle1=0)
-    gmsh.model.occ.remove([(3, 1), (2, 2)])  # left is the surface 1; dolfinx 0.11 wants all of a mesh tagged
+    gmsh.model.occ.remove(
+        [(3, 1), (2, 2)]
+    )  # left is the surface 1; dolfinx 0.11 wants all of a mesh tagged
     gmsh.model.occ.synchronize()
     rim = gmsh.model.getEntitiesInBoundingBox(-26, -26, -0.1, 26, 26, 0.1, dim=1)
     gmsh.model.addPhysicalGroup(2, [1], 1, name="all")
@@ -65,11 +71,19 @@ def shell(dome: Dome, **keys: Any) -> ms.Shell:
 
 def path(dome: Dome, *parts: Any, **keys: Any) -> list[dict[str, float]]:
     """What is observed along a pressure that grows."""
-    scene = ms.Scene(ms.Problem(shell(dome, **keys), ms.Clamped("rim"), *parts, PRESSED), MPI.COMM_SELF)
+    scene = ms.Scene(
+        ms.Problem(shell(dome, **keys), ms.Clamped("rim"), *parts, PRESSED), MPI.COMM_SELF
+    )
     return [scene.observe(record.point.state) for record in ms.follow(scene)]
 
 
-def close(found: list[dict[str, float]], wanted: list[dict[str, float]], *, but: str = "", rel: float = 1e-9) -> None:
+def close(
+    found: list[dict[str, float]],
+    wanted: list[dict[str, float]],
+    *,
+    but: str = "",
+    rel: float = 1e-9,
+) -> None:
     assert len(found) == len(wanted)
     for one, other in zip(found, wanted, strict=True):
         assert {k: v for k, v in one.items() if k != but} == pytest.approx(
@@ -89,7 +103,13 @@ def test_numbers_of_the_case_on_the_same_mesh(dome: Dome) -> None:
         "shell": {"geometry": "mesh", "file": str(dome[2]), "radius": "25 mm", **MATERIAL},
         "boundary": {"rim": "clamped"},
         "symmetry": "none",
-        "loading": {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.2, "points": 1},
+        "loading": {
+            "kind": "pressure",
+            "control": "load",
+            "until": "target",
+            "pressure": 0.2,
+            "points": 1,
+        },
     }
     scene = ms.Scene(case, MPI.COMM_SELF)
     close(path(dome), [scene.observe(record.point.state) for record in ms.follow(scene)])
@@ -98,33 +118,52 @@ def test_numbers_of_the_case_on_the_same_mesh(dome: Dome) -> None:
 def test_a_shape_in_place_of_a_mesh() -> None:
     of_case = ms.Scene(CASES / "dimple_buckling.yaml")
     hemisphere = ms.Case.load(CASES / "dimple_buckling.yaml").shell
-    keys = {key: value for key, value in hemisphere.model_dump(exclude_unset=True).items() if key != "geometry"}
-    problem = ms.Problem(ms.Shell("hemisphere", **keys), ms.Clamped("equator"), ms.Pressure(until="limit"))
+    keys = {
+        key: value
+        for key, value in hemisphere.model_dump(exclude_unset=True).items()
+        if key != "geometry"
+    }
+    problem = ms.Problem(
+        ms.Shell("hemisphere", **keys), ms.Clamped("equator"), ms.Pressure(until="limit")
+    )
     *_, fold = ms.follow(problem)
     *_, wanted = ms.follow(of_case)
     assert problem.axisymmetric
-    assert fold.point.state.mu["pressure"] == pytest.approx(wanted.point.state.mu["pressure"], rel=1e-9)
+    assert fold.point.state.mu["pressure"] == pytest.approx(
+        wanted.point.state.mu["pressure"], rel=1e-9
+    )
 
 
 def test_thickness_as_a_function(dome: Dome) -> None:
     quadratic = function(dome, ("Lagrange", 2), lambda x: 1 + 0.2 * x[0] / R + 0.1 * x[1] / R)
     close(path(dome, thickness_factor=quadratic), path(dome, thickness_factor="1 + 0.2*x + 0.1*y"))
-    close(path(dome, thickness_factor=function(dome, ("DG", 0), lambda x: 1 + 0 * x[0])), path(dome))
+    close(
+        path(dome, thickness_factor=function(dome, ("DG", 0), lambda x: 1 + 0 * x[0])), path(dome)
+    )
 
 
 def test_a_thickness_that_is_negative_between_the_nodes_of_the_displacement(dome: Dome) -> None:
     """Quadratic in each triangle, one at its vertices and less than zero at the middle of a side."""
     thin = function(dome, ("DG", 2), lambda x: 1 + 0 * x[0])
     thin.x.array[3::6] = -0.02
-    with pytest.raises(MeshError, match=r"shell\.thickness_factor: is not within 0\.001 to 1000 at"):
-        ms.Scene(ms.Problem(shell(dome, thickness_factor=thin), ms.Clamped("rim"), degree=3), MPI.COMM_SELF)
+    with pytest.raises(
+        MeshError, match=r"shell\.thickness_factor: is not within 0\.001 to 1000 at"
+    ):
+        ms.Scene(
+            ms.Problem(shell(dome, thickness_factor=thin), ms.Clamped("rim"), degree=3),
+            MPI.COMM_SELF,
+        )
 
 
 def test_remanence_as_a_function(dome: Dome) -> None:
-    remanent = function(dome, ("DG", 2, (3,)), lambda x: 0.06 * np.stack([x[1] / R, 0 * x[0], 1 + x[0] / R]))
+    remanent = function(
+        dome, ("DG", 2, (3,)), lambda x: 0.06 * np.stack([x[1] / R, 0 * x[0], 1 + x[0] / R])
+    )
     formulas = ["0.06*y", "0", "0.06*(1 + x)"]
     found, wanted = (path(dome, ms.Field(Br, [0, 0, -0.02])) for Br in (remanent, formulas))
-    close(found, wanted, but="lambda_m", rel=1e-8)  # lambda_m counts from another size of the remanence
+    close(
+        found, wanted, but="lambda_m", rel=1e-8
+    )  # lambda_m counts from another size of the remanence
 
 
 @pytest.mark.slow
@@ -132,8 +171,15 @@ def test_natural_curvature_as_a_function(dome: Dome) -> None:
     bent = function(dome, ("Lagrange", 2), lambda x: 3 * (1 + x[0] / R))
     formula = f"3*(1 + x/{R * 1e-3})"
     close(*(path(dome, ms.Section("natural", curvature=k)) for k in (bent, formula)))
-    along = function(dome, ("Lagrange", 1, (3,)), lambda x: np.stack([3 + 0 * x[0], 1 + 0 * x[0], 0 * x[0]]))
-    close(*(path(dome, ms.Section("natural", curvature=k, along=[1, 0, 0])) for k in (along, [3.0, 1.0, 0.0])))
+    along = function(
+        dome, ("Lagrange", 1, (3,)), lambda x: np.stack([3 + 0 * x[0], 1 + 0 * x[0], 0 * x[0]])
+    )
+    close(
+        *(
+            path(dome, ms.Section("natural", curvature=k, along=[1, 0, 0]))
+            for k in (along, [3.0, 1.0, 0.0])
+        )
+    )
 
 
 @pytest.mark.slow
@@ -154,9 +200,15 @@ def test_own_energies_with_functions(dome: Dome) -> None:
     found = path(dome, ms.OwnTerm("bed", bed, (k,), value=0.01, observed={"held": bed}))
     close(found, path(dome, ms.OwnTerm("bed", same_bed, value=0.01, observed={"held": same_bed})))
     assert found[-1]["held"] > 0
-    f = function(dome, ("Lagrange", 2, (3,)), lambda x: np.stack([0 * x[0], x[0] / R, 1 + x[1] / R]))
-    close(*(path(dome, ms.OwnTerm("shove", *of, value=1e-4)) for of in ((shove, (f,)), (same_shove,))))
-    nonlinear = function(dome, ("Lagrange", 5), lambda x: np.exp(x[0] / R))  # above the degree of the displacement
+    f = function(
+        dome, ("Lagrange", 2, (3,)), lambda x: np.stack([0 * x[0], x[0] / R, 1 + x[1] / R])
+    )
+    close(
+        *(path(dome, ms.OwnTerm("shove", *of, value=1e-4)) for of in ((shove, (f,)), (same_shove,)))
+    )
+    nonlinear = function(
+        dome, ("Lagrange", 5), lambda x: np.exp(x[0] / R)
+    )  # above the degree of the displacement
     assert ms.OwnTerm("bed", bed, (nonlinear,)).digest
 
 
@@ -191,9 +243,21 @@ def flat(cell: str, dimension: int = 3) -> mesh.Mesh:
 @pytest.mark.parametrize(
     ("domain", "keys", "said"),
     [
-        (flat("quadrilateral"), {}, "mesh: its cells are of the kind quadrilateral; a mid-surface has triangles"),
-        (flat("triangle", 2), {}, "mesh: its nodes have 2 coordinates; a mid-surface is in space: gdim=3"),
-        (flat("triangle"), {"edges": {"rim": 1}}, "edges.rim: 1: is a value of tags: give facet_tags"),
+        (
+            flat("quadrilateral"),
+            {},
+            "mesh: its cells are of the kind quadrilateral; a mid-surface has triangles",
+        ),
+        (
+            flat("triangle", 2),
+            {},
+            "mesh: its nodes have 2 coordinates; a mid-surface is in space: gdim=3",
+        ),
+        (
+            flat("triangle"),
+            {"edges": {"rim": 1}},
+            "edges.rim: 1: is a value of tags: give facet_tags",
+        ),
     ],
 )
 def test_other_meshes_are_refused(domain: mesh.Mesh, keys: Mapping[str, Any], said: str) -> None:
@@ -205,20 +269,38 @@ def test_what_does_not_fit_is_refused(dome: Dome) -> None:
     domain, facet_tags, _ = dome
     with pytest.raises(MeshError, match=r"edges\.rim: 7: facet_tags have no such value, only 2"):
         ms.Shell(domain, edges={"rim": 7}, facet_tags=facet_tags, **MATERIAL)
-    with pytest.raises(MeshError, match=r"shell: the surface ends at the edge .* belongs to no physical curve"):
+    with pytest.raises(
+        MeshError, match=r"shell: the surface ends at the edge .* belongs to no physical curve"
+    ):
         ms.Problem(ms.Shell(domain, **MATERIAL), PRESSED).triangulated()
     elsewhere = fem.Function(fem.functionspace(flat("triangle"), ("Lagrange", 1)))
-    with pytest.raises(MeshError, match=r"shell.thickness_factor: is a function on another mesh than that"):
+    with pytest.raises(
+        MeshError, match=r"shell.thickness_factor: is a function on another mesh than that"
+    ):
         ms.Problem(shell(dome, thickness_factor=elsewhere), ms.Clamped("rim"))
-    with pytest.raises(MeshError, match=r"is a function of Basix element \(N1E.*; allowed are Lagrange and DG"):
-        ms.Problem(shell(dome), ms.Field(fem.Function(fem.functionspace(domain, ("N1curl", 1))), [0, 0, 1]))
+    with pytest.raises(
+        MeshError, match=r"is a function of Basix element \(N1E.*; allowed are Lagrange and DG"
+    ):
+        ms.Problem(
+            shell(dome), ms.Field(fem.Function(fem.functionspace(domain, ("N1curl", 1))), [0, 0, 1])
+        )
     fine = function(dome, ("Lagrange", 5), lambda x: 1 + 0 * x[0])
-    with pytest.raises(MeshError, match=r"thickness_factor: is a function of degree 5; allowed is at most .* 4"):
+    with pytest.raises(
+        MeshError, match=r"thickness_factor: is a function of degree 5; allowed is at most .* 4"
+    ):
         ms.Scene(ms.Problem(shell(dome, thickness_factor=fine), ms.Clamped("rim")), MPI.COMM_SELF)
     with pytest.raises(ms.CaseError, match="is a function; that needs a shell on a dolfinx mesh"):
-        ms.Problem(ms.Shell("hemisphere", radius_to_thickness=50, poisson_ratio=0.3, thickness_factor=elsewhere))
-    with pytest.raises(ms.CaseError, match=r"Problem: shell.poisson_ratio: 0.7: must be less than or equal to 0.5"):
-        ms.Problem(ms.Shell("hemisphere", radius_to_thickness=50, poisson_ratio=0.7), ms.Clamped("equator"))
+        ms.Problem(
+            ms.Shell(
+                "hemisphere", radius_to_thickness=50, poisson_ratio=0.3, thickness_factor=elsewhere
+            )
+        )
+    with pytest.raises(
+        ms.CaseError, match=r"Problem: shell.poisson_ratio: 0.7: must be less than or equal to 0.5"
+    ):
+        ms.Problem(
+            ms.Shell("hemisphere", radius_to_thickness=50, poisson_ratio=0.7), ms.Clamped("equator")
+        )
     with pytest.raises(ms.CaseError, match=r"Problem: 'rim': allowed are what ms.Clamped"):
         ms.Problem(shell(dome), "rim")  # type: ignore[arg-type]
     term = ms.OwnTerm("bed", lambda r0, u, k: k * ufl.dot(u.r, u.r), (elsewhere,))
@@ -235,12 +317,21 @@ def cap(*parts: Any, **sections: Any) -> Any:
 @pytest.mark.parametrize(
     ("written", "said"),
     [
-        (lambda: ms.Shell("cap", thicknes=0.1), "Problem: shell.thicknes: unknown key; did you mean thickness?"),
-        (lambda: ms.Shell("strip", widht=0.1), "Problem: shell.widht: unknown key; did you mean width?"),
+        (
+            lambda: ms.Shell("cap", thicknes=0.1),
+            "Problem: shell.thicknes: unknown key; did you mean thickness?",
+        ),
+        (
+            lambda: ms.Shell("strip", widht=0.1),
+            "Problem: shell.widht: unknown key; did you mean width?",
+        ),
         (lambda: ms.Shell("hemisfere"), "unknown geometry; did you mean hemisphere?"),
         (lambda: ms.Step("indentaton"), "unknown kind of step; did you mean indentation?"),
         (lambda: ms.Pressure(pint=3), "Problem: loading.pint: unknown key; did you mean points?"),
-        (lambda: ms.Force("tip", dept=3), "Problem: loading.dept: unknown key; did you mean depth?"),
+        (
+            lambda: ms.Force("tip", dept=3),
+            "Problem: loading.dept: unknown key; did you mean depth?",
+        ),
         (lambda: ms.Section("fundation", stiffness=1), "unknown section; did you mean foundation?"),
         (lambda: ms.Section("foundation", stifness=1), "unknown key; did you mean stiffness?"),
     ],
@@ -256,9 +347,21 @@ def test_what_is_given_twice_is_refused() -> None:
     field = ms.Field([0, 0, 1], [1, 0, 0], lambda_m=1e-3)
     twice = [
         ((ms.Hinged("rim"),), {}, "boundary.rim: is given twice, as clamped and as hinged"),
-        ((field, ms.Field([0, 0, 1], [1, 0, 0], lambda_m=2e-3)), {}, "magnetic.lambda_m: is given twice, as 0.001 and"),
-        ((ms.Section("shell", poisson_ratio=0.4),), {}, "shell.poisson_ratio: is given twice, as 0.3 and as 0.4"),
-        ((ms.Pressure(),), {"loading": {"kind": "pressure"}}, "loading: is given twice, as steps and as a section"),
+        (
+            (field, ms.Field([0, 0, 1], [1, 0, 0], lambda_m=2e-3)),
+            {},
+            "magnetic.lambda_m: is given twice, as 0.001 and",
+        ),
+        (
+            (ms.Section("shell", poisson_ratio=0.4),),
+            {},
+            "shell.poisson_ratio: is given twice, as 0.3 and as 0.4",
+        ),
+        (
+            (ms.Pressure(),),
+            {"loading": {"kind": "pressure"}},
+            "loading: is given twice, as steps and as a section",
+        ),
         ((), {"degree": 3, "mesh": {"degree": 4}}, "mesh.degree: is given twice, as 4 and as 3"),
         ((), {"degree": 3, "mesh": 1}, "mesh: 1: must be a section, with keys below it"),
     ]
@@ -272,7 +375,9 @@ def test_a_vector_that_is_zero_has_no_direction() -> None:
     """With `lambda_m` vectors are over their magnitudes: zero is no field, and not one along e3."""
 
     def pulled(remanent: Any, applied: Any) -> float:
-        *_, record = ms.follow(cap(ms.Field(remanent, applied, lambda_m=1e-3), ms.Step("field", points=1)))
+        *_, record = ms.follow(
+            cap(ms.Field(remanent, applied, lambda_m=1e-3), ms.Step("field", points=1))
+        )
         return float(np.abs(record.point.state.u).max())
 
     assert pulled([0, 0, 1], [0, 0, 1]) > 1e-4
@@ -282,17 +387,26 @@ def test_a_vector_that_is_zero_has_no_direction() -> None:
 
 def test_what_is_no_vector_and_no_shell(dome: Dome) -> None:
     for vector in (1.0, None, [0, 1], np.eye(3)):
-        with pytest.raises(ms.CaseError, match=r"^Problem: magnetic\.remanent: .*: a vector has three|numbers or form"):
+        with pytest.raises(
+            ms.CaseError,
+            match=r"^Problem: magnetic\.remanent: .*: a vector has three|numbers or form",
+        ):
             cap(ms.Field(vector, [0, 0, 1], lambda_m=1e-3))
     with pytest.raises(ms.CaseError, match=r"magnetic\.lambda_m: 'abc': must be a valid number"):
         cap(ms.Field([0, 0, 1], [0, 0, 1], lambda_m="abc"))  # type: ignore[arg-type]
     with pytest.raises(ms.CaseError, match=r"the first argument is what ms\.Shell gives"):
         ms.Problem(dome[0], ms.Clamped("rim"))  # type: ignore[arg-type]
-    with pytest.raises(ms.CaseError, match=r"shell\.geometry: the surface is the mesh; leave it out"):
+    with pytest.raises(
+        ms.CaseError, match=r"shell\.geometry: the surface is the mesh; leave it out"
+    ):
         shell(dome, geometry="disc")
     one = function(dome, ("Lagrange", 1), lambda x: 1 + 0 * x[0])
-    with pytest.raises(ms.CaseError, match=r"^Problem: foundation\.factor: a function on the mesh: must be"):
-        ms.Problem(shell(dome), ms.Clamped("rim"), ms.Section("foundation", stiffness=1.0, factor=one))
+    with pytest.raises(
+        ms.CaseError, match=r"^Problem: foundation\.factor: a function on the mesh: must be"
+    ):
+        ms.Problem(
+            shell(dome), ms.Clamped("rim"), ms.Section("foundation", stiffness=1.0, factor=one)
+        )
 
 
 def test_terms_whose_value_is_none() -> None:
@@ -309,7 +423,9 @@ def test_terms_whose_value_is_none() -> None:
 
 def folds(folder: Path, ranks: int) -> tuple[float, float]:
     """Pressure at the fold and integral of |u|^2 there, of the program in howto.md."""
-    (program,) = re.findall(r"```python\n(import gmsh\n.*?)```", HOWTO.read_text("utf-8"), re.DOTALL)
+    (program,) = re.findall(
+        r"```python\n(import gmsh\n.*?)```", HOWTO.read_text("utf-8"), re.DOTALL
+    )
     assert program.count("\n") <= 30
     program += """
 from dolfinx.fem import assemble_scalar, form
@@ -319,7 +435,9 @@ if comm.rank == 0:
 """
     (folder / "program.py").write_text(program, "utf-8")
     command = [*(mpirun(ranks) if ranks > 1 else []), sys.executable, "program.py"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=600)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, timeout=600
+    )
     assert done.returncode == 0, done.stderr
     assert (folder / "fold.bp").exists()
     (found,) = re.findall(r"fold at fold (\S+) (\S+)", done.stdout)
@@ -350,7 +468,13 @@ def test_the_program_of_the_howto_on_one_and_two_ranks(tmp_path: Path) -> None:
 def test_a_mesh_in_mm_is_not_in_metres(dome: Dome, sizes: dict[str, Any], message: str) -> None:
     """The dome is 50 wide; only its unit says of what."""
     domain, facet_tags, _ = dome
-    keys = {"edges": {"rim": 2}, "facet_tags": facet_tags, "youngs_modulus": "1 MPa", "poisson_ratio": 0.4, **sizes}
+    keys = {
+        "edges": {"rim": 2},
+        "facet_tags": facet_tags,
+        "youngs_modulus": "1 MPa",
+        "poisson_ratio": 0.4,
+        **sizes,
+    }
     if not message:
         ms.Shell(domain, **keys)
         return

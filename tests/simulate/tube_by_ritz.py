@@ -1,8 +1,9 @@
-"""A clamped tube under live pressure by Ritz's method, and Koiter's b of its lowest mode: of no finite elements.
+"""A clamped tube under live pressure by Ritz's method, and Koiter's b of its lowest mode: of no
+finite elements.
 
-Displacements are Legendre polynomials along the tube, held at both ends, times the harmonics 0, m and 2 m around it.
-The energy is Koiter's, of the exact strains and changes of curvature; the pressure works on the enclosed volume.
-Lengths are over R, stresses over E.
+Displacements are Legendre polynomials along the tube, held at both ends, times the harmonics 0, m
+and 2 m around it. The energy is Koiter's, of the exact strains and changes of curvature; the
+pressure works on the enclosed volume. Lengths are over R, stresses over E.
 """
 
 from itertools import pairwise
@@ -25,7 +26,11 @@ class Tube:
         t = 2 * np.pi / m * np.arange(AROUND) / AROUND
         self.weight = np.outer(weights * length / 2, np.full(AROUND, 1 / AROUND)).ravel()
         self.h, self.nu, self.size = h, nu, 1 / (1 - nu**2)
-        x, one, none = np.repeat(s * length / 2, AROUND), np.ones(len(s) * AROUND), np.zeros(len(s) * AROUND)
+        x, one, none = (
+            np.repeat(s * length / 2, AROUND),
+            np.ones(len(s) * AROUND),
+            np.zeros(len(s) * AROUND),
+        )
         self.const = {
             "r": np.array([x, none, one]),
             "x": np.array([one, none, none]),
@@ -36,16 +41,30 @@ class Tube:
         }
         columns, self.harmonic = list[dict[str, Array]](), list[int]()
         for k in (0, 1, 2):
-            for axis, power, odd in ((0, 1, 1), (1, 1, 0), (2, 2, 0)):  # u, v, w in the frame e_x, e_theta, e_r
+            for axis, power, odd in (
+                (0, 1, 1),
+                (1, 1, 0),
+                (2, 2, 0),
+            ):  # u, v, w in the frame e_x, e_theta, e_r
                 if k or axis != 1:
                     phase = np.pi / 2 * (axis == 1)
-                    waves = [(k * m) ** d * np.cos(k * m * t - phase + d * np.pi / 2) for d in range(3)]
+                    waves = [
+                        (k * m) ** d * np.cos(k * m * t - phase + d * np.pi / 2) for d in range(3)
+                    ]
                     for i in range(count):
-                        of_s = Legendre([1.0]) * Legendre.fromroots([-1, 1]) ** power * Legendre.basis(2 * i + odd)
-                        along = [of_s.deriv(d)(s) * (2 / length) ** d if d else of_s(s) for d in range(3)]
+                        of_s = (
+                            Legendre([1.0])
+                            * Legendre.fromroots([-1, 1]) ** power
+                            * Legendre.basis(2 * i + odd)
+                        )
+                        along = [
+                            of_s.deriv(d)(s) * (2 / length) ** d if d else of_s(s) for d in range(3)
+                        ]
                         columns.append(_derivatives(axis, along, waves))
                         self.harmonic.append(k)
-        self.linear = {name: np.stack([each[name] for each in columns], axis=2) for name in self.const}
+        self.linear = {
+            name: np.stack([each[name] for each in columns], axis=2) for name in self.const
+        }
 
     def at(self, q: Array) -> dict[str, Array]:
         return {name: self.const[name] + self.linear[name] @ q for name in self.const}
@@ -89,11 +108,16 @@ class Tube:
         return [e[0] + self.nu * e[1], e[1] + self.nu * e[0], 2 * (1 - self.nu) * e[2]]
 
     def _sum(self, e: list[Array], slopes: list[Array]) -> Array:
-        return np.sum([(self.weight * n) @ each for n, each in zip(self._stress(e), slopes, strict=True)], axis=0)
+        return np.sum(
+            [(self.weight * n) @ each for n, each in zip(self._stress(e), slopes, strict=True)],
+            axis=0,
+        )
 
     def _squared(self, slopes: list[Array]) -> Array:
         stress = self._stress(slopes)
-        return np.sum([(self.weight[:, None] * a).T @ b for a, b in zip(slopes, stress, strict=True)], axis=0)
+        return np.sum(
+            [(self.weight[:, None] * a).T @ b for a, b in zip(slopes, stress, strict=True)], axis=0
+        )
 
 
 def _derivatives(axis: int, along: list[Array], waves: list[Array]) -> dict[str, Array]:
@@ -121,7 +145,9 @@ def _dot(a: Array, A: Array) -> Array:
     return np.einsum("ap,apn->pn", a, A, optimize=True)
 
 
-def _determinant(f: dict[str, Array], A: dict[str, Array], names: tuple[str, str, str]) -> tuple[Array, Array]:
+def _determinant(
+    f: dict[str, Array], A: dict[str, Array], names: tuple[str, str, str]
+) -> tuple[Array, Array]:
     """a . (b x c) and its slopes."""
     a, b, c = names
     parts = ((a, b, c), (b, c, a), (c, a, b))
@@ -129,21 +155,27 @@ def _determinant(f: dict[str, Array], A: dict[str, Array], names: tuple[str, str
     return np.sum(f[a] * np.cross(f[b], f[c], axis=0), axis=0), slopes
 
 
-def _bent(f: dict[str, Array], A: dict[str, Array], names: tuple[str, str, str], weight: Array) -> Array:
+def _bent(
+    f: dict[str, Array], A: dict[str, Array], names: tuple[str, str, str], weight: Array
+) -> Array:
     """The second derivative of a . (b x c), summed with weights."""
     a, b, c = names
     found = 0.0
     for x, y, z in ((a, b, c), (b, c, a), (c, a, b)):
-        M = np.einsum("p,apn,apm->nm", weight, A[x], np.cross(A[y], f[z][:, :, None], axis=0), optimize=True)
+        M = np.einsum(
+            "p,apn,apm->nm", weight, A[x], np.cross(A[y], f[z][:, :, None], axis=0), optimize=True
+        )
         found = found + M + M.T
     return np.asarray(found)
 
 
 def koiter(h: float, length: float, nu: float, m: int, count: int = 6) -> tuple[float, float]:
-    """The pressure p_c at which m waves bifurcate, and b of p/p_c = 1 + b (w/h)^2 with their height w.
+    """The pressure p_c at which m waves bifurcate, and b of p/p_c = 1 + b (w/h)^2 with their height
+    w.
 
-    On the branch q0(p) + x phi + x^2 q2 with P2 q2 = -P3 phi^2/2 and the n-th derivatives Pn of the energy, it is
-    b p_c = -(P4 phi^4/6 + P3 phi^2 q2)/(d(P2 phi^2)/dp) (Budiansky, Adv. Appl. Mech. 14, 1974).
+    On the branch q0(p) + x phi + x^2 q2 with P2 q2 = -P3 phi^2/2 and the n-th derivatives Pn of the
+    energy, it is b p_c = -(P4 phi^4/6 + P3 phi^2 q2)/(d(P2 phi^2)/dp) (Budiansky, Adv. Appl. Mech.
+    14, 1974).
     """
     tube = Tube(h, length, nu, m, count)
     harmonic = np.array(tube.harmonic)

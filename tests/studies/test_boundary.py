@@ -1,4 +1,6 @@
-"""Boundaries of stability: a shallow arch against its closed form and against runs, resume, and what is refused."""
+"""Boundaries of stability: a shallow arch against its closed form and against runs, resume, and
+what is refused.
+"""
 
 import atexit
 import csv
@@ -24,12 +26,16 @@ from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
 
 
 def coarse() -> Path:
-    """The case "arch_boundary.yaml" with larger elements, in a folder that is removed as the process ends."""
+    """The case "arch_boundary.yaml" with larger elements, in a folder that is removed as the
+    process ends.
+    """
     folder = Path(tempfile.mkdtemp(prefix="arch"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     text = (CASES / "arch_boundary.yaml").read_text(encoding="utf-8")
     assert text.count("size: 0.05") == 1
-    (folder / "arch_boundary.yaml").write_text(text.replace("size: 0.05", "size: 0.1"), encoding="utf-8")
+    (folder / "arch_boundary.yaml").write_text(
+        text.replace("size: 0.05", "size: 0.1"), encoding="utf-8"
+    )
     return folder / "arch_boundary.yaml"
 
 
@@ -45,11 +51,22 @@ def folds(*settings: str) -> list[float]:
 
 
 def test_snapping_begins_at_a_rise_of_one(tmp_path: Path) -> None:
-    """Fung and Kaplan (NACA TN 2840): folds at a load of 2 e -+ 4 ((e^2 - 1)/3)^(3/2), here for a/h = 1/100.
+    """Fung and Kaplan (NACA TN 2840): folds at a load of 2 e -+ 4 ((e^2 - 1)/3)^(3/2), here for a/h
+    = 1/100.
 
-    In the unknown a of the first sine the load is 2 (e - a) + 2 a (e^2 - a^2), stationary at 3 a^2 = e^2 - 1.
+    In the unknown a of the first sine the load is 2 (e - a) + 2 a (e^2 - a^2), stationary at 3 a^2
+    = e^2 - 1.
     """
-    done = magshell("boundary", ARCH, "--over", f"{KEY}=0.7:1.3:4", "--set", f"{KEY}=1.2", "--out", tmp_path / "b")
+    done = magshell(
+        "boundary",
+        ARCH,
+        "--over",
+        f"{KEY}=0.7:1.3:4",
+        "--set",
+        f"{KEY}=1.2",
+        "--out",
+        tmp_path / "b",
+    )
     assert done.returncode == 0, done.stderr
     assert "a cusp, where two folds are born" in done.stdout
     rows = list(csv.DictReader((tmp_path / "b" / "boundary.csv").open()))
@@ -86,12 +103,17 @@ def test_a_number_of_the_shape(tmp_path: Path) -> None:
     fixed = [f"{KEY}=1"]
     found = ms.boundary(ARCH, f"{key}=0.75:0.85:2", [*fixed, f"{key}=0.8"], tmp_path / "b")
     for row in (found.rows[0], found.rows[-1]):
-        assert min(abs(load - row["load"]) for load in folds(*fixed, f"{key}={row['key']!r}")) < 1e-7 * row["load"]
+        assert (
+            min(abs(load - row["load"]) for load in folds(*fixed, f"{key}={row['key']!r}"))
+            < 1e-7 * row["load"]
+        )
 
 
 @pytest.mark.slow
 def test_a_caps_fold_vanishes_with_the_order_three_halves(tmp_path: Path) -> None:
-    """Over its depth: the cusp is the same from two starts to 1e-6, and beyond it both loads differ by c d^(3/2)."""
+    """Over its depth: the cusp is the same from two starts to 1e-6, and beyond it both loads differ
+    by c d^(3/2).
+    """
     case = tmp_path / "cap.yaml"
     case.write_text(
         "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 12, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
@@ -112,10 +134,15 @@ def test_a_caps_fold_vanishes_with_the_order_three_halves(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_higher_arches_buckle_to_one_side(tmp_path: Path) -> None:
-    """Before the fold from sqrt(5.5) on; that boundary turns at 2, both in the limit of shallow arches."""
+    """Before the fold from sqrt(5.5) on; that boundary turns at 2, both in the limit of shallow
+    arches.
+    """
     found = ms.boundary(ARCH, f"{KEY}=1.8:2.7:8", [f"{KEY}=2.6"], tmp_path / "b")
     assert found.content["kind"] == "bifurcation"
-    places = {kind: [row["key"] for row in found.special if row["kind"] == kind] for kind in ("meeting", "turn")}
+    places = {
+        kind: [row["key"] for row in found.special if row["kind"] == kind]
+        for kind in ("meeting", "turn")
+    }
     assert places["turn"] == pytest.approx([2.0], rel=1e-3)
     assert places["meeting"] == pytest.approx(2 * [np.sqrt(5.5)], rel=1e-3)
     assert found.rows[-1]["unstable"] == 0
@@ -136,11 +163,17 @@ def test_a_mode_has_one_name_in_both_files(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
-    """The symmetric fold beyond the bifurcation, which the case alone does not start from, by its closed form."""
+    """The symmetric fold beyond the bifurcation, which the case alone does not start from, by its
+    closed form.
+    """
     run, onward = tmp_path / "run", ["loading.1.until=points", "loading.1.points=40", f"{KEY}=2.6"]
     words = [word for setting in onward for word in ("--set", setting)]
     assert magshell("run", ARCH, *words, "--out", run, "--no-pictures").returncode == 0
-    located = {row["label"]: row["point"] for row in read_path(run) if row["label"] in ("fold", "bifurcation")}
+    located = {
+        row["label"]: row["point"]
+        for row in read_path(run)
+        if row["label"] in ("fold", "bifurcation")
+    }
     over = ["boundary", ARCH, "--over", f"{KEY}=2.4:2.7:2", "--out", tmp_path / "b"]
     done = magshell(*over, "--from", f"{run}:{located['fold']}")
     assert done.returncode == 0, done.stderr
@@ -149,22 +182,35 @@ def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
     for row in rows:
         rise = float(row["key"])
         assert row["kind"] == "fold"
-        assert float(row["load"]) == pytest.approx(2 * rise + 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3)
-    other = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", out=tmp_path / "c", start=f"{run}:{located['bifurcation']}")
+        assert float(row["load"]) == pytest.approx(
+            2 * rise + 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3
+        )
+    other = ms.boundary(
+        ARCH, f"{KEY}=2.6:2.7:1", out=tmp_path / "c", start=f"{run}:{located['bifurcation']}"
+    )
     alone = ms.boundary(ARCH, f"{KEY}=2.6:2.7:1", [f"{KEY}=2.6"], out=tmp_path / "d")
-    assert [row["load"] for row in other.rows] == pytest.approx([row["load"] for row in alone.rows], rel=1e-7)
+    assert [row["load"] for row in other.rows] == pytest.approx(
+        [row["load"] for row in alone.rows], rel=1e-7
+    )
     for start, said in (
-        (f"{run}:0", f"is no fold or bifurcation of this run; these are {located['bifurcation']} (bifurcation), "),
+        (
+            f"{run}:0",
+            f"is no fold or bifurcation of this run; these are {located['bifurcation']} (bifurcation), ",
+        ),
         (f"{run}", "write it as DIR:POINT"),
         (f"{tmp_path}:1", "path.csv"),
     ):
         refused = magshell(*over, "--from", start)
         assert refused.returncode == 2
         assert said in refused.stderr
-    outside = magshell("boundary", ARCH, "--over", f"{KEY}=1:2", "--from", f"{run}:{located['fold']}")
+    outside = magshell(
+        "boundary", ARCH, "--over", f"{KEY}=1:2", "--from", f"{run}:{located['fold']}"
+    )
     assert outside.returncode == 2
     assert "has 2.6, outside the range" in outside.stderr
-    both = magshell(*over, "--over", "foundation.stiffness=1e-9,1e-4", "--from", f"{run}:{located['fold']}")
+    both = magshell(
+        *over, "--over", "foundation.stiffness=1e-9,1e-4", "--from", f"{run}:{located['fold']}"
+    )
     assert both.returncode == 2
     assert "a map starts at the end of each of its cases" in both.stderr
 
@@ -175,14 +221,18 @@ class Killed(Exception):
 
 @pytest.mark.slow
 def test_from_a_point_on_two_ranks_and_after_an_interruption(tmp_path: Path) -> None:
-    """The lower fold, which a case does not end at: the same rows on one rank and on two, whole and in two parts."""
+    """The lower fold, which a case does not end at: the same rows on one rank and on two, whole and
+    in two parts.
+    """
     run = tmp_path / "run"
     words = [f"{KEY}=1.3", "loading.1.until=points", "loading.1.points=80"]
     settings = [word for setting in words for word in ("--set", setting)]
     assert magshell("run", ARCH, *settings, "--out", run, "--no-pictures").returncode == 0
     start = f"{run}:{[row['point'] for row in read_path(run) if row['label'] == 'fold'][1]}"
     over, said = f"{KEY}=1.28:1.32:1", list[str]()
-    done = started("boundary", ARCH, "--over", over, "--from", start, "--out", tmp_path / "two", ranks=2)
+    done = started(
+        "boundary", ARCH, "--over", over, "--from", start, "--out", tmp_path / "two", ranks=2
+    )
     assert done.returncode == 0, done.stderr
     two = list(csv.DictReader((tmp_path / "two" / "boundary.csv").open()))
     assert [float(two[i]["key"]) for i in (0, -1)] == [1.28, 1.32]
@@ -194,13 +244,18 @@ def test_from_a_point_on_two_ranks_and_after_an_interruption(tmp_path: Path) -> 
 
     with pytest.raises(Killed):
         ms.boundary(ARCH, over, out=tmp_path / "b", say=killed, start=start)
-    kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "b" / "points").glob("*down*.json")}
+    kept = {
+        file: file.stat().st_mtime_ns for file in (tmp_path / "b" / "points").glob("*down*.json")
+    }
     assert kept
     again = ms.boundary(ARCH, over, out=tmp_path / "b", start=start)
     assert all(file.stat().st_mtime_ns == then for file, then in kept.items() if file.exists())
     for row, there in zip(again.rows, two, strict=True):
         rise = row["key"]
-        assert (row["kind"], row["load"]) == (there["kind"], pytest.approx(float(there["load"]), rel=1e-9))
+        assert (row["kind"], row["load"]) == (
+            there["kind"],
+            pytest.approx(float(there["load"]), rel=1e-9),
+        )
         assert row["load"] == pytest.approx(2 * rise - 4 * ((rise**2 - 1) / 3) ** 1.5, rel=3e-3)
 
 
@@ -216,7 +271,10 @@ def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:
 
     with pytest.raises(Killed):
         ms.boundary(ARCH, over, settings, tmp_path / "b", say=killed)
-    kept = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "b" / "points").glob("*down-*.json")}
+    kept = {
+        file.name: file.stat().st_mtime_ns
+        for file in (tmp_path / "b" / "points").glob("*down-*.json")
+    }
     assert len(kept) >= 3
     seen: list[str] = []
     again = ms.boundary(ARCH, over, settings, tmp_path / "b", say=seen.append)
@@ -235,7 +293,11 @@ def test_an_interrupted_boundary_goes_on(tmp_path: Path) -> None:
         ("boundary.left=1:2", [], "boundary.left"),
         ("shell.poisson_ratio=0:0.9", [], "shell.poisson_ratio"),
         ("shell.density=1:2", [], "it has no influence on this instability"),
-        (f"{KEY}=1:1.6", ["loading.1.until=target", "loading.1.factor=0.5"], "the case ends without an instability"),
+        (
+            f"{KEY}=1:1.6",
+            ["loading.1.until=target", "loading.1.factor=0.5"],
+            "the case ends without an instability",
+        ),
     ],
 )
 def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], said: str) -> None:
@@ -245,15 +307,23 @@ def test_what_is_no_boundary(tmp_path: Path, over: str, settings: list[str], sai
 
 @pytest.mark.telling
 def test_through_a_field_of_zero(tmp_path: Path) -> None:
-    """Where the case starts; at the ends against the axisymmetric reference of tests/cases/test_cases.py."""
-    found = ms.boundary(CASES / "dimple_buckling.yaml", "magnetic.lambda_m=-0.00184:0.00184:3", out=tmp_path / "b")
+    """Where the case starts; at the ends against the axisymmetric reference of
+    tests/cases/test_cases.py.
+    """
+    found = ms.boundary(
+        CASES / "dimple_buckling.yaml", "magnetic.lambda_m=-0.00184:0.00184:3", out=tmp_path / "b"
+    )
     ends = {row["key"]: row["load"] for row in (found.rows[0], found.rows[-1])}
     assert ends == pytest.approx({-0.00184: 0.120723848, 0.00184: 0.552053778}, rel=1e-6)
     assert not found.special
 
 
-def test_a_load_is_in_the_units_of_the_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is said and drawn is the column in Pa: 2 E/sqrt(3 (1 - nu^2)) (h/R)^2 times the load of the same row."""
+def test_a_load_is_in_the_units_of_the_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is said and drawn is the column in Pa: 2 E/sqrt(3 (1 - nu^2)) (h/R)^2 times the load of
+    the same row.
+    """
     import matplotlib.pyplot as plt
 
     drawn: list[Any] = []
@@ -261,7 +331,9 @@ def test_a_load_is_in_the_units_of_the_case(tmp_path: Path, monkeypatch: pytest.
     case = tmp_path / "cap.yaml"
     case.write_text(CAP)
     said: list[str] = []
-    found = ms.boundary(case, "shell.youngs_modulus=1.3 MPa:1.31 MPa:1", out=tmp_path / "b", say=said.append)
+    found = ms.boundary(
+        case, "shell.youngs_modulus=1.3 MPa:1.31 MPa:1", out=tmp_path / "b", say=said.append
+    )
     for row in found.rows:
         unit = 2e6 * row["key"] / np.sqrt(3 * (1 - 0.49**2)) * (0.8 / 40) ** 2
         assert row["pressure_Pa"] == pytest.approx(unit * row["load"], rel=1e-12)
@@ -288,7 +360,9 @@ def test_a_map_of_boundaries(tmp_path: Path) -> None:
     assert (out / "boundary.png").stat().st_size > 10_000
     alone = ms.boundary(ARCH, over, [*fixed, "foundation.stiffness=1e-9"], tmp_path / "alone")
     own = [row for row in rows if float(row["second"]) == 1e-9]
-    assert [float(row["load"]) for row in own] == pytest.approx([row["load"] for row in alone.rows], rel=1e-9)
+    assert [float(row["load"]) for row in own] == pytest.approx(
+        [row["load"] for row in alone.rows], rel=1e-9
+    )
     assert {float(row["second"]) for row in rows} == {1e-12, 1e-9}
 
 
@@ -311,7 +385,9 @@ def test_what_is_no_map(tmp_path: Path, second: str, said: str) -> None:
 
 
 def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Symbols for keys, signs of minus, words for loads; no second panel where all lines end by the same load."""
+    """Symbols for keys, signs of minus, words for loads; no second panel where all lines end by the
+    same load.
+    """
     import matplotlib.pyplot as plt
 
     drawn: list[Any] = []
@@ -322,7 +398,14 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
     }  # fmt: skip
     loads = {-0.002: "pressure", -0.004: "lambda_m"}
     rows = [
-        {"second": second, "amplitude": load, "key": key, "load": key / 4, "kind": "fold", "unstable": 0}
+        {
+            "second": second,
+            "amplitude": load,
+            "key": key,
+            "load": key / 4,
+            "kind": "fold",
+            "unstable": 0,
+        }
         for second, load in loads.items()
         for key in (0.4, 1.0, 2.0)
     ]
@@ -339,7 +422,10 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.mark.slow
 def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
-    """Of a clamped cap over its depth: 3, then 4. Runs on both sides have these loads, one at the crossing both."""
+    """Of a clamped cap over its depth: 3, then 4.
+
+    Runs on both sides have these loads, one at the crossing both.
+    """
     case, key = tmp_path / "cap.yaml", "shell.polar"
     case.write_text(
         "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 24.5, poisson_ratio: 0.3}\n"
@@ -347,10 +433,16 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
     )
 
     def run(depth: float) -> dict[str, float]:
-        """The loads of all waves, in their order, on the mesh of the boundary: that of the case, stretched."""
+        """The loads of all waves, in their order, on the mesh of the boundary: that of the case,
+        stretched.
+        """
         start = ms.Scene(ms.Case.load(case))
         scene = Scene(moved(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()), start.comm)
-        return {r.mode: r.point.state.mu["pressure"] for r in ms.follow(scene) if r.mode.startswith("m = ")}
+        return {
+            r.mode: r.point.state.mu["pressure"]
+            for r in ms.follow(scene)
+            if r.mode.startswith("m = ")
+        }
 
     done = magshell("boundary", case, "--over", f"{key}=24:26:2", "--out", tmp_path / "b")
     assert done.returncode == 0, done.stderr
@@ -366,7 +458,9 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
         assert next(iter(loads)) == row["mode"]
         assert float(row["load"]) == pytest.approx(loads[row["mode"]], rel=1e-7)
     loads = run(float(rows[at]["key"]))
-    assert [loads["m = 3"], loads["m = 4"]] == pytest.approx([float(rows[at]["load"])] * 2, rel=1e-6)
+    assert [loads["m = 3"], loads["m = 4"]] == pytest.approx(
+        [float(rows[at]["load"])] * 2, rel=1e-6
+    )
     content = json.loads((tmp_path / "b" / "boundary.json").read_text())
     named = {words for _, _, words in _regions(_numbers(rows), content, (0.0, 1.0))}
     assert named == {"stable", "buckles with m = 3", "buckles with m = 4"}
@@ -375,7 +469,10 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_number_of_waves_changes_with_the_thickness(tmp_path: Path) -> None:
-    """Thinner caps have more waves, and more families are counted. The boundary goes on in its sense."""
+    """Thinner caps have more waves, and more families are counted.
+
+    The boundary goes on in its sense.
+    """
     case = tmp_path / "cap.yaml"
     case.write_text(
         "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 24.5, poisson_ratio: 0.3}\n"
@@ -420,7 +517,9 @@ def test_where_three_modes_meet_the_first_is_followed(tmp_path: Path) -> None:
         f"boundary: {{rim: clamped}}\nfoundation: {{stiffness: {700 * D!r}}}\nnatural: {{stretch: {1 + growth}}}\n"
         "loading: {kind: natural, grows: stretch, until: limit}\n"
     )
-    found = ms.boundary(case, f"foundation.stiffness={650 * D!r}:{1100 * D!r}:4", out=tmp_path / "b")
+    found = ms.boundary(
+        case, f"foundation.stiffness={650 * D!r}:{1100 * D!r}:4", out=tmp_path / "b"
+    )
     assert not found.stopped
     assert {row["unstable"] for row in found.rows} == {0}
     meeting = brentq(lambda k: neutral_compression(k, 1) - neutral_compression(k, 2), 650, 800)
@@ -429,7 +528,9 @@ def test_where_three_modes_meet_the_first_is_followed(tmp_path: Path) -> None:
     assert met[-1] < meeting + 3  # the discrete modes 0 and 2 may come in another order so near
     for row in found.rows:
         k = row["key"] / D
-        N = 12 * (1 + nu) * thinness**2 * growth * row["load"]  # of a plate that cannot grow at its rim
+        N = (
+            12 * (1 + nu) * thinness**2 * growth * row["load"]
+        )  # of a plate that cannot grow at its rim
         assert pytest.approx(min(neutral_compression(k, m) for m in range(4)), rel=5e-4) == N
         assert met[0] <= k <= met[-1] or row["mode"] == ("m = 1" if k < met[0] else "")
 

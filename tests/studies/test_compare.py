@@ -17,7 +17,9 @@ THICK = ["shell.radius_to_thickness=20", "symmetry=half"]
 
 @pytest.mark.slow
 def test_the_two_models_differ_by_a_multiple_of_the_thickness(tmp_path: Path) -> None:
-    """R/h = 20: 1.3 h/R in k_d at R/h = 90 (docs/solid) is 6 % here, on meshes that are a percent off."""
+    """R/h = 20: 1.3 h/R in k_d at R/h = 90 (docs/solid) is 6 % here, on meshes that are a percent
+    off.
+    """
     said: list[str] = []
     refinements = {"shell": [0.3], "solid": [0.2, 0.3, 0.4]}
     done = compare(CASE, THICK, refinements=refinements, out=tmp_path, say=said.append)  # type: ignore[arg-type]
@@ -33,7 +35,9 @@ def test_the_two_models_differ_by_a_multiple_of_the_thickness(tmp_path: Path) ->
     again = compare(CASE, THICK, refinements=refinements, out=tmp_path, say=said.append)  # type: ignore[arg-type]
     assert again.content == done.content
     assert (tmp_path / "solid_0.4" / "usage.json").stat().st_mtime_ns == kept
-    asked = compare(CASE, THICK, refinements=refinements, out=tmp_path, result="p_over_pc@end", say=said.append)  # type: ignore[arg-type]
+    asked = compare(
+        CASE, THICK, refinements=refinements, out=tmp_path, result="p_over_pc@end", say=said.append
+    )  # type: ignore[arg-type]
     assert asked.content["result"] == "p_over_pc@end"
     assert asked.content["difference"] == pytest.approx(done.content["difference"], rel=1e-6)
 
@@ -41,7 +45,12 @@ def test_the_two_models_differ_by_a_multiple_of_the_thickness(tmp_path: Path) ->
 @pytest.mark.slow
 def test_curve_against_curve(tmp_path: Path) -> None:
     """R/h = 20: the forces at whole thicknesses differ by some h/R, on a coarse mesh."""
-    settings = ["shell.radius_to_thickness=20", "loading.depth=5.2", "loading.points=5", "magnetic.lambda_m=0"]
+    settings = [
+        "shell.radius_to_thickness=20",
+        "loading.depth=5.2",
+        "loading.points=5",
+        "magnetic.lambda_m=0",
+    ]
     refinements = {"shell": [0.5], "solid": [0.5]}
     case = CASES / "solid_indentation.yaml"
     done = compare(case, settings, refinements=refinements, out=tmp_path)  # type: ignore[arg-type]

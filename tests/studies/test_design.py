@@ -1,4 +1,6 @@
-"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients tested elsewhere."""
+"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients
+tested elsewhere.
+"""
 
 import csv
 import json
@@ -59,7 +61,9 @@ def rows(folder: Path) -> list[dict[str, str]]:
 def test_reach_interrupt_and_resume(
     strip: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An interrupted design ends as one that was not; its best case runs as it is, to the same number."""
+    """An interrupted design ends as one that was not; its best case runs as it is, to the same
+    number.
+    """
     case, room = strip(TURN), import_module("magshell_fenicsx.studies.design")
     evaluate, count = room.evaluate, [0]
 
@@ -89,8 +93,12 @@ def test_reach_interrupt_and_resume(
 
 
 @pytest.mark.slow
-def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], tmp_path: Path) -> None:
-    """The deflection is largest at the bound of the field that a constraint on the shortening gives."""
+def test_numbers_between_bounds_and_a_constraint(
+    strip: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """The deflection is largest at the bound of the field that a constraint on the shortening
+    gives.
+    """
     kept = "[{of: tip_ux, least: -0.2}]"
     varied = "{magnetic.lambda_m: [1.0e-5, 2.0e-4]}"
     section = f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}, iterations: 8}}"
@@ -100,7 +108,9 @@ def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], t
 
 
 def test_fields_between_bounds(strip: Callable[[str], Path], tmp_path: Path) -> None:
-    """The deflection and the mass by a random change of thickness and curvature, against differences."""
+    """The deflection and the mass by a random change of thickness and curvature, against
+    differences.
+    """
     varied = "thickness: {points: 4, values: [0.5, 2]}, curvature: {points: 3, values: [-1, 1]}"
     source = read_source(strip(f"design: {{objective: {{maximise: tip_uz}}, {varied}}}\n"))
     case = Case.from_source(source)
@@ -152,7 +162,10 @@ def test_bounds_and_results_in_units(tmp_path: Path) -> None:
     assert best.magnetic.applied.flux_density == pytest.approx(1e-3 * found[1], rel=1e-12)
     bare = "--set=design.numbers={magnetic.applied.flux_density: [-20, 20]}"
     checked = magshell("check", tmp_path / "cap.yaml", bare)
-    assert "design.numbers: magnetic.applied.flux_density: the case gives 10 mT: its bounds need" in checked.stderr
+    assert (
+        "design.numbers: magnetic.applied.flux_density: the case gives 10 mT: its bounds need"
+        in checked.stderr
+    )
 
 
 @pytest.mark.slow
@@ -174,19 +187,28 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
             "design: {objective: {minimise: tip_ux}}",
             "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies",
         ),
-        ("design: {objective: {}, remanence: {}}", "give one of maximise, minimise, reach and shape, here none"),
+        (
+            "design: {objective: {}, remanence: {}}",
+            "give one of maximise, minimise, reach and shape, here none",
+        ),
         ("design: {objective: {reach: tip_ux}, remanence: {}}", "reach and value belong together"),
         ("design: {objective: {shape: {}}, remanence: {}}", "give components or curve"),
         (
             "design: {objective: {maximise: tip_ux}, constraints: [{of: tip_uz}], remanence: {}}",
             "of: tip_uz: give least",
         ),
-        ("design: {objective: {maximise: hertz_1}, remanence: {points: 3}}", "hertz_1: needs shell.density"),
+        (
+            "design: {objective: {maximise: hertz_1}, remanence: {points: 3}}",
+            "hertz_1: needs shell.density",
+        ),
         (
             "design: {objective: {minimise: barrier}, remanence: {points: 3}}",
             "barrier: needs a last step with until: zero",
         ),
-        ("design: {objective: {minimise: tip_ux}, remanence: {}}", "design.remanence: give points, or"),
+        (
+            "design: {objective: {minimise: tip_ux}, remanence: {}}",
+            "design.remanence: give points, or",
+        ),
         (
             "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1, 2]}}",
             "design.numbers: magnetic.lambda_m: the case starts at 0.0001, beyond 1 to 2",
@@ -249,8 +271,12 @@ def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
-    """1.3 times the knockdown factor of the uniform remanence of the same magnitude; waves are looked at too."""
-    content = design(CASES / "designed_hemisphere.yaml", ["design.iterations=4", "design.verify=2"], tmp_path)
+    """1.3 times the knockdown factor of the uniform remanence of the same magnitude; waves are
+    looked at too.
+    """
+    content = design(
+        CASES / "designed_hemisphere.yaml", ["design.iterations=4", "design.verify=2"], tmp_path
+    )
     assert content["start"]["knockdown"] == pytest.approx(0.447276, rel=1e-5)
     assert content["best"]["knockdown"] > 1.3 * content["start"]["knockdown"]
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
@@ -268,20 +294,30 @@ def test_thickness_for_the_highest_load_at_equal_mass(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_equal_forces_of_four_tips(tmp_path: Path) -> None:
-    """Arms that are magnetised inwards, by symmetry, press with 5.1 uN each in the part of the field along e3."""
+    """Arms that are magnetised inwards, by symmetry, press with 5.1 uN each in the part of the
+    field along e3.
+    """
     content = design(CASES / "designed_gripper.yaml", ["design.iterations=40"], tmp_path)
-    tips = np.array([content["best"][f"{arm}_tip_fz"] for arm in ("east", "north", "west", "south")])
-    assert content["start"]["east_tip_fz"] == pytest.approx(-content["start"]["west_tip_fz"], rel=1e-5)
+    tips = np.array(
+        [content["best"][f"{arm}_tip_fz"] for arm in ("east", "north", "west", "south")]
+    )
+    assert content["start"]["east_tip_fz"] == pytest.approx(
+        -content["start"]["west_tip_fz"], rel=1e-5
+    )
     assert np.ptp(tips) < 2.1e-3 * tips.max()  # each within 1e-3 of the west one's
     assert tips.min() > 4.9e-6
     radial = "{kind: expression, components: [-x/sqrt(x**2 + y**2), -y/sqrt(x**2 + y**2), 0]}"
-    inwards = run(Case.load(CASES / "designed_gripper.yaml", [f"magnetic.remanent={radial}"])).rows[-1]
+    inwards = run(Case.load(CASES / "designed_gripper.yaml", [f"magnetic.remanent={radial}"])).rows[
+        -1
+    ]
     assert tips.mean() == pytest.approx(float(inwards["north_tip_fz"]), rel=0.03)
 
 
 @pytest.mark.slow
 def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
-    """A clamped disc, omega = 10.2158 sqrt(D/(rho h))/R^2 (Leissa, 1969) where it is flat, as a designed dome."""
+    """A clamped disc, omega = 10.2158 sqrt(D/(rho h))/R^2 (Leissa, 1969) where it is flat, as a
+    designed dome.
+    """
     file = CASES / "designed_shape.yaml"
     vary = variables(source := read_source(file), case := Case.from_source(source), case.design)  # type: ignore[arg-type]
     way, B = np.random.default_rng(0).random(len(vary.first)), tmp_path / "B.csv"
@@ -290,7 +326,9 @@ def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
         for x in (vary.first + c * way for c in (0.01, 0.02, 0.03))
     )
     slope = (further.values["omega2_1"] - back.values["omega2_1"]) / 0.02
-    assert np.array(here.gradients["omega2_1"]) @ way == pytest.approx(slope, rel=3e-4)  # 1e-4 of the difference
+    assert np.array(here.gradients["omega2_1"]) @ way == pytest.approx(
+        slope, rel=3e-4
+    )  # 1e-4 of the difference
     content = design(file, ["design.iterations=4"], tmp_path / "out")
     flat = 10.2158**2 * 1e-4 / (12 * (1 - 0.3**2))
     assert content["start"]["omega2_1"] == pytest.approx(flat, rel=0.05)  # the dome of 0.2 h
@@ -300,27 +338,42 @@ def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_given_load_of_a_design_that_is_killed(tmp_path: Path) -> None:
-    """The field with which a shell buckles at a given pressure; killed and resumed, a design walks the same way."""
+    """The field with which a shell buckles at a given pressure; killed and resumed, a design walks
+    the same way.
+    """
     file, out = CASES / "designed_field.yaml", tmp_path / "out"
     content = design(file, ["design.verify=1"], tmp_path / "whole")
     assert content["best"]["knockdown"] == pytest.approx(0.4, rel=1e-4)
     strength = content["numbers"]["magnetic.lambda_m"]
-    other = run(Case.load(CASES / "dimple_buckling.yaml", [f"magnetic.lambda_m={strength}", "mesh.degree=3"]))
+    other = run(
+        Case.load(
+            CASES / "dimple_buckling.yaml", [f"magnetic.lambda_m={strength}", "mesh.degree=3"]
+        )
+    )
     assert other.knockdown == pytest.approx(0.4, rel=1e-3)
     killed = start("design", file, "--out", out, "--set=design.verify=1")
     wait_until(lambda: len([*out.glob("points/*.json")]) > 1 or killed.poll() is not None)
     kill(killed, 0)
     known = len([*out.glob("points/*.json")])
     assert 1 < known < len(rows(tmp_path / "whole"))
-    assert magshell("design", file, "--out", out, "--set=design.verify=1", "--resume").returncode == 0
+    assert (
+        magshell("design", file, "--out", out, "--set=design.verify=1", "--resume").returncode == 0
+    )
     for row, whole in zip(rows(out), rows(tmp_path / "whole"), strict=True):
         assert float(row["knockdown"]) == pytest.approx(float(whole["knockdown"]), rel=1e-12)
 
 
 @pytest.mark.slow
 def test_letter_and_its_elastica(tmp_path: Path) -> None:
-    """The letter U to 1 % of the length; the elastica with the remanence that was found has the same tip."""
-    coarse = ["mesh.degree=2", "symmetry=none", "design.iterations=16", "design.remanence={points: 16}"]
+    """The letter U to 1 % of the length; the elastica with the remanence that was found has the
+    same tip.
+    """
+    coarse = [
+        "mesh.degree=2",
+        "symmetry=none",
+        "design.iterations=16",
+        "design.remanence={points: 16}",
+    ]
     content = design(CASES / "designed_letter.yaml", coarse, tmp_path)
     assert content["best"]["largest_distance"] < 0.01
     assert content["verified"]["largest_distance"] < 0.01
@@ -331,7 +384,9 @@ def test_letter_and_its_elastica(tmp_path: Path) -> None:
     def slopes(s: Array, y: Array) -> Array:
         theta = y[0]
         bx, _, bz = (found.weights(np.column_stack([s, 0 * s, 0 * s])) @ vectors).T
-        return np.stack([y[1], -q * (bx * np.cos(theta) - bz * np.sin(theta)), np.cos(theta), np.sin(theta)])
+        return np.stack(
+            [y[1], -q * (bx * np.cos(theta) - bz * np.sin(theta)), np.cos(theta), np.sin(theta)]
+        )
 
     def ends(root: Array, tip: Array) -> Array:
         return np.array([root[0], tip[1], root[2], root[3]])
@@ -346,9 +401,17 @@ def test_letter_and_its_elastica(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_remanence_for_a_sensor_that_reads_most(strip: Callable[[str], Path], tmp_path: Path) -> None:
-    """Far away the strip is a dipole m, e . B = m . (3 (x . e) x - e)/(4 pi r^3): most along that vector; to 1e-3."""
-    x, turned = np.array([30.0, 0.0, 20.0]), "design: {objective: {maximise: hall_Bz}, remanence: {points: 2}}\n"
+def test_remanence_for_a_sensor_that_reads_most(
+    strip: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Far away the strip is a dipole m, e .
+
+    B = m . (3 (x . e) x - e)/(4 pi r^3): most along that vector; to 1e-3.
+    """
+    x, turned = (
+        np.array([30.0, 0.0, 20.0]),
+        "design: {objective: {maximise: hall_Bz}, remanence: {points: 2}}\n",
+    )
     text = "sensors: {hall: {position: [30.5, 0, 20]}}\nloading: {kind: pressure, control: load, until: target"
     file = strip(f"{text}, pressure: 1.0e-9, points: 1}}\n{turned}")
     file.write_text(file.read_text().replace("{lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}",
@@ -362,7 +425,9 @@ def test_remanence_for_a_sensor_that_reads_most(strip: Callable[[str], Path], tm
 
 @pytest.mark.slow
 def test_remanences_of_two_strips(tmp_path: Path) -> None:
-    """What pulls a strip down to another lifts it, by remanences found with the gradient of the interaction."""
+    """What pulls a strip down to another lifts it, by remanences found with the gradient of the
+    interaction.
+    """
     content = design(CASES / "designed_neighbour.yaml", ["design.iterations=4"], tmp_path)
     assert content["start"]["tip_uz_mm"] == pytest.approx(-0.575, abs=1e-3)
     assert content["best"]["tip_uz_mm"] > 0.1

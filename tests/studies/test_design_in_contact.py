@@ -1,4 +1,6 @@
-"""Designs of several shells: a field that changes the gap between those that touch, and fields of all of them."""
+"""Designs of several shells: a field that changes the gap between those that touch, and fields of
+all of them.
+"""
 
 import json
 from pathlib import Path
@@ -21,10 +23,21 @@ h = 0.02
 
 @pytest.mark.slow
 def test_thickness_of_two_strips(tmp_path: Path) -> None:
-    """The upper of two cantilevers presses on the lower one, whose tip sinks less if roots are thick."""
-    strips = [Sheet(n, (0, 0, z), (1, 0, 0), (0, 0.2, 0), (5, 1)) for n, z in (("lower", 0), ("upper", 1.4 * h))]
+    """The upper of two cantilevers presses on the lower one, whose tip sinks less if roots are
+    thick.
+    """
+    strips = [
+        Sheet(n, (0, 0, z), (1, 0, 0), (0, 0.2, 0), (5, 1))
+        for n, z in (("lower", 0), ("upper", 1.4 * h))
+    ]
     write(tmp_path / "strips.msh", strips)
-    shell = {"geometry": "mesh", "file": "strips.msh", "radius": 1, "thickness": h, "youngs_modulus": 1}
+    shell = {
+        "geometry": "mesh",
+        "file": "strips.msh",
+        "radius": 1,
+        "thickness": h,
+        "youngs_modulus": 1,
+    }
     case = {
         "shell": shell | {"poisson_ratio": 0},
         "boundary": {"lower_4": "clamped", "upper_4": "clamped"},
@@ -56,13 +69,22 @@ def test_thickness_of_two_strips(tmp_path: Path) -> None:
         ("deviation", [-1, 1], [0.1, -0.2, 0.05, 0.3]),
     ],
 )
-def test_fields_of_unlike_shells(field: str, values: list[float], change: list[float], tmp_path: Path) -> None:
-    """A strip, and a thicker and shorter one that is turned: results by a random change of a field, by differences."""
+def test_fields_of_unlike_shells(
+    field: str, values: list[float], change: list[float], tmp_path: Path
+) -> None:
+    """A strip, and a thicker and shorter one that is turned: results by a random change of a field,
+    by differences.
+    """
     strip = {"geometry": "strip", "width": 0.2, "poisson_ratio": 0, "youngs_modulus": "1 MPa"}
 
     def of(length: float, thickness: float, **place: object) -> dict[str, object]:
         shell = {**strip, "radius": f"{length} mm", "thickness": f"{thickness} mm"}
-        return {"shell": shell, "boundary": {"root": "clamped"}, "points": {"tip": [f"{length} mm", 0, 0]}, **place}
+        return {
+            "shell": shell,
+            "boundary": {"root": "clamped"},
+            "points": {"tip": [f"{length} mm", 0, 0]},
+            **place,
+        }
 
     turned = {"place": {"position": ["3 mm", "5 mm", "8 mm"], "axis": {"polar": 40, "azimuth": 70}}}
     loads = [{"at": f"{name}_tip", "force": [0, 0, "-1e-5 N"]} for name in ("long", "short")]
@@ -81,7 +103,10 @@ def test_fields_of_unlike_shells(field: str, values: list[float], change: list[f
     assert made.design
     vary, standing = variables(source, made, made.design, Case.from_source), Standing()
     start = vary.first + change
-    way, results = np.random.default_rng(0).standard_normal(len(start)), ["long_tip_uz", "short_tip_uz", "mass"]
+    way, results = (
+        np.random.default_rng(0).standard_normal(len(start)),
+        ["long_tip_uz", "short_tip_uz", "mass"],
+    )
 
     def at(c: float) -> Evaluation:
         there = vary.case_of(start + c * way, tmp_path / "B.csv")

@@ -10,7 +10,16 @@ from matplotlib.figure import Figure
 
 from magshell_fenicsx.studies.design_picture import Reached, draw_design
 
-MANY = ["buckling_pressure_Pa", "mass", "tip_uz_mm", "w_mm", "knockdown", "tip_fz_N", "hertz_1", "hertz_2"]
+MANY = [
+    "buckling_pressure_Pa",
+    "mass",
+    "tip_uz_mm",
+    "w_mm",
+    "knockdown",
+    "tip_fz_N",
+    "hertz_1",
+    "hertz_2",
+]
 
 
 @pytest.mark.parametrize(
@@ -28,18 +37,29 @@ def test_one_axis_for_each_unit(
     monkeypatch.setattr(Figure, "savefig", lambda figure, file: drawn.append(figure))
     row: dict[str, Any] = {"evaluation": 1, "best": True, **dict.fromkeys(results, 1.0)}
     nothing: Any = SimpleNamespace(controls=None, fields=[], blocks={})
-    draw_design([row, {**row, "evaluation": 2, results[0]: None}], results, nothing, np.zeros(0), tmp_path / "d.png")
+    draw_design(
+        [row, {**row, "evaluation": 2, results[0]: None}],
+        results,
+        nothing,
+        np.zeros(0),
+        tmp_path / "d.png",
+    )
     axes = drawn[0].axes
     assert [each.get_ylabel() for each in axes] == labels
     assert sum(len(each.lines) for each in axes) == 2 * len(results)
     assert [bool(each.get_xlabel()) for each in axes] == [False] * (len(labels) - 1) + [True]
 
 
-def test_the_remanence_is_drawn_on_the_edges_of_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_remanence_is_drawn_on_the_edges_of_the_shell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From above, where the shell is flat; results of several points share what they are."""
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, file: drawn.append(figure))
-    places, edges = np.eye(3) * [1.0, 1.0, 0.0], np.array([[0.0, 0, 0], [2, 0, 0], [np.nan] * 3, [2, 1, 0], [0, 1, 0]])
+    places, edges = (
+        np.eye(3) * [1.0, 1.0, 0.0],
+        np.array([[0.0, 0, 0], [2, 0, 0], [np.nan] * 3, [2, 1, 0], [0, 1, 0]]),
+    )
     vary: Any = SimpleNamespace(
         controls=SimpleNamespace(places=places, around=False),
         vectors=lambda x: np.eye(3),
@@ -52,4 +72,6 @@ def test_the_remanence_is_drawn_on_the_edges_of_the_shell(tmp_path: Path, monkey
     draw_design([row], ["east_fz", "west_fz"], vary, np.zeros(0), tmp_path / "d.png", shape=shape)
     history, remanence = drawn[0].axes
     assert history.get_ylabel() == "$f_z$"
-    assert any(np.array_equal(line.get_xydata(), edges[:, :2], equal_nan=True) for line in remanence.lines)
+    assert any(
+        np.array_equal(line.get_xydata(), edges[:, :2], equal_nan=True) for line in remanence.lines
+    )

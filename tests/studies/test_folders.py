@@ -8,7 +8,8 @@ from command import magshell
 from conftest import CASES
 
 CASE = CASES / "dimple_buckling.yaml"
-COMMANDS = {  # the words of a command, its table in JSON, what a folder says that has one, its other tables
+# the words of a command, its table in JSON, what a folder says that has one, its other tables
+COMMANDS = {
     "sweep": ((CASE, "--over", "mesh.degree=2,3"), "sweep.json", {}, ("curves.csv", "sweep.png")),
     "ensemble": (
         (CASES / "random_dimples.yaml", "--samples", 2, "--seed", 1),
@@ -28,7 +29,12 @@ COMMANDS = {  # the words of a command, its table in JSON, what a folder says th
         {"objective": {}, "best": {}},
         ("best.csv", "best.yaml", "design.csv", "design.png"),
     ),
-    "compare": ((CASE,), "compare.json", {"difference": 0.1, "runs": {}}, ("compare.csv", "compare.png")),
+    "compare": (
+        (CASE,),
+        "compare.json",
+        {"difference": 0.1, "runs": {}},
+        ("compare.csv", "compare.png"),
+    ),
 }
 
 
@@ -39,8 +45,13 @@ def test_files_of_others_are_refused(tmp_path: Path, name: str) -> None:
         (tmp_path / file).write_text("mine", encoding="utf-8")
     refused = magshell(name, *words, "--out", tmp_path)
     assert refused.returncode == 2
-    assert f"none is known to have written: {', '.join(sorted((first, *tables)))}; move them away" in refused.stderr
-    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == dict.fromkeys((first, *tables), "mine")
+    assert (
+        f"none is known to have written: {', '.join(sorted((first, *tables)))}; move them away"
+        in refused.stderr
+    )
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == dict.fromkeys(
+        (first, *tables), "mine"
+    )
 
 
 @pytest.mark.parametrize("name", [name for name, (_, _, known, _) in COMMANDS.items() if known])

@@ -1,4 +1,6 @@
-"""Parameters from measured data: what was put in is found, bands cover it; resume, and what is refused."""
+"""Parameters from measured data: what was put in is found, bands cover it; resume, and what is
+refused.
+"""
 
 import itertools
 import json
@@ -76,7 +78,9 @@ ELSEWHERE = ["shell.youngs_modulus=930 kPa", "magnetic.remanent.polar=78"]  # wh
 
 @dataclass(frozen=True)
 class Whole:
-    """An identification by the command line that nobody interrupted: its words, and what it printed."""
+    """An identification by the command line that nobody interrupted: its words, and what it
+    printed.
+    """
 
     words: list[str | Path]
     out: Path
@@ -98,16 +102,27 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 
 
 def test_what_was_put_in_is_found(whole: Whole) -> None:
-    """Within three deviations; the columns estimate the noise that was added; the folder has what is said."""
+    """Within three deviations; the columns estimate the noise that was added; the folder has what
+    is said.
+    """
     content, out = whole.content, whole.out
     found = [content["parameters"][key] for key in KEYS]
-    away = [(each["value"] - truth) / each["deviation"] for each, truth in zip(found, TRUTH, strict=True)]
+    away = [
+        (each["value"] - truth) / each["deviation"]
+        for each, truth in zip(found, TRUTH, strict=True)
+    ]
     assert np.abs(away).max() < 3
     assert [each["unit"] for each in found] == ["kPa", ""]
     assert [content["noise"][of]["estimated"] for of in ("tip_ux", "tip_uz")] == [True, True]
-    assert content["noise"]["tip_uz"]["deviation"] == pytest.approx(NOISE, rel=0.8)  # of two degrees of freedom
-    assert content["next"]["result"] == "tip_uz_mm"  # there modulus and angle act otherwise than in the data
-    assert all("value" in each for each in content["predicted"])  # none is lost between the points of the path
+    assert content["noise"]["tip_uz"]["deviation"] == pytest.approx(
+        NOISE, rel=0.8
+    )  # of two degrees of freedom
+    assert (
+        content["next"]["result"] == "tip_uz_mm"
+    )  # there modulus and angle act otherwise than in the data
+    assert all(
+        "value" in each for each in content["predicted"]
+    )  # none is lost between the points of the path
     assert (out / "identify.png").stat().st_size > 10_000
     rows = (out / "identify.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * len(FEW)
@@ -122,7 +137,9 @@ class Killed(Exception):
 
 
 def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> None:
-    """The same numbers, and no evaluation twice: killed as it begins, it goes on from all points but the last two."""
+    """The same numbers, and no evaluation twice: killed as it begins, it goes on from all points
+    but the last two.
+    """
     _, file, _, data, *_ = whole.words
     out = tmp_path / "out"
 
@@ -131,7 +148,9 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
 
     with pytest.raises(Killed):
         ms.identify(file, data, ELSEWHERE, out, say=killed)
-    for point in sorted((whole.out / "points").glob("*.json"), key=lambda each: each.stat().st_mtime_ns)[:-2]:
+    for point in sorted(
+        (whole.out / "points").glob("*.json"), key=lambda each: each.stat().st_mtime_ns
+    )[:-2]:
         shutil.copy(point, out / "points")
     kept = {each: each.stat().st_mtime_ns for each in (out / "points").glob("*.json")}
     assert len(kept) >= 2
@@ -145,13 +164,17 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
     """Buckling pressures in two fields say modulus and remanence of a cap, without noise exactly."""
     text = CAP + "symmetry: axisymmetric\n"
-    text += "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
+    text += (
+        "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
+    )
     text = text.replace("parameters:", "noise: {buckling_pressure_Pa: 0.5 Pa}, parameters:")
     file, key = case_file(tmp_path, text), "magnetic.applied.flux_density"
     rows = [f"{key} [mT],buckling_pressure [Pa]"]
     for field in (-10, 20):
         case = ms.Case.load(file, [f"{key}={field} mT"])
-        rows.append(f"{field},{float(read(ms.Scene(case), [Reading('buckling_pressure_Pa')], []).values[0])!r}")
+        rows.append(
+            f"{field},{float(read(ms.Scene(case), [Reading('buckling_pressure_Pa')], []).values[0])!r}"
+        )
     start = ["shell.youngs_modulus=1.35 MPa", "magnetic.remanent.flux_density=57 mT"]
     found = ms.identify(file, data_file(tmp_path, "\n".join(rows)), start, tmp_path / "out")
     assert found.fit.x == pytest.approx([1.3, 60.0], rel=1e-4)
@@ -159,7 +182,9 @@ def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
 
 
 class Interpolated:
-    """Predictions of the strip by Chebyshev polynomials in both parameters, from runs at their points."""
+    """Predictions of the strip by Chebyshev polynomials in both parameters, from runs at their
+    points.
+    """
 
     LOW, HIGH, DEGREE = np.array([820.0, 76.0]), np.array([980.0, 84.0]), 4
 
@@ -167,8 +192,12 @@ class Interpolated:
         self.case = ms.Case.load(case_file(folder))
         nodes = np.cos((np.arange(self.DEGREE + 1) + 0.5) * np.pi / (self.DEGREE + 1))
         at = list(itertools.product(nodes, nodes))
-        values = np.array([self.exact(self.LOW + (np.array(z) + 1) / 2 * (self.HIGH - self.LOW)) for z in at])
-        self._c = np.linalg.solve(chebyshev.chebvander2d(*np.array(at).T, [self.DEGREE] * 2), values)
+        values = np.array(
+            [self.exact(self.LOW + (np.array(z) + 1) / 2 * (self.HIGH - self.LOW)) for z in at]
+        )
+        self._c = np.linalg.solve(
+            chebyshev.chebvander2d(*np.array(at).T, [self.DEGREE] * 2), values
+        )
         self._c = self._c.reshape(self.DEGREE + 1, self.DEGREE + 1, -1)
 
     def exact(self, x: Array) -> Array:
@@ -183,15 +212,19 @@ class Interpolated:
     def __call__(self, x: Array) -> tuple[Array, Array]:
         scale = 2 / (self.HIGH - self.LOW)
         z = (np.asarray(x) - self.LOW) * scale - 1
-        by = [chebyshev.chebval2d(*z, scale[i] * chebyshev.chebder(self._c, axis=i)) for i in range(2)]
+        by = [
+            chebyshev.chebval2d(*z, scale[i] * chebyshev.chebder(self._c, axis=i)) for i in range(2)
+        ]
         return self.values(np.asarray(x)), np.stack(by, axis=1)
 
 
 @pytest.mark.slow
 def test_bands_of_200_repeats_and_a_posterior(tmp_path: Path) -> None:
-    """Of 200 synthetic measurements 92 to 98 % of the bands cover the truth; one posterior, summed on a grid, to 5 %.
+    """Of 200 synthetic measurements 92 to 98 % of the bands cover the truth; one posterior, summed
+    on a grid, to 5 %.
 
-    Runs are interpolated; the interpolation is 1e-4 of the noise, its slopes are those of the adjoints.
+    Runs are interpolated; the interpolation is 1e-4 of the noise, its slopes are those of the
+    adjoints.
     """
     model = Interpolated(tmp_path)
     beside = np.array([871.0, 81.7])
@@ -202,7 +235,9 @@ def test_bands_of_200_repeats_and_a_posterior(tmp_path: Path) -> None:
     y, group = model(TRUTH)[0], np.tile([0, 1], len(FIELDS))
     rng, inside, fits = np.random.default_rng(7), list[Array](), list[Array]()
     for _ in range(200):
-        known = Measured(y + NOISE * rng.normal(size=y.size), group, np.full(2, NOISE), TRUTH, np.full(2, np.inf))
+        known = Measured(
+            y + NOISE * rng.normal(size=y.size), group, np.full(2, NOISE), TRUTH, np.full(2, np.inf)
+        )
         fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
         inside.append((fit.band[0] < TRUTH) & (fit.band[1] > TRUTH))
         fits.append(fit.x)
@@ -224,10 +259,15 @@ def test_bands_of_200_repeats_and_a_posterior(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_posterior_of_emcee(tmp_path: Path) -> None:
-    """Means and standard deviations within 5 %, where emcee (Foreman-Mackey and others 2013) is installed."""
+    """Means and standard deviations within 5 %, where emcee (Foreman-Mackey and others 2013) is
+    installed.
+    """
     emcee = pytest.importorskip("emcee")
     model, rng = Interpolated(tmp_path), np.random.default_rng(3)
-    data, group = model(TRUTH)[0] + NOISE * rng.normal(size=2 * len(FIELDS)), np.tile([0, 1], len(FIELDS))
+    data, group = (
+        model(TRUTH)[0] + NOISE * rng.normal(size=2 * len(FIELDS)),
+        np.tile([0, 1], len(FIELDS)),
+    )
     known = Measured(data, group, np.full(2, NOISE), TRUTH, np.full(2, np.inf))
     fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
     logarithm = lambda x: -float(np.sum(((data - model(x)[0]) / NOISE) ** 2)) / 2  # noqa: E731
@@ -247,18 +287,37 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
             [],
             r"data: --data .*measured.csv: line 3: applied_mT = 30 is outside the path, which goes from 0",
         ),
-        ("applied [mT],tip_uz [mm]\n\n5,9\n\n-3,1\n10,12\n", [], r"line 5: applied_mT = -3 is outside the path"),
+        (
+            "applied [mT],tip_uz [mm]\n\n5,9\n\n-3,1\n10,12\n",
+            [],
+            r"line 5: applied_mT = -3 is outside the path",
+        ),
         ("applied [mT],tip_uz\n5,9\n", [], r"tip_uz: has no unit: write tip_uz \[mm\]"),
         ("applied,tip_uz [mm]\n5,9\n", [], r"applied: has no unit: write applied \[mT\]"),
         ("applied [mT],tip_uz [s]\n5,9\n", [], "column tip_uz: its unit s"),
-        ("applied [mT],tip_uz [mm]\n5,9\n", [], "1 data do not determine 2 parameters without a prior"),
-        ("applied [mT],tip_uz [mm]\n5,9\n10,12\n", [], "2 data do not say the noise beside 2 parameters"),
-        ("applied [mT],middle [mm]\n5,9\n", [], "middle: has the unit mm, but no result of this name has one"),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            [],
+            "1 data do not determine 2 parameters without a prior",
+        ),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n10,12\n",
+            [],
+            "2 data do not say the noise beside 2 parameters",
+        ),
+        (
+            "applied [mT],middle [mm]\n5,9\n",
+            [],
+            "middle: has the unit mm, but no result of this name has one",
+        ),
         ("applied [mT],speed\n5,9\n", [], "speed: has no gradient here; allowed are"),
         ("applied [mT]\n5\n9\n", [], "has no column with a result of this case"),
         (
             "applied [mT],tip_uz [mm]\n5,9\n10,12\n15,13\n",
-            ["identify.parameters={shell.youngs_modulus: {}, shell.density: {}}", "shell.density=1000 kg/m^3"],
+            [
+                "identify.parameters={shell.youngs_modulus: {}, shell.density: {}}",
+                "shell.density=1000 kg/m^3",
+            ],
             "shell.density: has no influence on these data",
         ),
         (
@@ -271,9 +330,21 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
             ["identify.parameters={shell.youngs_modulus: {prior: 900, deviation: 10 kPa}}"],
             "900: the case gives shell.youngs_modulus with the unit kPa: so has its prior",
         ),
-        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.noise={tip_ux: 1 mm}"], "tip_ux: .*has no such column"),
-        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.noise={tip_uz: 1}"], "needs a unit, such as 1 mm"),
-        ("applied [mT],tip_uz [mm]\n5,9\n", ["identify.narrow=shell.thickness"], "is none of the parameters"),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            ["identify.noise={tip_ux: 1 mm}"],
+            "tip_ux: .*has no such column",
+        ),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            ["identify.noise={tip_uz: 1}"],
+            "needs a unit, such as 1 mm",
+        ),
+        (
+            "applied [mT],tip_uz [mm]\n5,9\n",
+            ["identify.narrow=shell.thickness"],
+            "is none of the parameters",
+        ),
         (
             "applied [mT],tip_uz [mm]\n5,9\n",
             ["identify.parameters={mesh.size: {}}"],
@@ -323,7 +394,10 @@ def test_what_identifies_nothing(tmp_path: Path, data: str, settings: list[str],
         ),
         ("identify.candidates.0.of=nope", "identify.candidates.0.of: nope: has no gradient here"),
         ("identify.candidates.1.noise=0.05", "identify.candidates.1.noise: 0.05: needs a unit"),
-        ("identify.changes=[tip_uz_cm]", "identify.changes: tip_uz_cm: the case has no such result"),
+        (
+            "identify.changes=[tip_uz_cm]",
+            "identify.changes: tip_uz_cm: the case has no such result",
+        ),
         ("identify.noise={nope: 1 mm}", "identify.noise: nope: the case has no such result"),
         ("identify.noise={tip_ux: 1 mm, tip_uz_mm: 1 mm}", ""),
     ],
@@ -353,10 +427,16 @@ def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
 def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
     """What is nan or empty is said in the output and in identify.json, by column; the band is that of
     the table without these rows."""
-    text = CAP.replace("{kind: pressure, until: limit}", "{kind: field, points: 1}") + "symmetry: axisymmetric\n"
+    text = (
+        CAP.replace("{kind: pressure, until: limit}", "{kind: field, points: 1}")
+        + "symmetry: axisymmetric\n"
+    )
     case = case_file(tmp_path, text + "identify: {parameters: {shell.youngs_modulus: {}}}\n")
     found = dict[str, dict[str, Any]]()
-    for name, rows in {"some": "3,-4.5\n4,nan\n6,-9\n7,\n10,-15\n", "all": "3,-4.5\n6,-9\n10,-15\n"}.items():
+    for name, rows in {
+        "some": "3,-4.5\n4,nan\n6,-9\n7,\n10,-15\n",
+        "all": "3,-4.5\n6,-9\n10,-15\n",
+    }.items():
         found[name] = ms.identify(
             case, data_file(tmp_path, "applied [mT],w_pole [um]\n" + rows), out=tmp_path / name
         ).content
@@ -374,4 +454,7 @@ def test_one_datum_says_no_noise(tmp_path: Path) -> None:
     case = case_file(tmp_path, COARSE + "identify: {}\n")
     done = magshell("identify", case, "--data", data, "--out", tmp_path / "out", "--set", wide)
     assert done.returncode == 2
-    assert "identify.noise: tip_uz: 1 data do not say the noise beside 1 parameters: give it" in done.stderr
+    assert (
+        "identify.noise: tip_uz: 1 data do not say the noise beside 1 parameters: give it"
+        in done.stderr
+    )

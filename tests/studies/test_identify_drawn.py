@@ -1,4 +1,6 @@
-"""Bands of few runs with drawn parameters, of a field of many numbers, against many samples of its posterior."""
+"""Bands of few runs with drawn parameters, of a field of many numbers, against many samples of its
+posterior.
+"""
 
 import numpy as np
 import pytest
@@ -15,8 +17,16 @@ NOISE = 0.01
 
 def posterior() -> Fit:
     """Of a vector with two components along a line, of which eight moments were measured."""
-    J = np.array([np.kron((end > X) * (end - X), [1.0, a]) / X.size for end in (0.2, 0.5, 0.8, 1.0) for a in (0.3, -1)])
-    data = J @ np.kron(np.cos(2 * X), [1.0, 0.5]) + NOISE * np.random.default_rng(2).normal(size=len(J))
+    J = np.array(
+        [
+            np.kron((end > X) * (end - X), [1.0, a]) / X.size
+            for end in (0.2, 0.5, 0.8, 1.0)
+            for a in (0.3, -1)
+        ]
+    )
+    data = J @ np.kron(np.cos(2 * X), [1.0, 0.5]) + NOISE * np.random.default_rng(2).normal(
+        size=len(J)
+    )
     smooth = Smooth(0, np.abs(X[:, None] - X), 2, 1.0, 0.3)
     start, free = np.zeros(J.shape[1]), np.full(J.shape[1], np.inf)
     measured = Measured(data, np.zeros(len(J), dtype=int), np.array([NOISE]), start, free, smooth)
@@ -25,7 +35,8 @@ def posterior() -> Fit:
 
 @pytest.mark.parametrize(("count", "error"), [(20, 0.13), (40, 0.1)])
 def test_bands_of_a_field(count: int, error: float) -> None:
-    """Of 100 smooth results of the field: widths right to 13 % of 20 runs, to 10 % of 40, as root mean squares.
+    """Of 100 smooth results of the field: widths right to 13 % of 20 runs, to 10 % of 40, as root
+    mean squares.
 
     Independent runs miss by 18 and 13 % (20 and 40, mean over 30 seeds).
     """

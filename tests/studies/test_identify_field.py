@@ -29,7 +29,8 @@ FAR = ("value", "low", "high")
 
 @pytest.mark.slow
 def test_a_field_and_its_predictions(tmp_path: Path) -> None:
-    """Bands of 20 runs of a reversed history, which changes nothing, are those of slopes; narrowed is the field.
+    """Bands of 20 runs of a reversed history, which changes nothing, are those of slopes; narrowed
+    is the field.
 
     On 2 and 3 ranks all is the same, but for sums in another order.
     """

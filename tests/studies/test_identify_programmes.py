@@ -1,4 +1,6 @@
-"""Other histories predicted from a posterior: bands against slopes, data in them, resume, and what is refused."""
+"""Other histories predicted from a posterior: bands against slopes, data in them, resume, and what
+is refused.
+"""
 
 import csv
 import json
@@ -39,14 +41,18 @@ def written(folder: Path) -> tuple[Path, Path]:
     case.write_text(CAP + LOOKED_FOR)
     middle, last = (row for row in ms.run(ms.Case.load(case)).rows if row["label"] == "target")
     end = last["tip_uz_mm"]
-    data.write_text(f"applied [mT],tip_uz [mm]\n{middle['applied_mT']!r},{middle['tip_uz_mm']!r}\n20,{end!r}\n")
+    data.write_text(
+        f"applied [mT],tip_uz [mm]\n{middle['applied_mT']!r},{middle['tip_uz_mm']!r}\n20,{end!r}\n"
+    )
     (folder / "turned.csv").write_text(f"applied [mT],tip_uz [um]\n-20,{1e3 * end!r}\n-5,0\n")
     return case, data
 
 
 @pytest.mark.slow
 def test_bands_of_another_history(tmp_path: Path) -> None:
-    """Those of slopes, with field and remanence reversed, which changes nothing; of two data one is inside."""
+    """Those of slopes, with field and remanence reversed, which changes nothing; of two data one is
+    inside.
+    """
     case, data = written(tmp_path)
     words = ["identify", case, "--data", data, "--set", BEGIN]
     done = magshell(*words, "--out", tmp_path / "one")
@@ -65,12 +71,19 @@ def test_bands_of_another_history(tmp_path: Path) -> None:
     assert "turned: 1 of 2 data within their predicted bands" in done.stdout
     rows = list(csv.DictReader((tmp_path / "one" / "identify_turned.csv").open()))
     assert {row["result"] for row in rows} == {"tip_uz_mm", "w_pole_mm"}
-    (end,) = (row for row in rows if row["result"] == "tip_uz_mm" and float(row["applied_mT"]) == -20)
+    (end,) = (
+        row for row in rows if row["result"] == "tip_uz_mm" and float(row["applied_mT"]) == -20
+    )
     assert float(end["low"]) == pytest.approx(number["low"], rel=1e-6)
     assert float(end["high_measured"]) > float(end["high"])
     assert (tmp_path / "one" / "identify_turned.png").stat().st_size > 10_000
-    points = {file: file.stat().st_mtime_ns for file in (tmp_path / "one" / "points").glob("*.json")}
-    other = ["--set", "identify.predict.turned.changes=[w_pole_mm]"]  # makes neither fit nor runs new
+    points = {
+        file: file.stat().st_mtime_ns for file in (tmp_path / "one" / "points").glob("*.json")
+    }
+    other = [
+        "--set",
+        "identify.predict.turned.changes=[w_pole_mm]",
+    ]  # makes neither fit nor runs new
     again = started(*words, *other, "--out", tmp_path / "one", ranks=2)
     assert again.returncode == 0, again.stderr
     assert "turned: 21 runs, 0 to compute" in again.stdout
@@ -81,14 +94,38 @@ def test_bands_of_another_history(tmp_path: Path) -> None:
     ("setting", "said"),
     [
         ("identify.predict.turned.case=nowhere.yaml", "identify.predict.turned: .*nowhere.yaml"),
-        ("identify.predict.turned.case=other.yaml", "other.yaml has no shell.youngs_modulus, which is looked for"),
-        ("identify.predict.turned.settings=[magnetic.nope=1]", "identify.predict.turned: .*magnetic.nope"),
-        ("identify.predict.turned.of=[nope]", "identify.predict.turned.of: nope: nope is no column with numbers"),
-        ("identify.predict.turned.changes=[tip_uy]", "identify.predict.turned.changes: tip_uy: is no column that"),
-        ("identify.predict.turned.data=none.csv", "identify.predict.turned.data: none.csv: cannot be read"),
-        ("identify.predict.turned.data=no_unit.csv", "no_unit.csv: tip_uz: has no unit: write tip_uz"),
-        ("identify.predict.turned.data=step.csv", "step.csv: line 2: a row has no place, or no step of 1 to 1"),
-        ("identify.predict={a b: {of: [knockdown]}}", "a b: a name has letters, digits and _ alone"),
+        (
+            "identify.predict.turned.case=other.yaml",
+            "other.yaml has no shell.youngs_modulus, which is looked for",
+        ),
+        (
+            "identify.predict.turned.settings=[magnetic.nope=1]",
+            "identify.predict.turned: .*magnetic.nope",
+        ),
+        (
+            "identify.predict.turned.of=[nope]",
+            "identify.predict.turned.of: nope: nope is no column with numbers",
+        ),
+        (
+            "identify.predict.turned.changes=[tip_uy]",
+            "identify.predict.turned.changes: tip_uy: is no column that",
+        ),
+        (
+            "identify.predict.turned.data=none.csv",
+            "identify.predict.turned.data: none.csv: cannot be read",
+        ),
+        (
+            "identify.predict.turned.data=no_unit.csv",
+            "no_unit.csv: tip_uz: has no unit: write tip_uz",
+        ),
+        (
+            "identify.predict.turned.data=step.csv",
+            "step.csv: line 2: a row has no place, or no step of 1 to 1",
+        ),
+        (
+            "identify.predict={a b: {of: [knockdown]}}",
+            "a b: a name has letters, digits and _ alone",
+        ),
         ("identify.predict.turned={samples: 30}", "give data, of, or both: nothing is predicted"),
     ],
 )
@@ -103,6 +140,8 @@ def test_what_predicts_nothing(tmp_path: Path, setting: str, said: str) -> None:
         ("step", "step,applied [mT],tip_uz [mm]\n3,-5,9\n"),
     ):
         (tmp_path / f"{name}.csv").write_text(text)
-    (tmp_path / "other.yaml").write_text("shell: {geometry: strip, radius: 1, width: 0.2, thickness: 0.01}\n")
+    (tmp_path / "other.yaml").write_text(
+        "shell: {geometry: strip, radius: 1, width: 0.2, thickness: 0.01}\n"
+    )
     with pytest.raises(CaseError, match=said):
         ms.identify(case, data, [setting], tmp_path / "out")

@@ -1,11 +1,21 @@
-"""The posterior of Gauss-Newton and Laplace: coverage of its bands, against Metropolis, and what it refuses."""
+"""The posterior of Gauss-Newton and Laplace: coverage of its bands, against Metropolis, and what it
+refuses.
+"""
 
 import numpy as np
 import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.laplace import NORMAL, Fit, Measured, NoNoise, NotSeen, fitted, nonlinearity
+from magshell_fenicsx.studies.laplace import (
+    NORMAL,
+    Fit,
+    Measured,
+    NoNoise,
+    NotSeen,
+    fitted,
+    nonlinearity,
+)
 from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
@@ -26,7 +36,9 @@ def measured(seed: int, noise: float = NOISE, deviation: float = np.inf) -> Meas
     y = relaxing(TRUTH)
     assert y
     data = y[0] + NOISE * np.random.default_rng(seed).normal(size=len(T))
-    return Measured(data, np.zeros(len(T), dtype=np.int64), np.array([noise]), TRUTH, np.full(2, deviation))
+    return Measured(
+        data, np.zeros(len(T), dtype=np.int64), np.array([noise]), TRUTH, np.full(2, deviation)
+    )
 
 
 def fit(known: Measured, start: tuple[float, float] = (1.0, 1.0)) -> Fit:
@@ -35,17 +47,24 @@ def fit(known: Measured, start: tuple[float, float] = (1.0, 1.0)) -> Fit:
 
 @pytest.mark.parametrize("noise", [NOISE, np.nan])
 def test_bands_cover_what_they_say(noise: float) -> None:
-    """500 repeats, noise given and estimated: 95 % within two deviations of that share, 2 %; no bias."""
+    """500 repeats, noise given and estimated: 95 % within two deviations of that share, 2 %; no
+    bias.
+    """
     fits = [fit(measured(seed, noise), (2.0, 0.8)) for seed in range(500)]
     inside = np.mean([(f.band[0] < TRUTH) & (f.band[1] > TRUTH) for f in fits], axis=0)
     assert inside == pytest.approx(0.95, abs=0.02)
     spread = np.std([f.x for f in fits], axis=0)
-    assert np.mean([f.x for f in fits], axis=0) == pytest.approx(TRUTH, abs=3 * spread.max() / np.sqrt(500))
+    assert np.mean([f.x for f in fits], axis=0) == pytest.approx(
+        TRUTH, abs=3 * spread.max() / np.sqrt(500)
+    )
     assert np.mean([f.deviation**2 for f in fits], axis=0) ** 0.5 == pytest.approx(spread, rel=0.1)
 
 
 def sampled(known: Measured, begin: Array, step: Array, count: int) -> Array:
-    """Samples of the posterior by Metropolis' algorithm (J. Chem. Phys. 21, 1953), of 200 walkers at once."""
+    """Samples of the posterior by Metropolis' algorithm (J.
+
+    Chem. Phys. 21, 1953), of 200 walkers at once.
+    """
     rng, x, found = np.random.default_rng(5), np.tile(begin, (200, 1)), []
 
     def misfit(x: Array) -> Array:
@@ -91,7 +110,11 @@ def test_one_more_measurement() -> None:
     own = fit(known)
     k = len(T) - 1
     again = Measured(
-        np.append(known.data, own.y[k]), np.zeros(len(T) + 1, dtype=np.int64), known.noise, known.mean, known.deviation
+        np.append(known.data, own.y[k]),
+        np.zeros(len(T) + 1, dtype=np.int64),
+        known.noise,
+        known.mean,
+        known.deviation,
     )
 
     def twice(x: Array) -> tuple[Array, Array] | None:
@@ -108,30 +131,40 @@ def test_what_data_do_not_see_is_named() -> None:
     def product(x: Array) -> tuple[Array, Array]:
         return x[0] * x[1] * T, np.outer(T, x[::-1])
 
-    known = Measured(2 * T, np.zeros(len(T), dtype=np.int64), np.array([0.1]), np.ones(2), np.full(2, np.inf))
+    known = Measured(
+        2 * T, np.zeros(len(T), dtype=np.int64), np.array([0.1]), np.ones(2), np.full(2, np.inf)
+    )
     with pytest.raises(NotSeen) as refused:
         fitted(product, known, np.array([1.0, 1.5]), np.ones(2), 5, lambda *_: None)
     assert refused.value.numbers == [0, 1]
     one = Measured(known.data, known.group, known.noise, np.ones(2), np.array([0.1, np.inf]))
-    assert fitted(product, one, np.array([1.0, 1.5]), np.ones(2), 30, lambda *_: None).x == pytest.approx(
-        [1.0, 2.0], rel=1e-6
-    )
+    assert fitted(
+        product, one, np.array([1.0, 1.5]), np.ones(2), 30, lambda *_: None
+    ).x == pytest.approx([1.0, 2.0], rel=1e-6)
 
 
 def mean_of(data: Array, deviation: float, noise: float = np.nan) -> Fit:
     """A number that is measured itself, with the prior 0 +- deviation."""
     known = Measured(
-        data, np.zeros(len(data), dtype=np.int64), np.array([noise]), np.zeros(1), np.array([float(deviation)])
+        data,
+        np.zeros(len(data), dtype=np.int64),
+        np.array([noise]),
+        np.zeros(1),
+        np.array([float(deviation)]),
     )
     slopes = np.ones((len(data), 1))
-    return fitted(lambda x: (x[0] + 0 * data, slopes), known, np.zeros(1), np.ones(1), 50, lambda *_: None)
+    return fitted(
+        lambda x: (x[0] + 0 * data, slopes), known, np.zeros(1), np.ones(1), 50, lambda *_: None
+    )
 
 
 @pytest.mark.parametrize("deviation", [0.1, 0.3, 1.0])
 def test_few_data_beside_a_prior(deviation: float) -> None:
-    """300 numbers from the prior, each measured three times with unknown noise: 90 to 97 % lie in their bands.
+    """300 numbers from the prior, each measured three times with unknown noise: 90 to 97 % lie in
+    their bands.
 
-    Student's t alone, of about two degrees of freedom, makes bands that are wider than the prior's own.
+    Student's t alone, of about two degrees of freedom, makes bands that are wider than the prior's
+    own.
     """
     rng, inside, widest = np.random.default_rng(1), [], 0.0
     for _ in range(300):
@@ -147,24 +180,32 @@ def test_data_that_do_not_say_their_noise() -> None:
     """One number measured once: the noise would follow the fit to zero, and the band with it."""
     with pytest.raises(NoNoise):
         mean_of(np.array([1.0]), 10.0)
-    assert mean_of(np.array([1.0]), 10.0, 0.5).deviation == pytest.approx([1 / np.hypot(1 / 10, 1 / 0.5)])
+    assert mean_of(np.array([1.0]), 10.0, 0.5).deviation == pytest.approx(
+        [1 / np.hypot(1 / 10, 1 / 0.5)]
+    )
 
 
 def test_bands_that_are_wide_as_data_are_few() -> None:
-    """E of a spring y = 1/E from two data: linear two deviations away, and not at the ends of its band."""
+    """E of a spring y = 1/E from two data: linear two deviations away, and not at the ends of its
+    band.
+    """
     data = np.array([0.95, 1.05])
 
     def spring(x: Array) -> tuple[Array, Array] | None:
         return None if x[0] <= 0 else (np.full(2, 1 / x[0]), np.full((2, 1), -1 / x[0] ** 2))
 
-    known = Measured(data, np.zeros(2, dtype=np.int64), np.array([np.nan]), np.ones(1), np.array([np.inf]))
+    known = Measured(
+        data, np.zeros(2, dtype=np.int64), np.array([np.nan]), np.ones(1), np.array([np.inf])
+    )
     own = fitted(spring, known, np.ones(1), np.ones(1), 20, lambda *_: None)
     assert own.band[0] < 0.5
     assert nonlinearity(spring, own)[0] > NORMAL
 
 
 class Blurred:
-    """Forty means of a field of 25 numbers on a line, with noise: all is normal, its posterior has a closed form."""
+    """Forty means of a field of 25 numbers on a line, with noise: all is normal, its posterior has
+    a closed form.
+    """
 
     S, LENGTH = 0.7, 0.25
     X = np.linspace(0, 1, 25)
@@ -180,11 +221,15 @@ class Blurred:
         smooth = Smooth(0, np.abs(self.X[:, None] - self.X), 1, deviation, length)
         group = np.zeros(40, dtype=np.int64)
         known = Measured(data, group, np.array([noise]), np.zeros(25), np.full(25, np.inf), smooth)
-        return fitted(lambda x: (self.J @ x, self.J), known, np.zeros(25), np.ones(25), 20, lambda *_: None)
+        return fitted(
+            lambda x: (self.J @ x, self.J), known, np.zeros(25), np.ones(25), 20, lambda *_: None
+        )
 
 
 def test_a_smooth_field_of_given_strength() -> None:
-    """Mean and covariance of a normal field given its data (Rasmussen and Williams 2006, eq. 2.25 and 2.26)."""
+    """Mean and covariance of a normal field given its data (Rasmussen and Williams 2006, eq. 2.25
+    and 2.26).
+    """
     own, rng = Blurred(), np.random.default_rng(2)
     truth = np.linalg.cholesky(own.K) @ rng.normal(size=25)
     fit = own.fit(truth, 3, own.S, own.LENGTH, NOISE)

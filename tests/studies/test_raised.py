@@ -1,4 +1,6 @@
-"""The lowest of several values raised: by linear programs of all planes that were seen (studies/raised.py)."""
+"""The lowest of several values raised: by linear programs of all planes that were seen
+(studies/raised.py).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +19,9 @@ SEEN = 3  # of the values the lowest ones
 
 @dataclass
 class Eigenvalues:
-    """The lowest eigenvalues of A0 + sum x_i A_i, which cross, with their slopes; `most` bounds the sum of x."""
+    """The lowest eigenvalues of A0 + sum x_i A_i, which cross, with their slopes; `most` bounds the
+    sum of x.
+    """
 
     A: Array
     most: float
@@ -46,7 +50,9 @@ class Eigenvalues:
                 return Evaluation()
             values, vectors = np.linalg.eigh(self.of(x))
             slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:SEEN]]
-            beside = [(float(value), slope) for value, slope in zip(values[:SEEN], slopes, strict=True)]
+            beside = [
+                (float(value), slope) for value, slope in zip(values[:SEEN], slopes, strict=True)
+            ]
             return Evaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
 
         return evaluate
@@ -54,7 +60,9 @@ class Eigenvalues:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_eigenvalues_that_cross(seed: int) -> None:
-    """The lowest eigenvalue is concave: the planes of all places, in all of the bounds, are a bound of its maximum."""
+    """The lowest eigenvalue is concave: the planes of all places, in all of the bounds, are a bound
+    of its maximum.
+    """
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(5, 8, 8))
     A = A + A.transpose(0, 2, 1)
@@ -66,16 +74,22 @@ def test_eigenvalues_that_cross(seed: int) -> None:
         slope = np.array([v @ of @ v for of in A[1:]])
         rows.append(np.append(-slope, 1.0))
         sides.append(value - slope @ x)
-    most = -scipy.optimize.linprog([0, 0, 0, 0, -1], rows, sides, bounds=[(0, 1)] * 4 + [(None, None)]).fun
+    most = -scipy.optimize.linprog(
+        [0, 0, 0, 0, -1], rows, sides, bounds=[(0, 1)] * 4 + [(None, None)]
+    ).fun
     kept = [x for x in [tried[0], *tried[2:]] if x.sum() <= goal.most + 1e-9]
     assert "foreseen" in ended
-    assert max(np.linalg.eigvalsh(goal.of(x))[0] for x in kept) == pytest.approx(most, abs=1e-3 * abs(most))
+    assert max(np.linalg.eigvalsh(goal.of(x))[0] for x in kept) == pytest.approx(
+        most, abs=1e-3 * abs(most)
+    )
     assert np.linalg.eigvalsh(goal.of(tried[0]))[0] < most - 0.3
 
 
 @dataclass
 class Slight:
-    """1 + x0 - 0.1 x1^2, with the constraint b (0.1 - x0) >= 0, that hardly depends on the variables."""
+    """1 + x0 - 0.1 x1^2, with the constraint b (0.1 - x0) >= 0, that hardly depends on the
+    variables.
+    """
 
     b: float
 

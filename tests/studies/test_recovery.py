@@ -29,7 +29,9 @@ design: {objective: {shape: {components: [x, y, z]}}, remanence: {points: 6}}
 
 @pytest.mark.slow
 def test_from_its_own_shape(tmp_path: Path) -> None:
-    """The misfit falls by 1e6, and the field is found where it shows: a torque near the root bends little of it."""
+    """The misfit falls by 1e6, and the field is found where it shows: a torque near the root bends
+    little of it.
+    """
     (tmp_path / "strip.yaml").write_text(STRIP)
     source = read_source(tmp_path / "strip.yaml")
     case = Case.from_source(source)
@@ -68,7 +70,9 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
         return value, slope
 
     with contextlib.suppress(Enough):
-        scipy.optimize.minimize(watched, vary.first, jac=True, method="L-BFGS-B", options={"maxiter": 80, "ftol": 0.0})
+        scipy.optimize.minimize(
+            watched, vary.first, jac=True, method="L-BFGS-B", options={"maxiter": 80, "ftol": 0.0}
+        )
     assert min(misfits) < 1e-6 * misfits[0]
     along = np.linspace(0, 1, 11)
     assert vary.controls

@@ -1,4 +1,6 @@
-"""The runner of many runs: what is kept and what is not, shares, the rest of the time, and one's own study on it."""
+"""The runner of many runs: what is kept and what is not, shares, the rest of the time, and one's
+own study on it.
+"""
 
 import json
 import re
@@ -20,7 +22,16 @@ from magshell_fenicsx.platform import environment
 from magshell_fenicsx.public import run
 from magshell_fenicsx.studies import runner
 from magshell_fenicsx.studies.results import parse_scalar
-from magshell_fenicsx.studies.runner import Folder, Outcome, compute, keep, keep_outcome, kept, kept_outcome, outcome_of
+from magshell_fenicsx.studies.runner import (
+    Folder,
+    Outcome,
+    compute,
+    keep,
+    keep_outcome,
+    kept,
+    kept_outcome,
+    outcome_of,
+)
 
 PLATE = CASES / "clamped_plate.yaml"
 OUTCOME = Outcome.failed("lost", 1.5, 3)
@@ -31,10 +42,14 @@ def test_no_study_knows_the_case_file() -> None:
     rooms = Path(magshell_fenicsx.__file__).parent
     files = [*(rooms / "studies").glob("*.py"), rooms / "input" / "chance.py"]
     assert len(files) > 20
-    assert not [file.name for file in files if "magshell_fenicsx.case" in file.read_text(encoding="utf-8")]
+    assert not [
+        file.name for file in files if "magshell_fenicsx.case" in file.read_text(encoding="utf-8")
+    ]
 
 
-def test_an_outcome_is_kept_for_these_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_outcome_is_kept_for_these_sources(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is missing, cut off, of other types or of other sources is none."""
     file, case = tmp_path / "a.json", Case.load(PLATE)
     assert kept_outcome(file) is None
@@ -69,7 +84,8 @@ def test_only_what_has_the_same_beside_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("part", ["0/2", "3/2", "1", "a/b", "1/9", "1/2/3"])
 def test_a_part_that_is_none(part: str) -> None:
     with pytest.raises(
-        CaseError, match=f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of"
+        CaseError,
+        match=f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of",
     ):
         runner.part_of(part, 8, "points")
 
@@ -89,8 +105,13 @@ def test_the_rest_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_study_of_ones_own(tmp_path: Path) -> None:
-    """Cases in, outcomes and a table out: the deflection of a plate over its load, which a second call only reads."""
-    scalar, folder = parse_scalar("w_from_field_over_h@end"), Folder("a line", ("line.json", "line.csv"), ("loads",))
+    """Cases in, outcomes and a table out: the deflection of a plate over its load, which a second
+    call only reads.
+    """
+    scalar, folder = (
+        parse_scalar("w_from_field_over_h@end"),
+        Folder("a line", ("line.json", "line.csv"), ("loads",)),
+    )
     computed: list[float] = []
 
     def line(loads: list[float]) -> list[float | None]:
@@ -102,14 +123,24 @@ def test_a_study_of_ones_own(tmp_path: Path) -> None:
             case = Case.from_source(read_source(PLATE, settings))
             result = run(case, comm=MPI.COMM_SELF)
             computed.append(load)
-            keep_outcome(outcome_of(result, "path", result.scene.newton.factorisation.count), case, files[load])
+            keep_outcome(
+                outcome_of(result, "path", result.scene.newton.factorisation.count),
+                case,
+                files[load],
+            )
             yield f"{load}"
 
-        compute([load for load in loads if kept_outcome(files[load]) is None], load_computed, MPI.COMM_WORLD)
+        compute(
+            [load for load in loads if kept_outcome(files[load]) is None],
+            load_computed,
+            MPI.COMM_WORLD,
+        )
         outcomes = [kept_outcome(file) for file in files.values()]
         values = [outcome.value(scalar) if outcome else None for outcome in outcomes]
         write_csv(
-            [{"load": load, "w": w} for load, w in zip(loads, values, strict=True)], ("load", "w"), tmp_path / "t"
+            [{"load": load, "w": w} for load, w in zip(loads, values, strict=True)],
+            ("load", "w"),
+            tmp_path / "t",
         )
         return values
 
@@ -120,7 +151,9 @@ def test_a_study_of_ones_own(tmp_path: Path) -> None:
 
 
 def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the rest of the time once it is known, and never beside a line that was just said; nested, once."""
+    """With the rest of the time once it is known, and never beside a line that was just said;
+    nested, once.
+    """
     monkeypatch.setattr(runner, "EACH", 0.2)
     said: list[str] = []
 

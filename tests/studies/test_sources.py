@@ -1,4 +1,6 @@
-"""What is kept on disk is not taken for a result of other sources, of another case or of another mesh."""
+"""What is kept on disk is not taken for a result of other sources, of another case or of another
+mesh.
+"""
 
 import json
 import os
@@ -46,7 +48,9 @@ def edited(monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
     """A folder with a copy of the package, as an installation makes it."""
-    shutil.copytree(PACKAGE, tmp_path / "site" / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        PACKAGE, tmp_path / "site" / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__")
+    )
     return tmp_path / "site"
 
 
@@ -58,14 +62,20 @@ def magshell(site: Path, *words: str | Path) -> subprocess.CompletedProcess[str]
 
 
 def test_every_file_of_the_package_counts(copied: Path) -> None:
-    """Code, C and template: changed, renamed, added, taken away; where it lies and what Python compiles do not."""
+    """Code, C and template: changed, renamed, added, taken away; where it lies and what Python
+    compiles do not.
+    """
     package = copied / PACKAGE.name
     known = [environment.version_of(package)]
     assert known == [environment.code_version()]
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "cli.cpython-313.pyc").write_bytes(b"compiled")
     assert known == [environment.version_of(package)]
-    for file in ("continuation/newton.py", "assembly/scatter.c", "output/report/report_template.html"):
+    for file in (
+        "continuation/newton.py",
+        "assembly/scatter.c",
+        "output/report/report_template.html",
+    ):
         with (package / file).open("a", encoding="utf-8") as stream:
             stream.write("\n")
         known.append(environment.version_of(package))
@@ -80,17 +90,24 @@ def test_every_file_of_the_package_counts(copied: Path) -> None:
 
 @pytest.mark.slow
 def test_an_interrupted_run_of_an_edited_program(copied: Path, tmp_path: Path) -> None:
-    """In a copy of the package, one file of which is changed: one message, exit code 2, nothing is lost."""
+    """In a copy of the package, one file of which is changed: one message, exit code 2, nothing is
+    lost.
+    """
     words = ("run", BUCKLING, *(f"--set={setting}" for setting in QUICK), "--out", tmp_path / "out")
     assert magshell(copied, *words, "--time-limit", "0").returncode == 3
     before = (tmp_path / "out" / "checkpoint").read_bytes()
-    with (copied / PACKAGE.name / "continuation" / "newton.py").open("a", encoding="utf-8") as stream:
+    with (copied / PACKAGE.name / "continuation" / "newton.py").open(
+        "a", encoding="utf-8"
+    ) as stream:
         stream.write("\n# another tolerance\n")
     done = magshell(copied, *words, "--resume")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     version = magshell_fenicsx.__version__
-    assert f"--resume: {tmp_path}/out was computed by other sources of magshell_fenicsx ({version}+" in done.stderr
+    assert (
+        f"--resume: {tmp_path}/out was computed by other sources of magshell_fenicsx ({version}+"
+        in done.stderr
+    )
     assert "--overwrite in place of --resume computes it again" in done.stderr
     assert (tmp_path / "out" / "checkpoint").read_bytes() == before
 
@@ -110,7 +127,9 @@ def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any, no_picture
 
 
 def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
-    """The case where it does, else the sources; what an earlier version of the program left is of others."""
+    """The case where it does, else the sources; what an earlier version of the program left is of
+    others.
+    """
     this, file = document_of(Case.load(BUCKLING)), tmp_path / "checkpoint"
     file.write_bytes(checkpoint.begun(this))
     checkpoint.check_resumable(file, this)
@@ -141,7 +160,9 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     """Are computed again, and it is said how many and why; then they are kept again."""
     said, computed = [], []
     whole = chain.run
-    monkeypatch.setattr(chain, "run", lambda case, comm: computed.append(case) or whole(case, comm=comm))
+    monkeypatch.setattr(
+        chain, "run", lambda case, comm: computed.append(case) or whole(case, comm=comm)
+    )
 
     def again(*over: str) -> list[str]:
         said.clear()
@@ -158,7 +179,9 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     assert len(computed) == 3
     assert again("loading.pressure=1e-5:3e-5:3") == []
     assert computed == []
-    kept = [json.loads(file.read_text(encoding="utf-8")) for file in (tmp_path / "points").iterdir()]
+    kept = [
+        json.loads(file.read_text(encoding="utf-8")) for file in (tmp_path / "points").iterdir()
+    ]
     assert [point["sources"] for point in kept] == 3 * [OTHER]
 
 
@@ -186,9 +209,13 @@ def faked(monkeypatch: pytest.MonkeyPatch, module: Any) -> list[str]:
         out = Path(words[words.index("--out") + 1])
         out.mkdir(parents=True, exist_ok=True)
         by.append(environment.code_version())
-        (out / "summary.json").write_text(json.dumps({**SUMMARY, "sources": by[-1]}), encoding="utf-8")
+        (out / "summary.json").write_text(
+            json.dumps({**SUMMARY, "sources": by[-1]}), encoding="utf-8"
+        )
         row = {name: "" if name in TEXTS else "0" for name in COLUMNS}
-        (out / "path.csv").write_text(f"{','.join(row)}\n{','.join(row.values())}\n", encoding="utf-8")
+        (out / "path.csv").write_text(
+            f"{','.join(row)}\n{','.join(row.values())}\n", encoding="utf-8"
+        )
         return Usage(0, 1.0, 1.0, 100.0, "", "")
 
     monkeypatch.setattr(module, "measure", measure)
@@ -201,18 +228,30 @@ def test_samples_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edi
     def measured() -> int:
         before = len(by)
         said.clear()
-        study(BUCKLING, ["mesh.refinement=0.3,0.5"], result="knockdown", repeat=1, out=tmp_path, say=said.append)
+        study(
+            BUCKLING,
+            ["mesh.refinement=0.3,0.5"],
+            result="knockdown",
+            repeat=1,
+            out=tmp_path,
+            say=said.append,
+        )
         return len(by) - before
 
     assert (measured(), measured()) == (4, 0)
     assert not any("again" in line for line in said)
     edited()
     assert measured() == 4
-    assert said[0] == "2 of 2 computed again: the folder has results of other sources of magshell_fenicsx"
+    assert (
+        said[0]
+        == "2 of 2 computed again: the folder has results of other sources of magshell_fenicsx"
+    )
     assert measured() == 0
 
 
-def test_a_program_that_changes_under_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_changes_under_a_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A run of other sources than the study's is no sample."""
     faked(monkeypatch, sample)
     measured = sample.Timings({})
@@ -244,7 +283,9 @@ def test_runs_of_a_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, e
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_mesh_file_that_changes_on_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_file_that_changes_on_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All points of a sweep, and all of a run, are of the mesh that it began with."""
     (tmp_path / "bracket.msh").write_bytes((CASES.parent / "meshes" / "bracket.msh").read_bytes())
     text = (CASES / "bracket.yaml").read_text(encoding="utf-8").replace("../meshes/", "")
@@ -259,7 +300,9 @@ def test_a_mesh_file_that_changes_on_the_way(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(chain, "run", edited)
     first = Case.load(tmp_path / "case.yaml", settings).outside["mesh_file"]
-    done = sweep(tmp_path / "case.yaml", ["shell.poisson_ratio=0.2,0.3"], settings, tmp_path / "out")
+    done = sweep(
+        tmp_path / "case.yaml", ["shell.poisson_ratio=0.2,0.3"], settings, tmp_path / "out"
+    )
     assert [point.case.outside["mesh_file"] for point in done.points] == [first, first]
     case = Case.load(tmp_path / "case.yaml", settings)
     before = case.outside["mesh_file"]
@@ -269,5 +312,12 @@ def test_a_mesh_file_that_changes_on_the_way(tmp_path: Path, monkeypatch: pytest
             stream.write("\n")
 
     run(case, tmp_path / "run", say=say)
-    assert case.outside["mesh_file"] == before != Case.load(tmp_path / "case.yaml", settings).outside["mesh_file"]
-    assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["mesh_file"] == before
+    assert (
+        case.outside["mesh_file"]
+        == before
+        != Case.load(tmp_path / "case.yaml", settings).outside["mesh_file"]
+    )
+    assert (
+        json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["mesh_file"]
+        == before
+    )

@@ -1,4 +1,6 @@
-"""Studies: what a result is, what errors are measured against, that times are those of clean processes."""
+"""Studies: what a result is, what errors are measured against, that times are those of clean
+processes.
+"""
 
 import csv
 import json
@@ -27,7 +29,13 @@ K_D = 0.326233289  # axisymmetric solver, nine digits
 def path(*points: tuple[str, float, float]) -> list[dict[str, str]]:
     """Rows of a path.csv with (amplitude, w_over_h, force)."""
     return [
-        {"amplitude": amplitude, "w_over_h": repr(w), "force": repr(force), "mode": "", "branch": "0"}
+        {
+            "amplitude": amplitude,
+            "w_over_h": repr(w),
+            "force": repr(force),
+            "mode": "",
+            "branch": "0",
+        }
         for amplitude, w, force in points
     ]
 
@@ -37,7 +45,9 @@ def force_at(w: float, rows: list[dict[str, str]]) -> float | None:
 
 
 def test_result_at_a_requested_point_is_its_row() -> None:
-    rows = path(("", 0.0, 0.0), ("force", 1.0, 2.5), ("force", 2.0, 3.7), ("force", 3.0 - 1e-12, 4.4))
+    rows = path(
+        ("", 0.0, 0.0), ("force", 1.0, 2.5), ("force", 2.0, 3.7), ("force", 3.0 - 1e-12, 4.4)
+    )
     assert force_at(1, rows) == 2.5
     assert force_at(2, rows) == 3.7
     assert force_at(3, rows) == 4.4
@@ -47,14 +57,19 @@ def test_result_at_a_requested_point_is_its_row() -> None:
 
 def test_a_frequency_is_no_column() -> None:
     with pytest.raises(
-        CaseError, match=r"--result hertz_1@end: hertz_1 is a natural frequency, which path.csv has not"
+        CaseError,
+        match=r"--result hertz_1@end: hertz_1 is a natural frequency, which path.csv has not",
     ):
         parse_scalar("hertz_1@end")
 
 
 def test_result_between_points_is_cubic() -> None:
-    """F = w^3 is met exactly; the field's part of the path, which meets it in a corner, is left out."""
-    rows = path(("", -9.0, 5.0), ("lambda_m", 0.0, 0.0), *(("force", w, w**3) for w in (1.0, 2.0, 3.5)))
+    """F = w^3 is met exactly; the field's part of the path, which meets it in a corner, is left
+    out.
+    """
+    rows = path(
+        ("", -9.0, 5.0), ("lambda_m", 0.0, 0.0), *(("force", w, w**3) for w in (1.0, 2.0, 3.5))
+    )
     assert force_at(1.5, rows) == pytest.approx(1.5**3, rel=1e-14)
     assert force_at(3, rows) == pytest.approx(_parabola(3.0), rel=1e-14)  # the last three points
 
@@ -65,7 +80,9 @@ def _parabola(w: float) -> float:
 
 
 def test_result_is_the_first_on_the_way() -> None:
-    """A path that turns back has two forces at one displacement; branches and excluded modes are not on the way."""
+    """A path that turns back has two forces at one displacement; branches and excluded modes are
+    not on the way.
+    """
     rows = path(("force", 0.0, 0.0), ("force", 2.0, 2.0), ("force", 1.0, 3.0))
     assert force_at(1.5, rows) == 1.5
     aside = [{**rows[2], "branch": "1"}, {**rows[2], "mode": "antisymmetric"}]
@@ -79,7 +96,9 @@ def test_results_of_the_summary() -> None:
     assert Scalar("critical_field").of(told, []) == -0.0034
     assert Scalar("critical_field").of({"limit_points": points[:1]}, []) is None
     earlier = {"snaps": [{"time": 2.0, "overshoot": 0.0}]}  # of an earlier version
-    of_snaps = [Scalar(name).of(earlier, []) for name in ("snap_time", "snap_departure", "snap_jump")]
+    of_snaps = [
+        Scalar(name).of(earlier, []) for name in ("snap_time", "snap_departure", "snap_jump")
+    ]
     assert of_snaps == [2.0, None, None]
     assert Scalar("snap_jump").of({"snaps": []}, []) is None
 
@@ -87,7 +106,10 @@ def test_results_of_the_summary() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("k_d", "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, snap_dep"),
+        (
+            "k_d",
+            "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, snap_dep",
+        ),
         ("force", "nothing is no column"),
         ("force@w=1", "w is no column"),
         ("label@end", "label is no column"),
@@ -153,13 +175,24 @@ def test_errors_and_front_against_a_given_reference() -> None:
 
 
 def test_front_of_single_ranks_is_by_cpu_time() -> None:
-    """Another program made the first wait: it is the fastest all the same. On two ranks waiting counts."""
+    """Another program made the first wait: it is the fastest all the same.
+
+    On two ranks waiting counts.
+    """
     runs, kept = made((0.51, 100, 5.0), (0.5005, 200, 2.0), (0.502, 300, 3.0))
     for one, seconds in zip(kept, (1.0, 2.0, 3.0), strict=True):
         one.samples = [{**times, "cpu_s": seconds} for times in one.samples]
-    assert [row["pareto"] for row in make_rows(runs, Scalar("knockdown"), 0.5)[0]] == [True, True, False]
+    assert [row["pareto"] for row in make_rows(runs, Scalar("knockdown"), 0.5)[0]] == [
+        True,
+        True,
+        False,
+    ]
     on_two = [Run(run.point, 2, run.measured) for run in runs]
-    assert [row["pareto"] for row in make_rows(on_two, Scalar("knockdown"), 0.5)[0]] == [False, True, False]
+    assert [row["pareto"] for row in make_rows(on_two, Scalar("knockdown"), 0.5)[0]] == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_finest_run_is_the_reference_with_its_own_error() -> None:
@@ -185,7 +218,9 @@ def test_run_without_the_result_is_a_row_with_its_cause() -> None:
 
 @pytest.mark.slow
 def test_peak_and_cpu_are_those_of_the_process(tmp_path: Path) -> None:
-    """200 MB written to and a second of work, against neither; the starter's own 400 MB do not count."""
+    """200 MB written to and a second of work, against neither; the starter's own 400 MB do not
+    count.
+    """
     (tmp_path / "rest.py").write_text("import sys; sys.exit(3)", encoding="utf-8")
     work = "x = bytearray(200 << 20)\nfor i in range(0, len(x), 1024): x[i] = 1\n"
     work += "import time; start = time.process_time()\nwhile time.process_time() < start + 1: pass"
@@ -234,7 +269,9 @@ def small(out: Path, **options: Any) -> Any:
 
 @pytest.mark.slow
 def test_study_measures_and_keeps(tmp_path: Path, started: list[list[str]]) -> None:
-    """k_d of two meridians against the axisymmetric reference; a second call runs only what it lacks."""
+    """k_d of two meridians against the axisymmetric reference; a second call runs only what it
+    lacks.
+    """
     said: list[str] = []
     done = small(tmp_path, reference=K_D, say=said.append)
     assert len(started) == 4  # each once to compile, once to measure
@@ -274,9 +311,19 @@ def test_study_measures_and_keeps(tmp_path: Path, started: list[list[str]]) -> N
 
 @pytest.mark.slow
 def test_ranks_and_a_field_that_is_too_strong(tmp_path: Path) -> None:
-    """Beyond the critical field (axisymmetric: -0.0033554) a run stops early: the field is its result."""
+    """Beyond the critical field (axisymmetric: -0.0033554) a run stops early: the field is its
+    result.
+    """
     settings = ["magnetic.lambda_m=-0.0035", "mesh.refinement=0.5"]
-    done = study(DIMPLE, ["mesh.degree=4"], settings, result="critical_field", ranks=[2, 1], repeat=1, out=tmp_path)
+    done = study(
+        DIMPLE,
+        ["mesh.degree=4"],
+        settings,
+        result="critical_field",
+        ranks=[2, 1],
+        repeat=1,
+        out=tmp_path,
+    )
     one, two = done.rows
     assert (one["ranks"], two["ranks"]) == (1, 2)
     assert one["result"] == pytest.approx(two["result"], rel=1e-9)

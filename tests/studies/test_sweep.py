@@ -22,7 +22,9 @@ from magshell_fenicsx.studies import sweep as module
 from magshell_fenicsx.studies import sweep_picture as sweep_plot
 from magshell_fenicsx.studies.points import SweepPoint, parse_axes
 
-PLATE, DIMPLE, POLE = (CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation"))
+PLATE, DIMPLE, POLE = (
+    CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation")
+)
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
 PRESSURES = "loading.pressure=1e-5:3e-5:2"
 
@@ -55,7 +57,9 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return done
 
 
-def plate(out: Path, *over: str, settings: tuple[str, ...] = (), say: Callable[[str], None] = print) -> module.Sweep:
+def plate(
+    out: Path, *over: str, settings: tuple[str, ...] = (), say: Callable[[str], None] = print
+) -> module.Sweep:
     return sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out, say=say)
 
 
@@ -105,10 +109,16 @@ def test_units_and_exact_ends() -> None:
         ("mesh.refinement=1:2:100000000", "count is 100000000"),
         ("magnetic.remanent=[1,2]", "only numbers and words"),
         ("mesh.degree+mesh.degree=3,4", "mesh.degree is swept twice"),
-        ("mesh.refinement.x=1,2", "--over mesh.refinement.x=1: refinement is a value, not a section"),
+        (
+            "mesh.refinement.x=1,2",
+            "--over mesh.refinement.x=1: refinement is a value, not a section",
+        ),
         ("mesh.degre=3,4", "mesh.degre: unknown key; did you mean degree?"),
         ("mesh.degree=3:4:3", "mesh.degree: 3.5: must be a valid integer"),
-        ("mesh.degree=3,4,9", "--over mesh.degree=9: mesh.degree: 9: must be less than or equal to 5"),
+        (
+            "mesh.degree=3,4,9",
+            "--over mesh.degree=9: mesh.degree: 9: must be less than or equal to 5",
+        ),
         ("symmetry=auto,half", "have no common mirror plane"),
     ],
 )
@@ -117,7 +127,10 @@ def test_mistakes_are_found_at_the_door(over: str, message: str) -> None:
         make_points(
             DIMPLE,
             parse_axes([over]),
-            ["magnetic={lambda_m: 1e-3, remanent: {polar: 9}, applied: {polar: 9, azimuth: 9}}", "mesh.refinement=1"],
+            [
+                "magnetic={lambda_m: 1e-3, remanent: {polar: 9}, applied: {polar: 9, azimuth: 9}}",
+                "mesh.refinement=1",
+            ],
         )
     assert message in str(e.value)
 
@@ -132,9 +145,22 @@ def test_too_many_points_and_a_key_that_is_also_set() -> None:
 @pytest.mark.telling
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_invalid_point_is_one_message_and_nothing_is_computed(tmp_path: Path, ranks: int) -> None:
-    done = magshell("sweep", PLATE, "--over", "shell.poisson_ratio=0.3,0.7", "--out", tmp_path / "out", ranks=ranks)
+    done = magshell(
+        "sweep",
+        PLATE,
+        "--over",
+        "shell.poisson_ratio=0.3,0.7",
+        "--out",
+        tmp_path / "out",
+        ranks=ranks,
+    )
     assert done.returncode == 2
-    assert done.stderr.count("--over shell.poisson_ratio=0.7: shell.poisson_ratio: 0.7: must be less than") == 1
+    assert (
+        done.stderr.count(
+            "--over shell.poisson_ratio=0.7: shell.poisson_ratio: 0.7: must be less than"
+        )
+        == 1
+    )
     assert "in the point shell.poisson_ratio=0.7" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
@@ -162,42 +188,65 @@ def test_second_call_computes_what_is_missing(tmp_path: Path, computed: list[flo
     assert computed == [1e-5, 3e-5, 2e-5, 1e-5]
 
 
-def test_another_sweep_into_a_folder_adds_or_is_refused(tmp_path: Path, computed: list[float]) -> None:
-    """sweep.csv never loses a row: more values are added to it; another case and other keys need another folder."""
+def test_another_sweep_into_a_folder_adds_or_is_refused(
+    tmp_path: Path, computed: list[float]
+) -> None:
+    """sweep.csv never loses a row: more values are added to it; another case and other keys need
+    another folder.
+    """
     plate(tmp_path)
     before = {row["point"] for row in read(tmp_path / "sweep.csv")}
     plate(tmp_path, "loading.pressure=3e-5,5e-5")
     after = (tmp_path / "sweep.csv").read_text(encoding="utf-8")
     assert computed == [1e-5, 3e-5, 5e-5]
     assert before < {row["point"] for row in read(tmp_path / "sweep.csv")}
-    assert [float(row["loading.pressure"]) for row in read(tmp_path / "sweep.csv")] == [1e-5, 3e-5, 5e-5]
-    with pytest.raises(CaseError, match="has a sweep of another case or other --set, which is kept; give another"):
+    assert [float(row["loading.pressure"]) for row in read(tmp_path / "sweep.csv")] == [
+        1e-5,
+        3e-5,
+        5e-5,
+    ]
+    with pytest.raises(
+        CaseError, match="has a sweep of another case or other --set, which is kept; give another"
+    ):
         plate(tmp_path, settings=("shell.radius_to_thickness=60",))
-    with pytest.raises(CaseError, match=r"has a sweep over loading\.pressure, which is kept; give another folder for"):
+    with pytest.raises(
+        CaseError,
+        match=r"has a sweep over loading\.pressure, which is kept; give another folder for",
+    ):
         plate(tmp_path, "shell.poisson_ratio=0.3,0.4")
     (tmp_path / "sweep.json").unlink()
-    with pytest.raises(CaseError, match=r"has a sweep\.csv of an earlier version; give another folder"):
+    with pytest.raises(
+        CaseError, match=r"has a sweep\.csv of an earlier version; give another folder"
+    ):
         plate(tmp_path)
     assert (tmp_path / "sweep.csv").read_text(encoding="utf-8") == after
 
 
-def test_a_large_sweep_reads_each_value_a_few_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_sweep_reads_each_value_a_few_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The work before the first point grows like the number of points."""
     asked: list[str] = []
-    monkeypatch.setattr(axes_module, "number_and_unit", lambda text: asked.append(text) or number_and_unit(text))
+    monkeypatch.setattr(
+        axes_module, "number_and_unit", lambda text: asked.append(text) or number_and_unit(text)
+    )
     axes = parse_axes(["loading.pressure=1e-5:3e-5:15", "shell.poisson_ratio=0.1:0.4:4"])
     with_earlier(tmp_path, read_source(PLATE), axes, make_points(PLATE, axes))
     assert len(asked) < 10 * 60
 
 
 def test_a_named_result_of_each_point(tmp_path: Path, computed: list[float]) -> None:
-    """A clamped plate, w = p R^4/(64 D) at its centre (Timoshenko): a column, and a line for each point.
+    """A clamped plate, w = p R^4/(64 D) at its centre (Timoshenko): a column, and a line for each
+    point.
 
-    Points that an earlier sweep has kept without that column are computed again, then they are kept.
+    Points that an earlier sweep has kept without that column are computed again, then they are
+    kept.
     """
     plate(tmp_path)
     said: list[str] = []
-    done = sweep(PLATE, [PRESSURES], COARSE, tmp_path, say=said.append, result="w_from_field_over_h@end")
+    done = sweep(
+        PLATE, [PRESSURES], COARSE, tmp_path, say=said.append, result="w_from_field_over_h@end"
+    )
     assert computed == 2 * [1e-5, 3e-5]
     rows = read(tmp_path / "sweep.csv")
     assert [float(row["result"]) for row in rows] == done.results
@@ -228,7 +277,9 @@ def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[flo
 
 
 def test_values_with_units_are_numbers(tmp_path: Path) -> None:
-    """A cap's fold is followed along a field in mT; the picture's line is straight to 1 %, as that over lambda_m is."""
+    """A cap's fold is followed along a field in mT; the picture's line is straight to 1 %, as that
+    over lambda_m is.
+    """
     sizes = "radius: 25.2 mm, thickness: 0.28 mm, youngs_modulus: 1.8 MPa"
     shell = f"{{geometry: cap, polar: 60, {sizes}, poisson_ratio: 0.5, "
     file = tmp_path / "cap.yaml"
@@ -252,7 +303,9 @@ def test_values_with_units_are_numbers(tmp_path: Path) -> None:
 
 def test_two_numbers_are_a_map() -> None:
     """Only if both have several values; one of another unit is converted."""
-    three, two, words = (parse_axes([f"mesh.degree={each}"])[0] for each in ("1,2,3", "1,2", "a,b,c"))
+    three, two, words = (
+        parse_axes([f"mesh.degree={each}"])[0] for each in ("1,2,3", "1,2", "a,b,c")
+    )
     lengths = parse_axes(["shell.radius=25 mm,3 cm,0.04 m"])[0]
     assert lengths.numbers == [25, pytest.approx(30), pytest.approx(40)]
     assert sweep_plot._is_map([three, lengths])
@@ -269,14 +322,20 @@ def test_equal_problems_are_computed_once(tmp_path: Path, computed: list[float])
 
 @pytest.mark.slow
 def test_table_tells_knockdowns_and_reasons(tmp_path: Path) -> None:
-    """k_d from the axisymmetric reference; a field below -0.003355 destabilises alone: no knockdown, but a reason."""
+    """k_d from the axisymmetric reference; a field below -0.003355 destabilises alone: no
+    knockdown, but a reason.
+    """
     over = ["--over", "magnetic.lambda_m=-0.004,0,0.00184", "--set=mesh.refinement=0.5"]
     done = magshell("sweep", DIMPLE, *over, "--out", tmp_path)
     assert done.returncode == 3
     assert "1 of 3 points stopped early" in done.stderr
     assert len([line for line in done.stdout.splitlines() if "/3  lambda_m=" in line]) == 3
     alone, none, positive = read(tmp_path / "sweep.csv")
-    assert [row["magnetic.lambda_m"] for row in (alone, none, positive)] == ["-0.004", "0", "0.00184"]
+    assert [row["magnetic.lambda_m"] for row in (alone, none, positive)] == [
+        "-0.004",
+        "0",
+        "0.00184",
+    ]
     assert alone["k_d"] == ""
     assert (alone["amplitude"], alone["kind"]) == ("lambda_m", "fold")
     assert float(alone["value"]) == pytest.approx(-0.003355, rel=1e-3)
@@ -290,7 +349,9 @@ def test_table_tells_knockdowns_and_reasons(tmp_path: Path) -> None:
         assert int(row["dofs"]) > 100
         assert float(row["wall_s"]) > 0
         assert float(row["w_pole_over_h"]) > 1
-        kept = json.loads((tmp_path / "points" / f"{row['point']}.json").read_text(encoding="utf-8"))
+        kept = json.loads(
+            (tmp_path / "points" / f"{row['point']}.json").read_text(encoding="utf-8")
+        )
         assert kept["case"]["magnetic"]["lambda_m"] == float(row["magnetic.lambda_m"])
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
 
@@ -300,7 +361,13 @@ def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
     over = ["--over", "shell.poisson_ratio=0.3,0.5", "--over", "loading.depth=1,2"]
     for ranks in (1, 2):
         done = magshell(
-            "sweep", POLE, *over, *(f"--set={s}" for s in COARSE), "--out", tmp_path / str(ranks), ranks=ranks
+            "sweep",
+            POLE,
+            *over,
+            *(f"--set={s}" for s in COARSE),
+            "--out",
+            tmp_path / str(ranks),
+            ranks=ranks,
         )
         assert done.returncode == 0, done.stderr
         assert (tmp_path / str(ranks) / "sweep.png").stat().st_size > 10_000
@@ -317,7 +384,8 @@ def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("indentation", 12), ("aligned", 156), ("tilted", 195), ("noncoplanar", 195)]
+    ("name", "count"),
+    [("indentation", 12), ("aligned", 156), ("tilted", 195), ("noncoplanar", 195)],
 )
 def test_every_point_of_the_figures_is_valid(name: str, count: int) -> None:
     figure = FIGURES[name]
@@ -325,13 +393,24 @@ def test_every_point_of_the_figures_is_valid(name: str, count: int) -> None:
 
 
 @pytest.mark.slow
-def test_figure_has_its_numbers_and_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Paper, figure b: the first-order energy gives an almost null change, the torque energy most of it."""
-    over = ("magnetic.lambda_m=0,0.00184", "magnetic.energy=full,first,torque", "magnetic.applied.polar=0")
+def test_figure_has_its_numbers_and_its_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Paper, figure b: the first-order energy gives an almost null change, the torque energy most
+    of it.
+    """
+    over = (
+        "magnetic.lambda_m=0,0.00184",
+        "magnetic.energy=full,first,torque",
+        "magnetic.applied.polar=0",
+    )
     monkeypatch.setitem(FIGURES, "tilted", replace(FIGURES["tilted"], over=over))
     figures.make("tilted", tmp_path)
     rows = read(tmp_path / "tilted.csv")
-    change = {(row["magnetic.energy"], row["magnetic.applied.polar"]): float(row["delta_k_d"]) for row in rows}
+    change = {
+        (row["magnetic.energy"], row["magnetic.applied.polar"]): float(row["delta_k_d"])
+        for row in rows
+    }
     assert len(rows) == len(change) == 3
     assert change["full", "0"] == pytest.approx(0.552053778 - 0.326233289, rel=1e-3)
     assert abs(change["first", "0"]) < 0.06 * change["full", "0"]

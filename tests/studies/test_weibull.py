@@ -22,7 +22,8 @@ def test_fit_is_the_most_likely_one_of_scipy(shape: float, count: int) -> None:
     assert not found.bounded
     theirs = stats.weibull_min.fit(x, shape, loc=LOCATION, scale=SCALE)
     likely = [
-        float(np.sum(stats.weibull_min.logpdf(x, *p))) for p in ((found.shape, found.location, found.scale), theirs)
+        float(np.sum(stats.weibull_min.logpdf(x, *p)))
+        for p in ((found.shape, found.location, found.scale), theirs)
     ]
     assert likely[0] >= likely[1] - 1e-6
     assert (found.shape, found.scale) == pytest.approx((theirs[0], theirs[2]), rel=1e-2)
@@ -31,8 +32,12 @@ def test_fit_is_the_most_likely_one_of_scipy(shape: float, count: int) -> None:
 def test_many_samples_give_the_parameters() -> None:
     found = fit(sample(20_000))
     assert found
-    assert (found.shape, found.location, found.scale) == pytest.approx((SHAPE, LOCATION, SCALE), rel=0.05)
-    assert found.quantile(0.01) == pytest.approx(stats.weibull_min.ppf(0.01, SHAPE, LOCATION, SCALE), rel=5e-3)
+    assert (found.shape, found.location, found.scale) == pytest.approx(
+        (SHAPE, LOCATION, SCALE), rel=0.05
+    )
+    assert found.quantile(0.01) == pytest.approx(
+        stats.weibull_min.ppf(0.01, SHAPE, LOCATION, SCALE), rel=5e-3
+    )
 
 
 def test_fit_scales_and_shifts_with_the_sample() -> None:
@@ -56,7 +61,11 @@ def test_samples_that_determine_no_fit() -> None:
 def test_intervals_hold_the_true_numbers() -> None:
     """Of 95 % intervals of 8 samples, at most 3 miss by chance (probability 4e-4 of more)."""
     names = ("mean", "shape", "location")
-    true = {"mean": stats.weibull_min.mean(SHAPE, LOCATION, SCALE), "shape": SHAPE, "location": LOCATION}
+    true = {
+        "mean": stats.weibull_min.mean(SHAPE, LOCATION, SCALE),
+        "shape": SHAPE,
+        "location": LOCATION,
+    }
     missed = dict.fromkeys(names, 0)
     for seed in range(8):
         found = intervals(sample(60, seed), seed, 40)
@@ -64,7 +73,9 @@ def test_intervals_hold_the_true_numbers() -> None:
             low, high = found[name]
             missed[name] += not low <= true[name] <= high
     assert max(missed.values()) <= 3
-    assert intervals(sample(60), 1, 20) == intervals(sample(60), 1, 20) != intervals(sample(60), 2, 20)
+    assert (
+        intervals(sample(60), 1, 20) == intervals(sample(60), 1, 20) != intervals(sample(60), 2, 20)
+    )
 
 
 def test_distance_and_correlations_are_those_of_scipy() -> None:
@@ -72,10 +83,18 @@ def test_distance_and_correlations_are_those_of_scipy() -> None:
     x = rng.normal(size=50)
     y = -x + 0.5 * rng.normal(size=50)
     rows = [
-        {"sample": i, "status": "found", "result": float(b), "severest.amplitude": float(a), "key": 1.0}
+        {
+            "sample": i,
+            "status": "found",
+            "result": float(b),
+            "severest.amplitude": float(a),
+            "key": 1.0,
+        }
         for i, (a, b) in enumerate(zip(x, y, strict=True))
     ]
-    rows.append({"sample": 50, "status": "stopped", "result": None, "severest.amplitude": 9.0, "key": 1.0})
+    rows.append(
+        {"sample": 50, "status": "stopped", "result": None, "severest.amplitude": 9.0, "key": 1.0}
+    )
     assert counts(rows) == {"samples": 51, "found": 50, "stopped": 1}
     (found,) = correlations(rows).values()  # none of a key that does not vary
     assert found["pearson"] == pytest.approx(stats.pearsonr(x, y)[0])

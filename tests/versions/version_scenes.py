@@ -32,9 +32,18 @@ class ProblemOnFile(Problem):
     """A problem of a dimpled half hemisphere, R/h = 90, on the triangulation in the file."""
 
     def _made(self) -> PatchMesh:
-        patch = read_msh(MeshFile(HERE / "half_disc.msh", 1.0), {k: np.append(x, 0.0) for k, x in self.points.items()})
+        patch = read_msh(
+            MeshFile(HERE / "half_disc.msh", 1.0),
+            {k: np.append(x, 0.0) for k, x in self.points.items()},
+        )
         edges = {"equator" if name == "rim" else name: edge for name, edge in patch.edges.items()}
-        return replace(patch, nodes=patch.nodes[:, :2], embedding=self.embedding, points=self.points, edges=edges)
+        return replace(
+            patch,
+            nodes=patch.nodes[:, :2],
+            embedding=self.embedding,
+            points=self.points,
+            edges=edges,
+        )
 
 
 def _scene(file: str, *settings: str, on_file: bool = False) -> Scene:
@@ -52,11 +61,15 @@ def _end(scene: Scene) -> Record:
 
 def _modes(scene: Scene, record: Record) -> Numbers:
     modes = ShellModes(scene.model).lowest(record.point.state, 2)
-    return {f"eigenvalue {n} {mode.label}".strip(): mode.eigenvalue for n, mode in enumerate(modes[:4])}
+    return {
+        f"eigenvalue {n} {mode.label}".strip(): mode.eigenvalue for n, mode in enumerate(modes[:4])
+    }
 
 
 def meridian() -> Numbers:
-    """One dimension: buckling under a field; forms assembled into matrices for the waves around the axis."""
+    """One dimension: buckling under a field; forms assembled into matrices for the waves around the
+    axis.
+    """
     scene = _scene("dimple_buckling.yaml", "magnetic.lambda_m=0.00184")
     records = list(follow(scene))
     fold = next(r for r in records if r.label == "fold")
@@ -65,22 +78,31 @@ def meridian() -> Numbers:
 
 def half_shell() -> Numbers:
     """Buckling of the dimpled shell, and the modes of its fields' state."""
-    scene = _scene("dimple_buckling.yaml", "symmetry=half", "magnetic.lambda_m=0.00184", on_file=True)
+    scene = _scene(
+        "dimple_buckling.yaml", "symmetry=half", "magnetic.lambda_m=0.00184", on_file=True
+    )
     records = list(follow(scene))
     fold = next(r for r in records if r.label == "fold")
     return {"k_d": fold.point.state.mu["pressure"], **_modes(scene, records[1])}
 
 
 def indentation() -> Numbers:
-    """A point force at 45 degrees under a field that is not parallel to the remanence; energies at the end."""
+    """A point force at 45 degrees under a field that is not parallel to the remanence; energies at
+    the end.
+    """
     tilted = "magnetic={lambda_m: 0.00184, remanent: {polar: 0}, applied: {polar: 45}}"
     dimple = "shell.defect={kind: dimple, amplitude: 1.64, width: 3.2}"
     depth = ("loading.depth=3", "loading.points=3")
     scene = _scene("indentation.yaml", dimple, tilted, *depth, on_file=True)
     records = [r for r in follow(scene) if r.label == "target"]
     ends = scene.observe(records[-1].point.state)
-    told = {name: ends[name] for name in ("stretching", "bending", "magnetic", "volume_change", "w_pole_over_h")}
-    return {f"force {n}": scene.observe(r.point.state)["force"] for n, r in enumerate(records, 1)} | told
+    told = {
+        name: ends[name]
+        for name in ("stretching", "bending", "magnetic", "volume_change", "w_pole_over_h")
+    }
+    return {
+        f"force {n}": scene.observe(r.point.state)["force"] for n, r in enumerate(records, 1)
+    } | told
 
 
 def mesh_file() -> Numbers:
@@ -92,7 +114,9 @@ def mesh_file() -> Numbers:
 
 def grid() -> Numbers:
     """A pinched quarter of a sphere on a grid of its chart."""
-    scene = _scene("benchmarks/hemisphere_hole.yaml", "loading.points=1", "loading.factor=0.1", "mesh.size=4")
+    scene = _scene(
+        "benchmarks/hemisphere_hole.yaml", "loading.points=1", "loading.factor=0.1", "mesh.size=4"
+    )
     ends = scene.observe(_end(scene).point.state)
     return {name: ends[name] for name in ("A_ux", "B_uy", "stretching", "bending")}
 
@@ -100,7 +124,9 @@ def grid() -> Numbers:
 def solid() -> Numbers:
     """Hexahedra of a neo-Hookean body under pressure and a field."""
     fixed = "loading={kind: pressure, control: load, until: target, pressure: 0.05, points: 1}"
-    scene = _scene("solid_buckling.yaml", "symmetry=half", "magnetic.lambda_m=0.00184", fixed, on_file=True)
+    scene = _scene(
+        "solid_buckling.yaml", "symmetry=half", "magnetic.lambda_m=0.00184", fixed, on_file=True
+    )
     ends = scene.observe(_end(scene).point.state)
     return {name: ends[name] for name in ("w_pole_over_h", "volume_change", "energy")}
 
@@ -111,4 +137,8 @@ SCENES: dict[str, Callable[[], Numbers]] = {
 
 
 if __name__ == "__main__":
-    print(json.dumps({"versions": versions(), **{name: scene() for name, scene in SCENES.items()}}, indent=2))
+    print(
+        json.dumps(
+            {"versions": versions(), **{name: scene() for name, scene in SCENES.items()}}, indent=2
+        )
+    )

@@ -1,4 +1,5 @@
-"""CalculiX input for an octant of a cylinder: one layer of C3D20R, the corner A moved radially in steps.
+"""CalculiX input for an octant of a cylinder: one layer of C3D20R, the corner A moved radially in
+steps.
 
 python3 calculix.py pinched 32 32 36 > pinched.inp && ccx pinched
 python3 calculix.py pinched --read pinched.dat
@@ -10,7 +11,8 @@ from itertools import pairwise
 from math import cos, pi, sin
 from pathlib import Path
 
-# radius, half length, thickness, Young's modulus, Poisson's ratio, on a diaphragm, last displacement of A, load
+# radius, half length, thickness, Young's modulus, Poisson's ratio, on a diaphragm, last
+# displacement of A, load
 PROBLEMS = {
     "pinched": (100.0, 100.0, 1.0, 30e3, 0.3, True, -84.0, 12e3),
     "pullout": (4.953, 5.175, 0.094, 10.5e6, 0.3125, False, 2.76, 40e3),
@@ -18,7 +20,9 @@ PROBLEMS = {
 
 
 def written(problem: str, n: int, m: int, steps: int) -> str:
-    """The input; nodes are at half steps (i, j) around and along, k = 0, 1, 2 through the thickness."""
+    """The input; nodes are at half steps (i, j) around and along, k = 0, 1, 2 through the
+    thickness.
+    """
     R, L, h, E, nu, held, end, _ = PROBLEMS[problem]
     number: dict[tuple[int, int, int], int] = {}
     for a in range(n):
@@ -37,7 +41,11 @@ def written(problem: str, n: int, m: int, steps: int) -> str:
         i, j = 2 * (cell // m), 2 * (cell % m)
         ring = [(i + 2, j), (i + 2, j + 2), (i, j + 2), (i, j)]
         mids = [((p[0] + q[0]) // 2, (p[1] + q[1]) // 2) for p, q in pairwise([*ring, ring[0]])]
-        nodes = [number[*x, k] for part, k in ((ring, 0), (ring, 2), (mids, 0), (mids, 2), (ring, 1)) for x in part]
+        nodes = [
+            number[*x, k]
+            for part, k in ((ring, 0), (ring, 2), (mids, 0), (mids, 2), (ring, 1))
+            for x in part
+        ]
         first, second = (", ".join(map(str, part)) for part in (nodes[:10], nodes[10:]))
         out += [f"{cell + 1}, {first},", second]
     corners = {"A": (0, 0), "B": (2 * n, 0), "C": (2 * n, 2 * m)}
@@ -48,9 +56,24 @@ def written(problem: str, n: int, m: int, steps: int) -> str:
         out += [f"{node}, {dof}" for key, node in number.items() if key[axis] == where]
     for i in range(2 * n + 1) if held else ():  # the mid-surface is held, its director is free
         for dof in {0: (1,), 2 * n: (2,)}.get(i, (1, 2)):
-            out += ["*EQUATION", "2", f"{number[i, 2 * m, 2]}, {dof}, 1, {number[i, 2 * m, 0]}, {dof}, 1"]
-    out += ["*MATERIAL, NAME=M", "*ELASTIC", f"{E}, {nu}", "*SOLID SECTION, ELSET=SHELL, MATERIAL=M"]
-    out += ["*STEP, NLGEOM, INC=2000", "*STATIC", f"{1 / steps}, 1, 1e-6, {1 / steps}", "*BOUNDARY", f"A, 1, 1, {end}"]
+            out += [
+                "*EQUATION",
+                "2",
+                f"{number[i, 2 * m, 2]}, {dof}, 1, {number[i, 2 * m, 0]}, {dof}, 1",
+            ]
+    out += [
+        "*MATERIAL, NAME=M",
+        "*ELASTIC",
+        f"{E}, {nu}",
+        "*SOLID SECTION, ELSET=SHELL, MATERIAL=M",
+    ]
+    out += [
+        "*STEP, NLGEOM, INC=2000",
+        "*STATIC",
+        f"{1 / steps}, 1, 1e-6, {1 / steps}",
+        "*BOUNDARY",
+        f"A, 1, 1, {end}",
+    ]
     for name in corners:
         out += [f"*NODE PRINT, NSET={name}", "U"]
     return "\n".join([*out, "*NODE PRINT, NSET=A, TOTALS=ONLY", "RF", "*END STEP", ""])
@@ -59,7 +82,9 @@ def written(problem: str, n: int, m: int, steps: int) -> str:
 def read(problem: str, file: Path) -> str:
     """Load factor, u_x of A, u_y of B and of C from a .dat file, as CSV; means of the two faces."""
     rows, means = ["load_factor,A_ux,B_uy,C_uy"], {}
-    for block in re.split(r"\n (?=displacements|total force)", file.read_text(encoding="utf-8"))[1:]:
+    for block in re.split(r"\n (?=displacements|total force)", file.read_text(encoding="utf-8"))[
+        1:
+    ]:
         head, *lines = block.strip().splitlines()
         values = [[float(x) for x in line.split()] for line in lines if line.strip()]
         if head.startswith("total"):
@@ -72,12 +97,19 @@ def read(problem: str, file: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("problem", choices=PROBLEMS)
-    parser.add_argument("mesh", type=int, nargs="*", metavar="N", help="elements around, along; steps")
+    parser.add_argument(
+        "mesh", type=int, nargs="*", metavar="N", help="elements around, along; steps"
+    )
     parser.add_argument("--read", type=Path)
     given = parser.parse_args()
-    print(read(given.problem, given.read) if given.read else written(given.problem, *given.mesh), end="")
+    print(
+        read(given.problem, given.read) if given.read else written(given.problem, *given.mesh),
+        end="",
+    )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,21 @@
-"""A second discretisation of two benchmarks, for what transverse shear and the published mesh contribute.
+"""A second discretisation of two benchmarks, for what transverse shear and the published mesh
+contribute.
 
-Reissner-Mindlin shell on an octant of a cylinder: displacement u and director d = d0 + v, both of degree k on a
-grid of quadrilaterals; the corner A is moved radially in steps. Lengths as in the case, energies over E h:
+Reissner-Mindlin shell on an octant of a cylinder: displacement u and director d = d0 + v, both of
+degree k on a grid of quadrilaterals; the corner A is moved radially in steps. Lengths as in the
+case, energies over E h:
 
     membrane and bending   W(E) + h^2/12 W(K),    W(A) = ((1 - nu) A:A + nu tr^2 A) / (2 (1 - nu^2)),
                            E_ij = (r,i . r,j - ..)/2,    K_ij = sym(r,i . d,j) - ..
     shear                  kappa/(4 (1 + nu)) |r,i . d|^2
     |d| = 1                ((d . d - 1)/2)^2 / 2, as penalty
 
-Degree 1 has one point, but for the part `--full` of membrane and bending: with 0.02 a stand-in for S4R, whose hourglass
-stiffness is not known. A large `--kappa` leaves a Koiter shell. It shares nothing with magshell_fenicsx.
+Degree 1 has one point, but for the part `--full` of membrane and bending: with 0.02 a stand-in for
+S4R, whose hourglass stiffness is not known. A large `--kappa` leaves a Koiter shell. It shares
+nothing with magshell_fenicsx.
 
-    .ci/in-env python3 cases/benchmarks/reference/reissner_mindlin.py pullout 36 24 --degree 1 > out.csv
+    .ci/in-env python3 cases/benchmarks/reference/reissner_mindlin.py pullout 36 24 --degree 1 >
+    out.csv
 """
 
 import argparse
@@ -27,7 +31,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 TOLERANCE, MOST = 1e-7, 12  # residual over the force at A; iterations of a step
-GROWTH, EASY, SMALLEST = 1.5, 5, 1e-3  # of steps: factor, iterations that allow it, over the largest
+GROWTH, EASY, SMALLEST = (
+    1.5,
+    5,
+    1e-3,
+)  # of steps: factor, iterations that allow it, over the largest
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,9 @@ PROBLEMS = {
 
 
 def energy(p: Problem, U: fem.Function, kappa: float, full: float) -> list[ufl.Form]:
-    """The elastic energy with U = (u, v), one form a rule: FFCx 0.9 makes a wrong kernel of their sum."""
+    """The elastic energy with U = (u, v), one form a rule: FFCx 0.9 makes a wrong kernel of their
+    sum.
+    """
     domain = U.function_space.mesh
     degree = U.function_space.element.basix_element.degree
     t = ufl.SpatialCoordinate(domain)[0] / p.R
@@ -82,10 +92,16 @@ def energy(p: Problem, U: fem.Function, kappa: float, full: float) -> list[ufl.F
 class Shell:
     """Residual, tangent and supports; the unknowns are (u, v) at the nodes."""
 
-    def __init__(self, p: Problem, cells: tuple[int, int], degree: int, kappa: float, full: float) -> None:
+    def __init__(
+        self, p: Problem, cells: tuple[int, int], degree: int, kappa: float, full: float
+    ) -> None:
         self.p, corner = p, np.array([p.R * np.pi / 2, p.L])
-        domain = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], corner], cells, mesh.CellType.quadrilateral)
-        V = fem.functionspace(domain, basix.ufl.element("Lagrange", domain.basix_cell(), degree, shape=(6,)))
+        domain = mesh.create_rectangle(
+            MPI.COMM_SELF, [[0, 0], corner], cells, mesh.CellType.quadrilateral
+        )
+        V = fem.functionspace(
+            domain, basix.ufl.element("Lagrange", domain.basix_cell(), degree, shape=(6,))
+        )
         self.U = fem.Function(V)
         residuals = [ufl.derivative(part, self.U) for part in energy(p, self.U, kappa, full)]
         self.F = [fem.form(residual) for residual in residuals]
@@ -96,9 +112,15 @@ class Shell:
         self.ksp.getPC().setType("cholesky")
         self.ksp.getPC().setFactorSolverType("mumps")
         x = V.tabulate_dof_coordinates()[:, :2]
-        sides = [np.flatnonzero(np.isclose(x[:, i], end)) for i in range(2) for end in (0.0, corner[i])]
-        planes = [(sides[0], (1, 4)), (sides[1], (0, 3)), (sides[2], (2, 5))] + [(sides[3], (0, 1))] * p.held
-        zero = np.concatenate([6 * nodes + component for nodes, both in planes for component in both])
+        sides = [
+            np.flatnonzero(np.isclose(x[:, i], end)) for i in range(2) for end in (0.0, corner[i])
+        ]
+        planes = [(sides[0], (1, 4)), (sides[1], (0, 3)), (sides[2], (2, 5))] + [
+            (sides[3], (0, 1))
+        ] * p.held
+        zero = np.concatenate(
+            [6 * nodes + component for nodes, both in planes for component in both]
+        )
         self.A, self.B, self.C = (
             6 * int(np.intersect1d(sides[i], sides[j])[0]) + component
             for i, j, component in ((0, 2, 0), (1, 2, 1), (1, 3, 1))
@@ -141,7 +163,9 @@ class Shell:
 
 def main() -> None:
     """Print load factor, u_x of A, u_y of B and of C."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("problem", choices=PROBLEMS)
     parser.add_argument("around", type=int)
     parser.add_argument("along", type=int)
@@ -168,7 +192,11 @@ def main() -> None:
             if abs(step) < SMALLEST * abs(largest):
                 sys.exit("lost")
             continue
-        print(*(f"{x:.9g}" for x in (4 * abs(force) / p.load, target, u[shell.B], u[shell.C])), sep=",", flush=True)
+        print(
+            *(f"{x:.9g}" for x in (4 * abs(force) / p.load, target, u[shell.B], u[shell.C])),
+            sep=",",
+            flush=True,
+        )
         before, here = here, (target, u.copy())
         if iterations <= EASY:
             step = min(GROWTH * step, largest, key=abs)

@@ -101,12 +101,16 @@ class Meridian:
             begin, end = self._ends[:, :1] - ROUNDING, self._ends[:, 1:] + ROUNDING
             at = ((begin < both) & (both < end)).any(axis=1)
             parts = [of for of in bodies if (of & at).any()]
-            bodies = [of for of in bodies if all(of is not part for part in parts)] + [np.any(parts, axis=0)]
+            bodies = [of for of in bodies if all(of is not part for part in parts)] + [
+                np.any(parts, axis=0)
+            ]
         return bodies
 
     @property
     def joints(self) -> list[Array | None]:
-        """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a T-junction."""
+        """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a
+        T-junction.
+        """
         near = [np.abs(self._ends - one) < ROUNDING for one, _ in self.tied]
         return [
             1.0 * at[:, 1] - 1.0 * at[:, 0] if one == other else None
@@ -122,7 +126,9 @@ class Meridian:
         """Parameters of facets, of which dolfinx wants one at least."""
         if not len(facets):
             return np.empty(0)
-        return np.asarray(self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, facets).ravel(), 0])
+        return np.asarray(
+            self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, facets).ravel(), 0]
+        )
 
     def section(self, s: Array) -> Array:
         """(n, 2) rho and z at some parameters."""
@@ -150,7 +156,9 @@ class Meridian:
         """What further deviations add to the placement in the same space."""
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
         assert isinstance(self.embedding, Deviated)
-        growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[:, [0, 2]].ravel()
+        growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[
+            :, [0, 2]
+        ].ravel()
         return growth
 
 
@@ -173,8 +181,8 @@ def make_meridian(
     names
         Of its ends, None for the axis.
     points
-        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place, and where that is
-        held the highest on the axis.
+        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place,
+        and where that is held the highest on the axis.
     pieces
         Name and ends of each of several shells, between which are no cells.
     held
@@ -228,7 +236,8 @@ def graded_vertices(
     pressed: tuple[float, float] | None = None,
     everywhere: float | None = None,
 ) -> Array:
-    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
+    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0
+    is there.
 
     Parameters
     ----------
@@ -264,7 +273,9 @@ def graded_vertices(
             return np.full_like(s, everywhere / refinement)
         sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
         if pressed:
-            sizes = np.minimum(sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
+            sizes = np.minimum(
+                sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0])
+            )
         return sizes
 
     lines = lines_of(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))
@@ -273,7 +284,9 @@ def graded_vertices(
 
 
 def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -> Array:
-    """Vertices at the corners and, between them, with cells proportional to the size that is asked for."""
+    """Vertices at the corners and, between them, with cells proportional to the size that is asked
+    for.
+    """
     pieces = []
     for a, b in pairwise(corners):
         s = np.linspace(a, b, 20001)

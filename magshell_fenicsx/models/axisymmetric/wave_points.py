@@ -1,4 +1,6 @@
-"""The second variation of an axisymmetric shell along waves, from the densities' Hessians at points of the meridian."""
+"""The second variation of an axisymmetric shell along waves, from the densities' Hessians at points
+of the meridian.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -26,7 +28,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 DERIVATIVES = 3  # value, first and second derivative along the meridian
 PLANE, WAVE = 2, 3  # components of axisymmetric fields and of a wave's coefficients
-_UPPER = tuple(combinations_with_replacement(range(WAVE), 2))  # pairs of components; the others follow by symmetry
+_UPPER = tuple(
+    combinations_with_replacement(range(WAVE), 2)
+)  # pairs of components; the others follow by symmetry
 
 
 class WavePoints:
@@ -42,10 +46,13 @@ class WavePoints:
     Attributes
     ----------
     rows, columns
-        (pairs,) of the nodes of the entries, sorted by rows, rows <= columns: the matrices are symmetric.
+        (pairs,) of the nodes of the entries, sorted by rows, rows <= columns: the matrices are
+        symmetric.
     """
 
-    def __init__(self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog) -> None:
+    def __init__(
+        self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog
+    ) -> None:
         self._nodes = u.function_space.dofmap.list.astype(np.int64)
         places = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
@@ -58,7 +65,9 @@ class WavePoints:
         nodes = [site.nodes(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
         pairs = [rows * count + columns for rows, columns in nodes]
-        kept = [number[rows <= columns] for number, (rows, columns) in zip(pairs, nodes, strict=True)]
+        kept = [
+            number[rows <= columns] for number, (rows, columns) in zip(pairs, nodes, strict=True)
+        ]
         numbers = np.unique(np.concatenate(kept))
         self.rows, self.columns = numbers // count, numbers % count
         self._sums = [
@@ -77,34 +86,53 @@ class WavePoints:
 
 
 class _Site:
-    """The energies at the points of one batch: of the cells, of the vertices between them, or of an end."""
+    """The energies at the points of one batch: of the cells, of the vertices between them, or of an
+    end.
+    """
 
     def __init__(
-        self, carrier: Carrier, u: fem.Function, batch: Batch, energies: Sequence[Energy], log: KernelLog
+        self,
+        carrier: Carrier,
+        u: fem.Function,
+        batch: Batch,
+        energies: Sequence[Energy],
+        log: KernelLog,
     ) -> None:
         self._batch, self._energies, self._log, self._u = batch, energies, log, u
         self._carrier, self._sides = carrier, range(len(batch.cells))
         self._points = points = Points(batch.size)
         sides = len(self._sides)
-        self._at_u, self._at_r0, self._drawn = (points.field(PLANE * DERIVATIVES * sides) for _ in range(3))
-        self._wave, self._geometry = points.field(WAVE * DERIVATIVES * sides), points.field(2 * sides)
+        self._at_u, self._at_r0, self._drawn = (
+            points.field(PLANE * DERIVATIVES * sides) for _ in range(3)
+        )
+        self._wave, self._geometry = (
+            points.field(WAVE * DERIVATIVES * sides),
+            points.field(2 * sides),
+        )
         fill(self._geometry, batch.geometry)
         fixed = [carrier.r0] if carrier.drawn is None else [carrier.r0, carrier.drawn]
         self._placed = Follows(self._place, lambda: tuple(field.x.array for field in fixed))
         self._m = fem.Constant(points._mesh, 1.0)
-        self._given = [parameters_at(points, e.density.parameters, sides) for e in energies if e.density]
+        self._given = [
+            parameters_at(points, e.density.parameters, sides) for e in energies if e.density
+        ]
         self._varying = [
-            [(target, on_batches(field, [batch], sides)) for target, field in varying] for _, varying in self._given
+            [(target, on_batches(field, [batch], sides)) for target, field in varying]
+            for _, varying in self._given
         ]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
-        """Nodes of the rows and nodes of the columns of each entity's matrix, both (entities, functions, functions)."""
+        """Nodes of the rows and nodes of the columns of each entity's matrix, both (entities,
+        functions, functions).
+        """
         of_entities = np.hstack([nodes[cells] for cells in self._batch.cells])
         rows, columns = np.broadcast_arrays(of_entities[:, :, None], of_entities[:, None])
         return rows, columns
 
     def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
-        """(waves, entities, pairs of components, pairs of functions), see `_UPPER`; None if no energy is there."""
+        """(waves, entities, pairs of components, pairs of functions), see `_UPPER`; None if no
+        energy is there.
+        """
         present = [number for number, e in enumerate(self._energies) if factors[e.amplitude]]
         if not present:
             return None
@@ -118,7 +146,9 @@ class _Site:
             self._m.value = m
             for number in present:
                 factor = np.pi * factors[self._energies[number].amplitude]
-                upper[which] += factor * self._points.evaluate(self._kernels[number], self._batch.size)
+                upper[which] += factor * self._points.evaluate(
+                    self._kernels[number], self._batch.size
+                )
         upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
         stiff = upper.any(axis=(0, 2))  # a body touches few cells: the matrices of others are zero
         whole = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
@@ -142,7 +172,11 @@ class _Site:
         kernels = []
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert e.density
-            start, shift = (drawn, [a - b for a, b in zip(r0, drawn, strict=True)]) if self._is_drawn(e) else (r0, None)
+            start, shift = (
+                (drawn, [a - b for a, b in zip(r0, drawn, strict=True)])
+                if self._is_drawn(e)
+                else (r0, None)
+            )
             moved = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
             W = ufl.zero()
             for part in range(2):  # the cosine's and the sine's
@@ -161,20 +195,27 @@ class _Site:
             return None
         covectors = [ufl.as_vector([self._geometry[2 * side], 0]) for side in self._sides]
         widths = [
-            self._geometry[2 * side + 1] / 2 * ufl.sqrt(ufl.dot(r0[side].r1, r0[side].r1)) for side in self._sides
+            self._geometry[2 * side + 1] / 2 * ufl.sqrt(ufl.dot(r0[side].r1, r0[side].r1))
+            for side in self._sides
         ]
         return covectors, sum(widths, ufl.zero()) / len(widths)
 
     def _of_sides(self, field: fem.Function, components: int, side: int) -> list[list[Expr]]:
         first = components * DERIVATIVES * side
-        return [[field[first + components * d + c] for c in range(components)] for d in range(DERIVATIVES)]
+        return [
+            [field[first + components * d + c] for c in range(components)]
+            for d in range(DERIVATIVES)
+        ]
 
     def _derivatives(self, field: fem.Function) -> Array:
         """(points, sides, derivatives, components) of an axisymmetric field."""
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
         sides = [
-            np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1) * scale[:, None, :, None]
-            for cells, table, scale in zip(self._batch.cells, self._reference, self._by_length, strict=True)
+            np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1)
+            * scale[:, None, :, None]
+            for cells, table, scale in zip(
+                self._batch.cells, self._reference, self._by_length, strict=True
+            )
         ]
         return np.stack([each.reshape(-1, DERIVATIVES, PLANE) for each in sides], axis=1)
 
@@ -186,24 +227,33 @@ class _Site:
 
     @cached_property
     def _by_length(self) -> list[Array]:
-        """(entities, derivatives) what makes derivatives by the coordinate of the meridian of these, on each side."""
+        """(entities, derivatives) what makes derivatives by the coordinate of the meridian of
+        these, on each side.
+        """
         lengths = _lengths(self._u.function_space)
-        return [1 / lengths[cells][:, None] ** np.arange(DERIVATIVES) for cells in self._batch.cells]
+        return [
+            1 / lengths[cells][:, None] ** np.arange(DERIVATIVES) for cells in self._batch.cells
+        ]
 
     @cached_property
     def _products(self) -> Array:
-        """(points of an entity and pairs of derivatives, pairs of functions), with the functions of all sides."""
+        """(points of an entity and pairs of derivatives, pairs of functions), with the functions of
+        all sides.
+        """
         each, derivatives, functions = self._reference[0].shape
         count = len(self._sides)
         of_sides = np.zeros((each, count, derivatives, count, functions))
         for side, table in enumerate(self._reference):
             of_sides[:, side, :, side] = table
         jets = of_sides.reshape(each, count * derivatives, count * functions)
-        return np.asarray(np.einsum("qin,qjm->qijnm", jets, jets).reshape(each * jets.shape[1] ** 2, -1))
+        return np.asarray(
+            np.einsum("qin,qjm->qijnm", jets, jets).reshape(each * jets.shape[1] ** 2, -1)
+        )
 
     @cached_property
     def _order(self) -> Ints:
-        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of its Hessians.
+        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of
+        its Hessians.
 
         These pairs are those of `_UPPER`.
         """
@@ -214,8 +264,14 @@ class _Site:
 
     @cached_property
     def _scales(self) -> Array:
-        """(points, entries of the Hessians) the weights of the integral, one at a vertex, and the lengths of cells."""
-        cells, weights, density = self._batch.cells[0], self._batch.rule.weights, self._energies[0].density
+        """(points, entries of the Hessians) the weights of the integral, one at a vertex, and the
+        lengths of cells.
+        """
+        cells, weights, density = (
+            self._batch.cells[0],
+            self._batch.rule.weights,
+            self._energies[0].density,
+        )
         lengths = np.abs(_lengths(self._u.function_space)[cells])
         sizes = np.ones(len(cells)) if density and density.on_edges else lengths
         of_jets = np.repeat(np.hstack(self._by_length), WAVE, axis=1)
@@ -237,11 +293,14 @@ def _added(
     if density.work is None:
         return density.at([r0, more], edge, parameters)
     less = [a - b for a, b in zip(u, v, strict=True)]
-    return (density.at([r0, more, v], edge, parameters) - density.at([r0, less, v], edge, parameters)) / 4
+    return (
+        density.at([r0, more, v], edge, parameters) - density.at([r0, less, v], edge, parameters)
+    ) / 4
 
 
 def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_array:
-    """The sparse matrix (entries of all pairs of nodes, entries of a site's blocks) by which the blocks are added up.
+    """The sparse matrix (entries of all pairs of nodes, entries of a site's blocks) by which the
+    blocks are added up.
 
     Parameters
     ----------
@@ -252,7 +311,9 @@ def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_ar
     count
         Number of all pairs.
     """
-    entries = np.arange(numbers.size * len(_UPPER)).reshape(len(numbers), len(_UPPER), *numbers.shape[1:])
+    entries = np.arange(numbers.size * len(_UPPER)).reshape(
+        len(numbers), len(_UPPER), *numbers.shape[1:]
+    )
     rows, columns = list[Ints](), list[Ints]()
     for k, (c, d) in enumerate(_UPPER):
         rows.append(9 * numbers[kept] + WAVE * c + d)
@@ -272,25 +333,40 @@ def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:
 
 
 def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
-    """The points where a density lives; the geometry of each is the covector and the length of the cell, by sides."""
+    """The points where a density lives; the geometry of each is the covector and the length of the
+    cell, by sides.
+    """
     V = carrier.r0.function_space
     topology, lengths = V.mesh.topology, _lengths(V)
     assert density
     if not density.on_edges:
-        X, weights = basix.make_quadrature(basix.CellType.interval, density.quadrature or carrier.rule)
+        X, weights = basix.make_quadrature(
+            basix.CellType.interval, density.quadrature or carrier.rule
+        )
         every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
         yield Batch((every,), Rule((X,), (), weights), np.zeros((len(every) * len(X), 2)))
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
-    inner = np.flatnonzero(np.diff(links.offsets) == 2) if density.facets is None else density.facets
-    around = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(len(inner), -1)
-    local = (corners[around] != np.asarray(inner)[:, None, None]).argmin(axis=2)  # the vertex's number in each cell
+    inner = (
+        np.flatnonzero(np.diff(links.offsets) == 2) if density.facets is None else density.facets
+    )
+    around = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(
+        len(inner), -1
+    )
+    local = (corners[around] != np.asarray(inner)[:, None, None]).argmin(
+        axis=2
+    )  # the vertex's number in each cell
     for kind in np.unique(local, axis=0):
         those = (local == kind).all(axis=1)
         cells = tuple(np.ascontiguousarray(side) for side in around[those].T)
-        outward = [np.sign(lengths[side]) * (1 if end else -1) for side, end in zip(cells, kind, strict=True)]
-        geometry = [np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)]
+        outward = [
+            np.sign(lengths[side]) * (1 if end else -1)
+            for side, end in zip(cells, kind, strict=True)
+        ]
+        geometry = [
+            np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)
+        ]
         rule = Rule(tuple(np.array([[float(end)]]) for end in kind), (), np.ones(1))
         yield Batch(cells, rule, np.hstack(geometry))
 

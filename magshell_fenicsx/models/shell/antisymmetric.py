@@ -1,9 +1,9 @@
 """Stability of a half model against the modes that its mirror plane excludes.
 
 At a symmetric state u the whole shell's energy for an antisymmetric addition v is that of one half
-with u + v and of the other, mirrored, with u - v. Its Hessian at v = 0 on one half is the half's own,
-but v moves freely along the mirror normal m and not in the plane, and the edges on the plane see the
-two halves tilt against each other.
+with u + v and of the other, mirrored, with u - v. Its Hessian at v = 0 on one half is the half's
+own, but v moves freely along the mirror normal m and not in the plane, and the edges on the plane
+see the two halves tilt against each other.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,8 @@ def antisymmetric_edge(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.
+    """Half the energy of an edge between the half with u + v and the mirror image of that with u -
+    v.
 
     The other parameters are those of `edges.symmetric`.
     """
@@ -50,9 +51,15 @@ def antisymmetric_edge(
         return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
 
     sides = (u + v, u - v)
-    J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)
+    J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(
+        r0, r0
+    )
     moments = [densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides]
-    return edge_density((moments[0][0] + moments[1][0]) / 2, moments[0][1], J, width, sigma) * stretch / 2
+    return (
+        edge_density((moments[0][0] + moments[1][0]) / 2, moments[0][1], J, width, sigma)
+        * stretch
+        / 2
+    )
 
 
 class AntisymmetricModes:

@@ -1,4 +1,6 @@
-"""Control points: a field as a mean of their values, without a mesh, as designs vary it and measured points give it."""
+"""Control points: a field as a mean of their values, without a mesh, as designs vary it and
+measured points give it.
+"""
 
 from dataclasses import dataclass
 
@@ -17,8 +19,8 @@ class Controls:
 
         B(x) = sum_i w_i(x) B_i,    w_i ~ exp(-|x - x_i|^2/l^2),    sum_i w_i = 1
 
-    The width l is the filter length of a design: nothing varies over less. B is linear in the values, it has no mesh,
-    and as a mean it is nowhere longer than the longest of them.
+    The width l is the filter length of a design: nothing varies over less. B is linear in the
+    values, it has no mesh, and as a mean it is nowhere longer than the longest of them.
 
     Attributes
     ----------
@@ -54,7 +56,8 @@ class Controls:
 
 @dataclass(frozen=True)
 class ByControls:
-    """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those that turn.
+    """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those
+    that turn.
 
     `frame` is as of `patterns.Components`.
     """
@@ -70,10 +73,15 @@ class ByControls:
         if self.controls.around:
             rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
             vectors = np.column_stack([vectors[:, :1] * x[:, :2] / rho, vectors[:, 1]])
-        return np.asarray(vectors if self.frame is None else vectors @ self.frame.T).reshape(r0.shape)
+        return np.asarray(vectors if self.frame is None else vectors @ self.frame.T).reshape(
+            r0.shape
+        )
 
     def pulled(self, r0: Array, forces: Array) -> Array:
-        """The transposed map: what multiplies each of the values in sum(forces . B) over places (cells, nodes, 3)."""
+        """The transposed map: what multiplies each of the values in sum(forces .
+
+        B) over places (cells, nodes, 3).
+        """
         x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:
             x, f = x @ self.frame, f @ self.frame

@@ -18,11 +18,16 @@ from magshell_fenicsx.models.shell.law import Law, work
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 3 + 3 + 9 + 18  # of a field's polynomial: u*, B at r0, B*, G*, H* by pairs j <= k
 
-MagneticDensity = Callable[..., Expr]  # of (r0, u, Br, Ba), and the natural forms where these are known
+MagneticDensity = Callable[
+    ..., Expr
+]  # of (r0, u, Br, Ba), and the natural forms where these are known
 
 
 def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural` forms."""
+    """Stretching density, paper Eq.
+
+    (eqn:energy), first term; of the strain from the `natural` forms.
+    """
     E, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
         return law.membrane(E, kin.inverse_metric(r0))
@@ -30,25 +35,40 @@ def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr
 
 
 def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
-    """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to S: what that adds to the energy of v."""
+    """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to S: what that adds to
+    the energy of v.
+    """
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     present, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
         return work(law.stress_change(present, strain, kin.inverse_metric(r0)), kin.metric(v)) / 2
     law = law.thicker(natural.thickness)
-    return natural.area * work(law.stress_change(present - natural.strain, strain, natural.up), kin.metric(v)) / 2
+    return (
+        natural.area
+        * work(law.stress_change(present - natural.strain, strain, natural.up), kin.metric(v))
+        / 2
+    )
 
 
 def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
+    """Bending density, paper Eq.
+
+    (eqn:energy), second term; of the change from the `natural` curvature.
+    """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         return law.bending(E, K, kin.inverse_metric(r0))
-    return natural.area * law.thicker(natural.thickness).bending(E - natural.strain, K - natural.bend, natural.up)
+    return natural.area * law.thicker(natural.thickness).bending(
+        E - natural.strain, K - natural.bend, natural.up
+    )
 
 
-def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None) -> tuple[Expr, Expr]:
-    """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a penalty."""
+def normal_moment(
+    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None
+) -> tuple[Expr, Expr]:
+    """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a
+    penalty.
+    """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         edge = kin.inverse_metric(r0), (nu1, nu2), 1
@@ -66,10 +86,15 @@ def law_at(law: Law, r0: Jet) -> Law:
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its constant."""
+    """-Ba .
+
+    (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its constant.
+    """
     up1, up2 = kin.dual_basis(r0)
     n, n0 = kin.normal(r0 + u), kin.normal(r0)
-    return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
+    return -ufl.dot(
+        Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br)
+    )
 
 
 def magnetic_thinned(
@@ -81,11 +106,14 @@ def magnetic_thinned(
     thinned = kin.area_ratio(r0) / kin.area_ratio(r)
     if natural is not None:
         thinned *= natural.area * natural.thickness
-    return magnetic(r0, u, Br, Ba) - thins * (thinned - 1) * ufl.dot(Ba, kin.normal(r)) * ufl.dot(n0, Br)
+    return magnetic(r0, u, Br, Ba) - thins * (thinned - 1) * ufl.dot(Ba, kin.normal(r)) * ufl.dot(
+        n0, Br
+    )
 
 
 def in_gradient(law: MagneticDensity) -> MagneticDensity:
-    """The part of Ba = G r, of (r0, u, Br, G): -(G r) . F Br at the deformed position, without its value at u = 0.
+    """The part of Ba = G r, of (r0, u, Br, G): -(G r) . F Br at the deformed position, without its
+    value at u = 0.
 
     `law` is `magnetic`, or has R in place of F.
     """
@@ -122,7 +150,10 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq. (eq:terms)."""
+    """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq.
+
+    (eq:terms).
+    """
     up1, up2 = kin.dual_basis(r0)
     q = rotation(r0, u)
     turned = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
@@ -147,17 +178,20 @@ def rotation(r0: Jet, u: Jet) -> Expr:
 
 
 def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
-    """(x . n dω - x0 . n0 dω0)/3 per flat area (already includes the area ratio), x told from the origin."""
+    """(x . n dω - x0 . n0 dω0)/3 per flat area (already includes the area ratio), x told from the
+    origin.
+    """
     r = r0 + u
     x, x0 = (r.r, r0.r) if origin is None else (r.r - origin, r0.r - origin)
     return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
 def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
-    """The volume that the surface sweeps when its points move straight to r0 + u; per area of the coordinates.
+    """The volume that the surface sweeps when its points move straight to r0 + u; per area of the
+    coordinates.
 
-    It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the edges are, no
-    origin and no faces that close the volume enter.
+    It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the
+    edges are, no origin and no faces that close the volume enter.
     """
     halfway = ufl.cross(r0.r1 + u.r1 / 2, r0.r2 + u.r2 / 2)
     return unit * ufl.dot(u.r, halfway + kin.area_vector(u) / 12)
@@ -175,7 +209,11 @@ def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:
     def component(i: int) -> Expr:
         linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
         pairs = enumerate(zip(*PAIRS, strict=True))
-        return P[6 + i] + linear + sum(P[18 + 6 * i + n] * d[int(j)] * d[int(k)] for n, (j, k) in pairs)
+        return (
+            P[6 + i]
+            + linear
+            + sum(P[18 + 6 * i + n] * d[int(j)] * d[int(k)] for n, (j, k) in pairs)
+        )
 
     B = ufl.as_vector([component(i) for i in range(3)])
     return B, B - ufl.as_vector([P[3 + i] for i in range(3)])

@@ -1,4 +1,5 @@
-"""The bending energy of edges: C0 interior penalty for a C0 displacement; how sharply undeformed cells meet.
+"""The bending energy of edges: C0 interior penalty for a C0 displacement; how sharply undeformed
+cells meet.
 
 A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that
 quantity over its undeformed value, an edge contributes
@@ -33,14 +34,23 @@ def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
     return M * J + sigma * D / (2 * width) * J**2
 
 
-def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]) -> Expr:
+def fold_jump(
+    plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]
+) -> Expr:
     """-[n] . {r_nu}, nu out of '+', [n] = n- - n+."""
-    r_nu = (plus.r1 * nu_plus[0] + plus.r2 * nu_plus[1] - minus.r1 * nu_minus[0] - minus.r2 * nu_minus[1]) / 2
+    r_nu = (
+        plus.r1 * nu_plus[0]
+        + plus.r2 * nu_plus[1]
+        - minus.r1 * nu_minus[0]
+        - minus.r2 * nu_minus[1]
+    ) / 2
     return -ufl.dot(kin.normal(minus) - kin.normal(plus), r_nu)
 
 
 def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
-    """Sine and cosine of the angle between the normals about the edge; its sign is that of `fold_jump`."""
+    """Sine and cosine of the angle between the normals about the edge; its sign is that of
+    `fold_jump`.
+    """
     along = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
     n_plus, n_minus = kin.normal(plus), kin.normal(minus)
     return -ufl.dot(ufl.cross(n_plus, n_minus), along), ufl.dot(n_plus, n_minus)
@@ -75,16 +85,24 @@ def two_sided(
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     moments = [
-        densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i]) for i in range(2)
+        densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i])
+        for i in range(2)
     ]
     M, D = ((plus + minus) / 2 for plus, minus in zip(*moments, strict=True))
     return edge_density(M, D, J, width, sigma) * stretch
 
 
 def interior(
-    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Law, Law], natural: Shapes | None = None
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    *rest: Any,
+    law: tuple[Law, Law],
+    natural: Shapes | None = None,
 ) -> Expr:
-    """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
+    """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in
+    `two_sided`.
+    """
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J0 = fold_jump(*r0, *nus)
     if natural:
@@ -94,19 +112,30 @@ def interior(
 
 
 def folded(
-    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Law, Law], natural: Shapes | None = None
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    *rest: Any,
+    law: tuple[Law, Law],
+    natural: Shapes | None = None,
 ) -> Expr:
-    """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size.
+    """The same across a fold of the undeformed surface: the jump is the change of the angle,
+    whatever its size.
 
-    b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a narrow bend has it.
+    b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a
+    narrow bend has it.
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
     stretched = 1
     if natural:
         nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
-        stretched = sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
-        bent = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (2 * stretched)
+        stretched = (
+            sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
+        )
+        bent = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (
+            2 * stretched
+        )
         angle = bent * ufl.atan2(sine0, cosine0)
         sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
     J = stretched * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
@@ -114,11 +143,12 @@ def folded(
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
-    """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the normal.
+    """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the
+    normal.
 
-    The tangent runs with the surface on its left, so that a positive angle turns the normal outward. The
-    angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine and sine of the turn
-    that it is counted from, so that it may grow beyond pi.
+    The tangent runs with the surface on its left, so that a positive angle turns the normal
+    outward. The angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine
+    and sine of the turn that it is counted from, so that it may grow beyond pi.
     """
     along = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(along, along))
@@ -138,18 +168,32 @@ def clamped(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
+    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at
+    `turn` n0.
+    """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
-    J = -ufl.dot((n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+    J = -ufl.dot(
+        (n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2
+    )
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 
 
 def symmetric(
-    r0: Jet, u: Jet, m: Expr, width: Expr, sigma: Expr, mirror: Expr, *, law: Law, natural: Forms | None = None
+    r0: Jet,
+    u: Jet,
+    m: Expr,
+    width: Expr,
+    sigma: Expr,
+    mirror: Expr,
+    *,
+    law: Law,
+    natural: Forms | None = None,
 ) -> Expr:
-    """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
+    """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an
+    interior edge's.
+    """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirror_jump(j: Jet) -> Expr:

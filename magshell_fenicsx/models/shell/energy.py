@@ -1,4 +1,6 @@
-"""A term of the shell: its density as a function of point quantities, its parameters, and the form made from it."""
+"""A term of the shell: its density as a function of point quantities, its parameters, and the form
+made from it.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,7 +29,8 @@ Constants = dict[str, fem.Constant]
 
 @dataclass(frozen=True)
 class Density:
-    """An energy as a function of point quantities: the one source of its form and of its derivatives at points.
+    """An energy as a function of point quantities: the one source of its form and of its
+    derivatives at points.
 
     Attributes
     ----------
@@ -36,7 +39,8 @@ class Density:
         (r0, u, m, width, *parameters), see `edges`; on interior edges the same with pairs of
         jets and covectors.
     parameters
-        Numbers, or fields that vary over the surface; `of` takes a field on interior edges as a pair.
+        Numbers, or fields that vary over the surface; `of` takes a field on interior edges as a
+        pair.
     parts
         The parts of the displacement's jet that it depends on.
     linear
@@ -46,7 +50,8 @@ class Density:
     sides
         2 on interior edges.
     work
-        Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on cells.
+        Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on
+        cells.
     quadrature
         Degree of its rule on cells; None for `cell_quadrature`.
     still
@@ -83,15 +88,19 @@ class Density:
         Parameters
         ----------
         jets
-            Of r0, u and what else it takes, each on every side; with the jet of v the virtual work is meant.
+            Of r0, u and what else it takes, each on every side; with the jet of v the virtual work
+            is meant.
         edge
             The covector on every side and the width; None on cells.
         parameters
-            In place of its own; where there are two sides, a vector that varies holds both, one after the other.
+            In place of its own; where there are two sides, a vector that varies holds both, one
+            after the other.
         """
         arguments = [*jets, *(edge[:1] if edge else ())]
         sided = [tuple(each) if self.sides == 2 else each[0] for each in arguments]
-        fields = [_halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters]
+        fields = [
+            _halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters
+        ]
         of = self.work if self.work and len(jets) == 3 else self.of
         return of(*sided, *(edge[1:] if edge else ()), *fields)
 
@@ -99,7 +108,9 @@ class Density:
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
     """A vector of the one side of an edge and then of the other, as two."""
     size = field.ufl_shape[0] // 2
-    first, second = (ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2))
+    first, second = (
+        ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2)
+    )
     return first, second
 
 
@@ -151,7 +162,9 @@ class HessianTerm:
     amplitude = None
     linear = False
 
-    def __init__(self, name: str, density: Density, energy: ufl.Form, v: fem.Function, log: KernelLog) -> None:
+    def __init__(
+        self, name: str, density: Density, energy: ufl.Form, v: fem.Function, log: KernelLog
+    ) -> None:
         self.name, self.density = name, density
         self.group, self.column = name, ""
         self._energy, self._v, self._log = energy, v, log
@@ -180,8 +193,11 @@ class HessianTerm:
         compat.add_matrix(K, self.tangent_form, clamped)
 
 
-def constants_of(term: OwnTerm, domain: mesh.Mesh, constants: Constants) -> tuple[fem.Constant | fem.Function, ...]:
-    """The parameters of a term as constants; a free one has the same constant in all terms, kept in `known`.
+def constants_of(
+    term: OwnTerm, domain: mesh.Mesh, constants: Constants
+) -> tuple[fem.Constant | fem.Function, ...]:
+    """The parameters of a term as constants; a free one has the same constant in all terms, kept in
+    `known`.
 
     Raises
     ------
@@ -192,10 +208,15 @@ def constants_of(term: OwnTerm, domain: mesh.Mesh, constants: Constants) -> tupl
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
-    def made(p: float | NDArray[np.float64] | Free | GivenField | ByPlace | Coefficient) -> fem.Constant | fem.Function:
+    def made(
+        p: float | NDArray[np.float64] | Free | GivenField | ByPlace | Coefficient,
+    ) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
             return constants.setdefault(p.name, constant(p.value))
-        if isinstance(p, Coefficient) and p.ufl_function_space().ufl_domain() == domain.ufl_domain():
+        if (
+            isinstance(p, Coefficient)
+            and p.ufl_function_space().ufl_domain() == domain.ufl_domain()
+        ):
             return p
         if isinstance(p, Coefficient | GivenField):
             raise MeshError(

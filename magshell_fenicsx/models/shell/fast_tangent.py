@@ -22,7 +22,13 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scatter import BlockMatrix
 from magshell_fenicsx.assembly.sliding import Constraint
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.models.shell.energy import Density, HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.energy import (
+    Density,
+    HessianTerm,
+    ShellTerm,
+    cell_quadrature,
+    edge_quadrature,
+)
 from magshell_fenicsx.models.shell.sites import Site
 
 Array = NDArray[np.float64]
@@ -43,7 +49,13 @@ class TangentSite(Protocol):
     @property
     def coupling(self) -> Sequence[Batch]: ...
 
-    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+    def add(
+        self,
+        u: Array,
+        factors: Mapping[str, float],
+        same: Array,
+        couple: Callable[[int, Array], None],
+    ) -> None:
         """Add element matrices, see `Site.add`."""
 
 
@@ -73,7 +85,9 @@ class FastTangent:
         self._u, self._sites, self._nodes = u, sites, V.dofmap.list
         self._moving = moving[0] if moving else None
         self._near = moving[1] if moving else ()
-        self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
+        self._matrix = BlockMatrix(
+            V, [batch.cells for site in sites for batch in site.coupling], clamped
+        )
         cells, functions = V.dofmap.list.shape
         self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
 
@@ -83,8 +97,8 @@ class FastTangent:
         Parameters
         ----------
         stress
-            Displacements, ghosts included, with weights: the sum of their membrane strains makes the membrane
-            stress in place of the present strain.
+            Displacements, ghosts included, with weights: the sum of their membrane strains makes
+            the membrane stress in place of the present strain.
         """
         self._same[:] = 0
         self._matrix.clear()
@@ -98,7 +112,9 @@ class FastTangent:
         return self._matrix.assemble()
 
     def times(self, v: Array, factors: Mapping[str, float]) -> Array:
-        """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
+        """This rank's part of the matrix without supports times a vector with ghosts, exact where
+        nodes move.
+        """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         same = np.zeros(self._same.shape)
         for site in self._near:
@@ -108,7 +124,9 @@ class FastTangent:
                 add_coupled(product, K, first, second, x)
 
             site.add(self._u.x.array, factors, same, couple)
-        add_own(product, same[self._moving], self._nodes[self._moving], x)  # others have no node that moves
+        add_own(
+            product, same[self._moving], self._nodes[self._moving], x
+        )  # others have no node that moves
         return product.ravel()
 
     def _couple(self, first: int, batch: int, K: Array) -> None:
@@ -123,7 +141,8 @@ def make_sites(
     prestress: Density | None = None,
     chosen: Chosen = None,
 ) -> list[Site]:
-    """The sites of some terms: all cells and all interior edges together, boundary edges term by term. Collective.
+    """The sites of some terms: all cells and all interior edges together, boundary edges term by
+    term. Collective.
 
     `chosen` are the local cells that count, with their edges; None for all.
     """
@@ -137,7 +156,9 @@ def make_sites(
         batches = cell_batches(V, rule or cell_quadrature(degree), chosen)
         sites.append(Site(r0, batches, 1, of_rule, log, None if rule else prestress))
     if interior:
-        sites.append(Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log))
+        sites.append(
+            Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log)
+        )
     for term in nonlinear:
         if term.density.facets is not None:
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, chosen)

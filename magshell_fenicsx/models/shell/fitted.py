@@ -1,12 +1,14 @@
-"""Formulas on cells: interpolated where they are smooth, else the polynomials with the same moments.
+"""Formulas on cells: interpolated where they are smooth, else the polynomials with the same
+moments.
 
-A formula that varies within a cell, or jumps there, is not what its values at the nodes show: a load on a disc between
-the nodes would be none. The polynomial p of the displacement's degree k with
+A formula that varies within a cell, or jumps there, is not what its values at the nodes show: a
+load on a disc between the nodes would be none. The polynomial p of the displacement's degree k with
 
     integral of p q = integral of f q    over the cell, for each polynomial q of the degree k,
 
-does the same work on every displacement, up to the curvature of the cell. Its integrals come from parts of the cell
-that are divided until each agrees with its own parts. Where f is a polynomial of the degree k, p is f.
+does the same work on every displacement, up to the curvature of the cell. Its integrals come from
+parts of the cell that are divided until each agrees with its own parts. Where f is a polynomial of
+the degree k, p is f.
 """
 
 from collections.abc import Callable
@@ -23,7 +25,9 @@ from magshell_fenicsx.models.shell.unseen import AT_ONCE, CHILDREN, Lattice, Par
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-Values = Callable[[Array, Array], Array]  # places and normals (cells, n, 3) -> (cells, n, components)
+Values = Callable[
+    [Array, Array], Array
+]  # places and normals (cells, n, 3) -> (cells, n, components)
 Element: TypeAlias = basix.finite_element.FiniteElement
 INTERVAL, TRIANGLE = basix.CellType.interval, basix.CellType.triangle
 AGREED = 1e-4  # of the integral of |f|: interpolated formulas differ by less
@@ -45,8 +49,8 @@ class Cells:
     element
         Of the placement.
     nodal
-        (cells, nodes, 3) of a surface, an edge (without normals) or a body, of whose cells the third axis is across;
-        (cells, nodes, 2) of a meridian, rho and z.
+        (cells, nodes, 3) of a surface, an edge (without normals) or a body, of whose cells the
+        third axis is across; (cells, nodes, 2) of a meridian, rho and z.
     owned
         How many are this rank's own; they come first.
     """
@@ -61,7 +65,8 @@ class Cells:
         return {INTERVAL: 1, TRIANGLE: 2}.get(self.element.cell_type, 3)
 
     def at(self, X: Array, cells: Numbers | slice = slice(None)) -> tuple[Array, Array, Array]:
-        """Places and normals (cells, n, 3), and length or area over that of the reference cell (cells, n).
+        """Places and normals (cells, n, 3), and length or area over that of the reference cell
+        (cells, n).
 
         At reference points (n, dimension), or at points (cells, n, dimension) of each cell.
         """
@@ -135,7 +140,8 @@ def fitted(
     degree
         Of the polynomials with the same moments, at most that of the element.
     bounded
-        Whether they stay between the least and the largest value in a cell; of their moments the first is kept.
+        Whether they stay between the least and the largest value in a cell; of their moments the
+        first is kept.
     formulas
         What varies in them, so that nothing between the places is missed.
     """
@@ -146,10 +152,16 @@ def fitted(
     off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
     magnitude, area = np.linalg.norm(f, axis=-1), area * w
     square_of = (area * magnitude**2).sum(axis=1)
-    sums = cells.sum(np.stack([*((area * v).sum(axis=1) for v in (magnitude, off)), square_of], axis=-1))
+    sums = cells.sum(
+        np.stack([*((area * v).sum(axis=1) for v in (magnitude, off)), square_of], axis=-1)
+    )
     size, differs, square = map(float, sums)
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
-    narrow = _narrow(values, formulas, cells, np.einsum("q,cqi->ci", w, f)) if formulas else _Narrow.nothing(len(scale))
+    narrow = (
+        _narrow(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
+        if formulas
+        else _Narrow.nothing(len(scale))
+    )
     hidden = scale * narrow.hidden
     more = float(cells.sum(hidden))
     size += more
@@ -158,7 +170,9 @@ def fitted(
     largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
     chosen = np.flatnonzero((off @ w > SMOOTH * largest * w.sum()) | (hidden > PART * size))
     ahead = narrow.parts(chosen, parts)
-    space = basix.create_element(basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped)
+    space = basix.create_element(
+        basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
+    )
     integrals = _moments(values, cells, chosen, scale, ahead, PART * size, space, nodal.shape[-1])
     moments, sizes[chosen], squares, missed = integrals
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
@@ -172,7 +186,9 @@ def fitted(
     at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
     if bounded:
         mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
-        at_nodes = _bounded(at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[chosen])
+        at_nodes = _bounded(
+            at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[chosen]
+        )
     new = nodal.copy()
     new[chosen] = at_nodes
     nothing = np.finfo(float).tiny  # a formula that is zero but on a line
@@ -192,7 +208,9 @@ def _alike(cells: Cells) -> Parts:
 
 def sampling(cells: Cells) -> tuple[Array, Array]:
     """Their places (parts, q, d) in the reference cell, and weights (parts, q)."""
-    return _alike(cells).rule(*basix.make_quadrature(cells.element.cell_type, RULE[cells.dimension]))
+    return _alike(cells).rule(
+        *basix.make_quadrature(cells.element.cell_type, RULE[cells.dimension])
+    )
 
 
 @dataclass(frozen=True)
@@ -227,7 +245,10 @@ class _Narrow:
         deep = self.deep[chosen]
         if not deep.any():
             return alike.of(chosen)
-        parts, largest = self.leaves[np.isin(self.leaves.cell, chosen)], 1.001 * np.abs(alike.sides[0, 0])
+        parts, largest = (
+            self.leaves[np.isin(self.leaves.cell, chosen)],
+            1.001 * np.abs(alike.sides[0, 0]),
+        )
         small, wide = list[Parts](), np.abs(parts.sides[:, 0]) > largest
         while wide.any():
             small.append(parts[~wide])
@@ -237,16 +258,22 @@ class _Narrow:
 
 
 def _narrow(values: Values, formulas: Together, cells: Cells, coarse: Array) -> _Narrow:
-    """Integrals (cells, components) compared with those over leaves, see `unseen.leaves`; collective."""
+    """Integrals (cells, components) compared with those over leaves, see `unseen.leaves`;
+    collective.
+    """
     d, kind = cells.dimension, cells.element.cell_type
     lattice, (points, weights) = Lattice.of(kind, LATTICE[d]), basix.make_quadrature(kind, RULE[d])
 
     def look(parts: Parts) -> tuple[Array, Array]:
-        X, w = parts.rule(lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places)))
+        X, w = parts.rule(
+            lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places))
+        )
         x, _, area = cells.at(X, parts.cell)
         return x, (area * w).sum(axis=1)
 
-    first = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(np.arange(len(cells.nodal)))
+    first = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(
+        np.arange(len(cells.nodal))
+    )
     seen = leaves(formulas, first, look, lattice, cells.owned, cells.comm)
     deep = np.zeros(len(cells.nodal), bool)
     divided = np.abs(seen.parts.sides[:, 0]) < 1
@@ -272,7 +299,8 @@ def _moments(
     space: Element,
     components: int,
 ) -> tuple[Array, Array, Array, float]:
-    """Integrals of f times each function (cells, functions, components), of |f| and |f|^2 (cells,), and their error.
+    """Integrals of f times each function (cells, functions, components), of |f| and |f|^2 (cells,),
+    and their error.
 
     Over the reference cell, but of |f| and the error over the surface; collective.
     """
@@ -289,7 +317,12 @@ def _moments(
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
     by_cell = np.zeros((len(chosen), space.dim, components))
-    sizes, squares, errors, each = np.zeros(len(chosen)), np.zeros(len(chosen)), 0.0, len(CHILDREN[cells.dimension])
+    sizes, squares, errors, each = (
+        np.zeros(len(chosen)),
+        np.zeros(len(chosen)),
+        0.0,
+        len(CHILDREN[cells.dimension]),
+    )
     whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
     for depth in range(DEEPEST + 1):
         last = depth == DEEPEST or cells.comm.allreduce(len(ahead.cell)) > MOST
@@ -298,14 +331,20 @@ def _moments(
             smaller = now.divided()
             X, w, area, f = evaluated(smaller)
             fine = integrals(w, f)
-            error = scale[now.cell] * np.linalg.norm(fine.reshape(len(before), each, -1).sum(axis=1) - before, axis=1)
+            error = scale[now.cell] * np.linalg.norm(
+                fine.reshape(len(before), each, -1).sum(axis=1) - before, axis=1
+            )
             done = (error <= threshold) | last
             errors += float((error[done & (now.cell < cells.owned)] ** 2).sum())
             kept = np.repeat(done, each)
             at, size = number[smaller.cell[kept]], np.linalg.norm(f[kept], axis=-1)
             if len(at):  # Basix tabulates no empty set of points
-                phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(*size.shape, space.dim)
-                np.add.at(by_cell, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
+                phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
+                    *size.shape, space.dim
+                )
+                np.add.at(
+                    by_cell, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept])
+                )
                 np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
                 np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
@@ -319,11 +358,18 @@ def _moments(
 
 
 def _bounded(at_nodes: Array, mean: Array, between: Array, f: Array) -> Array:
-    """Polynomials (cells, nodes, components) drawn towards their means until they have no values that f has not."""
+    """Polynomials (cells, nodes, components) drawn towards their means until they have no values
+    that f has not.
+    """
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
     every = np.concatenate([at_nodes, between], axis=1)
     share = np.ones_like(mean)
-    for bound, extreme in ((low, every.min(axis=1, keepdims=True)), (high, every.max(axis=1, keepdims=True))):
+    for bound, extreme in (
+        (low, every.min(axis=1, keepdims=True)),
+        (high, every.max(axis=1, keepdims=True)),
+    ):
         away = extreme - mean
-        share = np.minimum(share, np.where(np.abs(away) > 0, (bound - mean) / np.where(away == 0, 1.0, away), 1.0))
+        share = np.minimum(
+            share, np.where(np.abs(away) > 0, (bound - mean) / np.where(away == 0, 1.0, away), 1.0)
+        )
     return np.asarray(mean + np.clip(share, 0.0, 1.0) * (at_nodes - mean))

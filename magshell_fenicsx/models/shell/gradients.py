@@ -20,7 +20,12 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values
+from magshell_fenicsx.assembly.point_kernels import (
+    PointKernel,
+    Points,
+    point_gradient,
+    point_values,
+)
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.sites import NAMES, fill, parameters_at
@@ -44,7 +49,8 @@ class PointTerm(Protocol):
 
 
 class PointGradient:
-    """Some terms' densities at points, and dW/du of their sum, or the virtual work's derivative in v.
+    """Some terms' densities at points, and dW/du of their sum, or the virtual work's derivative in
+    v.
 
     Kernels are compiled when they are first asked for, on all ranks.
 
@@ -80,7 +86,9 @@ class PointGradient:
         chunk = max(CHUNK // each, 1) * each
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         points = self._points = Points(max(min(count, chunk), 1))
-        self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
+        self._u, placement, place = (
+            points.field(size) for size in (self._size, self._size, geometry.shape[1])
+        )
         self._given = [_Given(placement, r0), _Given(place, Follows(lambda: geometry, tuple))]
         self._names, self._log = [term.name for term in terms], log
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
@@ -89,16 +97,25 @@ class PointGradient:
             self._given += [_Given(target, _following(field, values)) for target, field in varying]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
-                self._work.append(_energy(term.density, [placement, self._u, self._v], place, parts, parameters))
-        self._conservative = [W for W, term in zip(self._W, terms, strict=True) if not term.density.work]
+                self._work.append(
+                    _energy(term.density, [placement, self._u, self._v], place, parts, parameters)
+                )
+        self._conservative = [
+            W for W, term in zip(self._W, terms, strict=True) if not term.density.work
+        ]
         self._energies: dict[str, PointKernel | None] = {}
 
     @cached_property
     def gradient(self) -> PointKernel | None:
         """The kernel of `evaluate`; None if nothing depends on u."""
-        sums = [(sum(self._conservative, ufl.zero()), self._u), (sum(self._work, ufl.zero()), self._v)]
+        sums = [
+            (sum(self._conservative, ufl.zero()), self._u),
+            (sum(self._work, ufl.zero()), self._v),
+        ]
         sums = [(W, z) for W, z in sums if z in extract_coefficients(W)]
-        return point_gradient(f"{', '.join(self._names)} gradient", sums, self._log) if sums else None
+        return (
+            point_gradient(f"{', '.join(self._names)} gradient", sums, self._log) if sums else None
+        )
 
     def energy(self, name: str) -> PointKernel | None:
         """The kernel of a term's energy; None if that is zero."""
@@ -109,18 +126,24 @@ class PointGradient:
         return self._energies[name]
 
     def chunks(self) -> list[slice]:
-        """The points that are treated together, to be evaluated one after the other with what is given now."""
+        """The points that are treated together, to be evaluated one after the other with what is
+        given now.
+        """
         for given in self._given:
             given.values.renew()
         return self._chunks
 
     def room(self, chunk: slice) -> Array:
-        """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
+        """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts *
+        3).
+        """
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
 
     def evaluate(self, chunk: slice, kernel: PointKernel) -> Array:
-        """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by the next call."""
+        """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by
+        the next call.
+        """
         for given in self._given:
             given.fill(chunk)
         return self._points.evaluate(kernel, chunk.stop - chunk.start)
@@ -175,11 +198,16 @@ def _energy(
     parts: Sequence[str],
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge; of r0, u and perhaps v."""
+    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge; of r0, u and
+    perhaps v.
+    """
     sides = range(density.sides)
     frames = [[place[FRAME * side + i] for i in range(FRAME)] for side in sides]
     r0_jets = [_jet(fields[0], side, parts) for side in sides]
-    others = [[in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides] for f in fields[1:]]
+    others = [
+        [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
+        for f in fields[1:]
+    ]
     if not density.on_edges:
         return frames[0][-1] * density.at([r0_jets, *others], None, parameters)
     first = FRAME * density.sides
@@ -191,6 +219,7 @@ def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
     """The parts that are not there are zero: no density asks for them."""
     first = 3 * len(parts) * side
     vectors = {
-        part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)]) for number, part in enumerate(parts)
+        part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)])
+        for number, part in enumerate(parts)
     }
     return Jet(*(vectors.get(name, ufl.zero(3)) for name in NAMES))

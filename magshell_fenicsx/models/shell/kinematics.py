@@ -113,8 +113,11 @@ def dual_basis(j: Jet) -> tuple[Expr, Expr]:
     return up[0, 0] * j.r1 + up[0, 1] * j.r2, up[1, 0] * j.r1 + up[1, 1] * j.r2
 
 
-def strain_components(r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]) -> tuple[Any, Any, Any]:
-    """E_11, E_12 and E_22 from the first derivatives of r0 and u, without subtracting two metrics of order one.
+def strain_components(
+    r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
+) -> tuple[Any, Any, Any]:
+    """E_11, E_12 and E_22 from the first derivatives of r0 and u, without subtracting two metrics
+    of order one.
 
     `dot` is that of expressions or of arrays.
     """
@@ -123,8 +126,12 @@ def strain_components(r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]) -
     return dot(r1, u1) + dot(u1, u1) / 2, E12, dot(r2, u2) + dot(u2, u2) / 2
 
 
-def curvature_components(n: Any, turned: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]) -> list[Any]:
-    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `turned`, n - n0; `dot` as above."""
+def curvature_components(
+    n: Any, turned: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
+) -> list[Any]:
+    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `turned`, n - n0;
+    `dot` as above.
+    """
     return [dot(n, uij) + dot(turned, rij) for rij, uij in zip(r0, u, strict=True)]
 
 
@@ -201,7 +208,9 @@ class Edge:
         """That of a covector as of `conormal`."""
         nu1, nu2, stretch = conormal(r0, m)
         t1, t2 = -m[1] / stretch, m[0] / stretch
-        return cls(r0.r1 * nu1 + r0.r2 * nu2, r0.r1 * t1 + r0.r2 * t2, (nu1, nu2), (t1, t2), stretch)
+        return cls(
+            r0.r1 * nu1 + r0.r2 * nu2, r0.r1 * t1 + r0.r2 * t2, (nu1, nu2), (t1, t2), stretch
+        )
 
     def by_outward(self, j: Jet) -> Expr:
         """The derivative of a field by the length along the outward conormal."""
@@ -213,7 +222,9 @@ class Edge:
 
 
 def angle_from(sine: Expr, cosine: Expr, past: Expr) -> Expr:
-    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `past` (2,)."""
+    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `past`
+    (2,).
+    """
     return ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
 
 

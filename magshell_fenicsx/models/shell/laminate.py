@@ -1,8 +1,10 @@
-"""The law of a laminate: Koiter's energies with stiffnesses A, B and D in the directions of its plies.
+"""The law of a laminate: Koiter's energies with stiffnesses A, B and D in the directions of its
+plies.
 
-With z along the normal the layer at z has the strain E - z K, so that the energy per area is
-(E : A : E - 2 E : B : K + K : D : K)/2, A, B, D the integrals of 1, z, z^2 times the stiffness of the plies
-(R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E h^3 are taken out.
+With z along the normal the layer at z has the strain E - z K, so that the energy per area is (E : A
+: E - 2 E : B : K + K : D : K)/2, A, B, D the integrals of 1, z, z^2 times the stiffness of the
+plies (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E h^3 are
+taken out.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,7 +20,9 @@ from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, T
 
 Array = NDArray[np.float64]
 SAME = 1e-6  # of directions
-Triple: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 22 and 12 of a stress, or twice 12 of a strain
+Triple: TypeAlias = tuple[
+    Scalar, Scalar, Scalar
+]  # 11, 22 and 12 of a stress, or twice 12 of a strain
 Stiffness: TypeAlias = Any  # 11, 12, 22, 16, 26, 66: numbers, or an expression (6,)
 
 
@@ -45,7 +49,8 @@ class Laminate:
     origin: Array = field(default_factory=lambda: np.zeros(3), repr=False)
 
     def refuse_normal(self, normals: Array, comm: MPI.Comm) -> None:
-        """See that the direction has a part in each cell, whose normals are (cells, nodes, 3); collective.
+        """See that the direction has a part in each cell, whose normals are (cells, nodes, 3);
+        collective.
 
         Raises
         ------
@@ -62,8 +67,14 @@ class Laminate:
             )
 
     def mirrored(self, plane: Mirror) -> bool:
-        """Whether a plane mirrors plies that do not twist: it is along or across their directions everywhere."""
-        own = replace(plane, normal=plane.normal @ self.axes, offset=plane.offset - float(plane.normal @ self.origin))
+        """Whether a plane mirrors plies that do not twist: it is along or across their directions
+        everywhere.
+        """
+        own = replace(
+            plane,
+            normal=plane.normal @ self.axes,
+            offset=plane.offset - float(plane.normal @ self.origin),
+        )
         return self.isotropic or own.keeps_lines(self.direction)
 
 
@@ -76,7 +87,8 @@ class Laminated(Law):
     A, B, D
         Over E h, E h^2 and E h^3.
     axis
-        The vector (3,) along whose part in the surface the angle 0 is, or whose meridians it is along.
+        The vector (3,) along whose part in the surface the angle 0 is, or whose meridians it is
+        along.
     origin
         A place (3,) on the axis of meridians.
     meridian
@@ -121,7 +133,10 @@ class Laminated(Law):
         one, two = (dot(self.axis, a) for a in (a1, a2))
         if self.meridian:  # (e_theta x n) . a, times lengths
             x = [r[..., i] - self.origin[i] for i in range(3)]
-            one, two = (dot(self.axis, n) * dot(x, a) - dot(x, n) * along for a, along in ((a1, one), (a2, two)))
+            one, two = (
+                dot(self.axis, n) * dot(x, a) - dot(x, n) * along
+                for a, along in ((a1, one), (a2, two))
+            )
         return replace(self, direction=(one, two))
 
     @property
@@ -146,11 +161,15 @@ class Laminated(Law):
         frame = _Frame(self.direction, up)
         return frame.raised(1, self._moment(frame, E, K))
 
-    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_moment(
+        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         frame = _Frame(self.direction, up)
         return _work(self._moment(frame, E, K), frame.twice(across))
 
-    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(
+        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         bent = _Frame(self.direction, up).twice(across)
         return self._of_D * _work(_stress(self.D, bent), bent)
 

@@ -1,8 +1,9 @@
 """The law of a thin shell's material: energies, stresses and moments as functions of strains.
 
-Energies are over E h per undeformed area, lengths over R. E is the membrane strain and K the change of curvature,
-(..., 2, 2) in coordinates of the surface; `up` is the inverse metric of the shape without stress. Every formula is one
-of components, so that it holds for an expression of UFL at a point and for arrays of NumPy over many points.
+Energies are over E h per undeformed area, lengths over R. E is the membrane strain and K the change
+of curvature, (..., 2, 2) in coordinates of the surface; `up` is the inverse metric of the shape
+without stress. Every formula is one of components, so that it holds for an expression of UFL at a
+point and for arrays of NumPy over many points.
 
 A further law is a `Law`, and a line in `parameters.Material.law`.
 """
@@ -20,7 +21,9 @@ from magshell_fenicsx.models.shell.energy import Density, Parameter
 
 Scalar: TypeAlias = Any  # a number, an expression, or an array (...)
 Tensor: TypeAlias = Any  # an expression (2, 2), or an array (..., 2, 2)
-Components: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 12 and 22 of a symmetric tensor with indices up
+Components: TypeAlias = tuple[
+    Scalar, Scalar, Scalar
+]  # 11, 12 and 22 of a symmetric tensor with indices up
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,9 @@ class Law(ABC):
         return False
 
     def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        """The law at an undeformed place (..., 3) with these tangents and a normal of any length: of directions."""
+        """The law at an undeformed place (..., 3) with these tangents and a normal of any length:
+        of directions.
+        """
         return self
 
     def thicker(self, factor: Scalar) -> Self:
@@ -118,23 +123,33 @@ class Law(ABC):
         """The derivative of `bending` by K."""
 
     @abstractmethod
-    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_moment(
+        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         """The moment twice along a covector c.
 
         Parameters
         ----------
         across, square
-            c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural stretch.
+            c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural
+            stretch.
         """
 
     @abstractmethod
-    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is proportional."""
+    def edge_stiffness(
+        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
+        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is
+        proportional.
+        """
 
 
 @dataclass(frozen=True)
 class Koiter(Law):
-    """Stress is linear in strain; stretching and bending do not know of each other. Its number is Poisson's ratio."""
+    """Stress is linear in strain; stretching and bending do not know of each other.
+
+    Its number is Poisson's ratio.
+    """
 
     @property
     def nu(self) -> Scalar:
@@ -159,11 +174,19 @@ class Koiter(Law):
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         return self._scaled(self.bending_stiffness, K, up)
 
-    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        bent = K[..., 0, 0] * across[0] ** 2 + 2 * K[..., 0, 1] * across[0] * across[1] + K[..., 1, 1] * across[1] ** 2
+    def edge_moment(
+        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
+        bent = (
+            K[..., 0, 0] * across[0] ** 2
+            + 2 * K[..., 0, 1] * across[0] * across[1]
+            + K[..., 1, 1] * across[1] ** 2
+        )
         return self.bending_stiffness * ((1 - self.nu) * bent + self.nu * square * trace(K, up))
 
-    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(
+        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         return self.bending_stiffness * square**2
 
     def _square(self, S: Tensor, up: Tensor) -> Scalar:
@@ -233,7 +256,11 @@ class OfShells(Law):
 
     @property
     def linear(self) -> "OfShells":
-        return self if all(law.linear is law for law in self.laws) else self._each(lambda law: law.linear)
+        return (
+            self
+            if all(law.linear is law for law in self.laws)
+            else self._each(lambda law: law.linear)
+        )
 
     @property
     def bending_stiffness(self) -> Scalar:
@@ -246,17 +273,25 @@ class OfShells(Law):
         return self._there([law.bending(E, K, up) for law in self.laws])
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        S11, S12, S22 = map(self._there, zip(*(law.stress(E, up) for law in self.laws), strict=True))
+        S11, S12, S22 = map(
+            self._there, zip(*(law.stress(E, up) for law in self.laws), strict=True)
+        )
         return S11, S12, S22
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
-        M11, M12, M22 = map(self._there, zip(*(law.moment(E, K, up) for law in self.laws), strict=True))
+        M11, M12, M22 = map(
+            self._there, zip(*(law.moment(E, K, up) for law in self.laws), strict=True)
+        )
         return M11, M12, M22
 
-    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_moment(
+        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         return self._there([law.edge_moment(E, K, up, across, square) for law in self.laws])
 
-    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_stiffness(
+        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         return self._there([law.edge_stiffness(E, up, across, square) for law in self.laws])
 
     def _each(self, change: Callable[[Law], Law]) -> Self:
@@ -277,16 +312,27 @@ def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """S^i_j as 11, 12, 21, 22."""
     S11, S12, S22 = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
-    return a11 * S11 + a12 * S12, a11 * S12 + a12 * S22, a12 * S11 + a22 * S12, a12 * S12 + a22 * S22
+    return (
+        a11 * S11 + a12 * S12,
+        a11 * S12 + a12 * S22,
+        a12 * S11 + a22 * S12,
+        a12 * S12 + a22 * S22,
+    )
 
 
 def trace(S: Tensor, up: Tensor) -> Scalar:
     """S^i_i."""
-    return up[..., 0, 0] * S[..., 0, 0] + 2 * up[..., 0, 1] * S[..., 0, 1] + up[..., 1, 1] * S[..., 1, 1]
+    return (
+        up[..., 0, 0] * S[..., 0, 0]
+        + 2 * up[..., 0, 1] * S[..., 0, 1]
+        + up[..., 1, 1] * S[..., 1, 1]
+    )
 
 
 def lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """The components with index down of a covector, from those with index up; `up` is the inverse metric (2, 2)."""
+    """The components with index down of a covector, from those with index up; `up` is the inverse
+    metric (2, 2).
+    """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
     return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
@@ -297,11 +343,13 @@ def work(S: Components, T: Tensor) -> Scalar:
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
 
 
-def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None) -> Density:
+def elastic(
+    density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None
+) -> Density:
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
-    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1. `made_of` (4,) is
-    `OwnMaterial.numbers`; None for one material.
+    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1.
+    `made_of` (4,) is `OwnMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
@@ -316,9 +364,16 @@ def elastic(density: Density, law: Law, t: Parameter | None = None, made_of: Par
         count = len(given) - len(law.numbers)
         laws = [law.with_numbers(*given[count:]).thicker(factor) for factor in factors]
         if materials is not None:
-            laws = [of_side.made_of(own[0], own[1], own[3]) for of_side, own in zip(laws, materials, strict=True)]
-        return density.of(*given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords)
+            laws = [
+                of_side.made_of(own[0], own[1], own[3])
+                for of_side, own in zip(laws, materials, strict=True)
+            ]
+        return density.of(
+            *given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords
+        )
 
     fields = (field for field in (t, made_of) if field is not None)
     parameters = (*density.parameters, *law.numbers, *fields)
-    return replace(density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still)
+    return replace(
+        density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still
+    )

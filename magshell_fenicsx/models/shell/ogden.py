@@ -1,12 +1,14 @@
-"""Ogden's rubber: the energy per volume is sum mu_p/alpha_p (l1^alpha_p + l2^alpha_p + l3^alpha_p - 3).
+"""Ogden's rubber: the energy per volume is sum mu_p/alpha_p (l1^alpha_p + l2^alpha_p + l3^alpha_p -
+3).
 
-R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565. Principal stretches have no derivatives where they are equal, their
-sum has: with d = det C, t = tr C, a = alpha/2 and 1 + w = t/(2 sqrt(d)) the squares of both stretches are
-sqrt(d) exp(+-u) with cosh u = 1 + w, so that
+R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565. Principal stretches have no derivatives where
+they are equal, their sum has: with d = det C, t = tr C, a = alpha/2 and 1 + w = t/(2 sqrt(d)) the
+squares of both stretches are sqrt(d) exp(+-u) with cosh u = 1 + w, so that
 
     l1^alpha + l2^alpha = 2 d^(a/2) (1 + V(w)),   V = cosh(a u) - 1,   w (2 + w) V'' + (1 + w) V' = a^2 (1 + V),
 
-where V is Chebyshev's function of the order a, less one: a power series in w that is cut off where w is small.
+where V is Chebyshev's function of the order a, less one: a power series in w that is cut off where
+w is small.
 
 Of the energy of bending see docs/theory.md, Rubber.
 """
@@ -52,14 +54,18 @@ class Ogden(Incompressible):
 
     @property
     def softening(self) -> float:
-        """How much of the stress is taken into the stiffness of bending, so that it is positive at every stretch."""
+        """How much of the stress is taken into the stiffness of bending, so that it is positive at
+        every stretch.
+        """
         return max(0.0, 2 - min(abs(alpha) for alpha in self.alpha))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         at, total = Stretched(E, up), 0.0
         for mu, alpha in self.terms:
             z, (V, _, _) = at.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(at))
-            total = total + mu / alpha * ((z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V)  # of order one is nothing
+            total = total + mu / alpha * (
+                (z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V
+            )  # of order one is nothing
         return self.e * self.t * total
 
     def _slopes(self, at: Stretched) -> tuple[Scalar, Scalar]:
@@ -68,7 +74,9 @@ class Ogden(Incompressible):
             a = alpha / 2
             V, V1, _ = _chebyshev(a, w)
             by_t = by_t + mu / alpha * at.d ** ((a - 1) / 2) * V1
-            by_d = by_d + mu / alpha / at.d * (at.d ** (a / 2) * (a * (1 + V) - (1 + w) * V1) - a * at.d**-a)
+            by_d = by_d + mu / alpha / at.d * (
+                at.d ** (a / 2) * (a * (1 + V) - (1 + w) * V1) - a * at.d**-a
+            )
         return by_t + by_d, by_d
 
     def _stiffness(self, at: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -88,11 +96,18 @@ class Ogden(Incompressible):
         of_det = 2 * across**2 / (across + even)
         factor = self.e * self.t**3 * self.h**2 / (12 * at.d)
         s = root(at.d)
-        return factor * square, -factor * mixed / s, factor * of_det * at.up / at.d, factor * drawn / at.d
+        return (
+            factor * square,
+            -factor * mixed / s,
+            factor * of_det * at.up / at.d,
+            factor * drawn / at.d,
+        )
 
 
 def _uneven(at: Stretched) -> Scalar:
-    """w = t/(2 sqrt(d)) - 1, in which no numbers of order one are subtracted: (t^2/4 - d)/(sqrt(d) (t/2 + sqrt(d)))."""
+    """w = t/(2 sqrt(d)) - 1, in which no numbers of order one are subtracted: (t^2/4 - d)/(sqrt(d)
+    (t/2 + sqrt(d))).
+    """
     s = root(at.d)
     return (at.T**2 / 4 - at.D) / (s * (1 + at.T / 2 + s))
 
@@ -102,7 +117,10 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     c = [0.0, a**2]
     for k in range(1, TERMS):
         c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
-    series = [_horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w) for n in range(3)]
+    series = [
+        _horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w)
+        for n in range(3)
+    ]
     if a == int(a) and abs(a) <= TERMS:  # a polynomial
         return series[0], series[1], series[2]
     small = ufl.lt(w, SMALL) if isinstance(w, Expr) else np.real(w) < SMALL
@@ -124,4 +142,6 @@ def _horner(c: list[float], w: Scalar) -> Scalar:
 
 
 def _where(small: Any, one: Scalar, two: Scalar) -> Scalar:
-    return ufl.conditional(small, one, two) if isinstance(small, Expr) else np.where(small, one, two)
+    return (
+        ufl.conditional(small, one, two) if isinstance(small, Expr) else np.where(small, one, two)
+    )

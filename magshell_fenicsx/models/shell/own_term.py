@@ -34,8 +34,13 @@ Array = NDArray[np.float64]
 Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
 SAME = 1e-10  # difference of two values that is rounding, over the larger
-OTHER_COORDINATES = np.array([[1.1, 0.7], [-0.4, 0.8]])  # by the jets' own: turned, stretched and sheared
-IN_COORDINATES, SURELY = 4, 1e-6  # samples in both; difference of values, over the larger, that is not rounding
+OTHER_COORDINATES = np.array(
+    [[1.1, 0.7], [-0.4, 0.8]]
+)  # by the jets' own: turned, stretched and sheared
+IN_COORDINATES, SURELY = (
+    4,
+    1e-6,
+)  # samples in both; difference of values, over the larger, that is not rounding
 
 
 def symbolic_functions() -> dict[str, Callable[..., Any]]:
@@ -48,8 +53,8 @@ def symbolic_functions() -> dict[str, Callable[..., Any]]:
 class Free:
     """A parameter of densities that is an amplitude of its own, and may enter them in any way.
 
-    A place, an angle or a natural curvature, for instance: what is conjugate to it is -dPi/dp, a force on what it
-    moves. `value` is that of the undeformed shell.
+    A place, an angle or a natural curvature, for instance: what is conjugate to it is -dPi/dp, a
+    force on what it moves. `value` is that of the undeformed shell.
     """
 
     name: str
@@ -58,9 +63,11 @@ class Free:
 
 @dataclass(frozen=True)
 class ByPlace:
-    """A parameter that is a formula of x, y, z over R at the undeformed place: a number that varies over the surface.
+    """A parameter that is a formula of x, y, z over R at the undeformed place: a number that varies
+    over the surface.
 
-    Each cell has the polynomial with the moments of the formula: what is narrower than a cell is not missed.
+    Each cell has the polynomial with the moments of the formula: what is narrower than a cell is
+    not missed.
 
     Attributes
     ----------
@@ -96,36 +103,41 @@ class ByPlace:
 
 @dataclass(frozen=True)
 class OwnTerm:
-    """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface or, with `on`, along an edge.
+    """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface or, with
+    `on`, along an edge.
 
-    Of its own name are the term, its amplitude mu and its column. What the density depends on is found from
-    it, and so are its derivatives and the symmetries that it leaves to a model.
+    Of its own name are the term, its amplitude mu and its column. What the density depends on is
+    found from it, and so are its derivatives and the symmetries that it leaves to a model.
 
     Parameters
     ----------
     name
         An identifier.
     density
-        Of (r0, u, *parameters): jets of the placement and of the displacement (see `kinematics.Jet`; r = r0 + u),
-        lengths in R, to a UFL scalar in E h per undeformed area. It must not depend on the coordinates that the
-        jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
-        the first derivatives of u; an energy of its second derivatives would miss the rotations between cells. None:
-        it has no energy and only observes, also second derivatives.
+        Of (r0, u, *parameters): jets of the placement and of the displacement (see
+        `kinematics.Jet`; r = r0 + u), lengths in R, to a UFL scalar in E h per undeformed area. It
+        must not depend on the coordinates that the jets are taken in: build it from values and from
+        what `kinematics` offers. It may depend on the value and the first derivatives of u; an
+        energy of its second derivatives would miss the rotations between cells. None: it has no
+        energy and only observes, also second derivatives.
     parameters
-        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can. A
-        dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place;
-        a formula of the place (`ByPlace`) is a number.
+        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as
+        mu can. A dolfinx function on the mesh that the shell was given on is a number, or a vector,
+        of its value at each place; a formula of the place (`ByPlace`) is a number.
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
-        Column -> density as above; mu times its integral over the whole shell is observed along a path, the integral
-        itself without an energy. A model has only the symmetries that these leave too.
+        Column -> density as above; mu times its integral over the whole shell is observed along a
+        path, the integral itself without an energy. A model has only the symmetries that these
+        leave too.
     of_volume
-        Whether the densities are those of a volume, over E: the thickness multiplies them where it varies, and a solid
-        has them in all of its body. They depend on the places r0.r and u.r alone.
+        Whether the densities are those of a volume, over E: the thickness multiplies them where it
+        varies, and a solid has them in all of its body. They depend on the places r0.r and u.r
+        alone.
     on
-        Name of an edge. The densities are then in E h R per undeformed length of it, and take a `kinematics.Edge` after
-        the jets: its outward conormal, and derivatives along this and by arc length. A solid has no such energies.
+        Name of an edge. The densities are then in E h R per undeformed length of it, and take a
+        `kinematics.Edge` after the jets: its outward conormal, and derivatives along this and by
+        arc length. A solid has no such energies.
     key
         That of the case file with this name, for messages.
 
@@ -154,9 +166,13 @@ class OwnTerm:
         if not self.densities:
             raise ValueError(f"{self.name}: has neither a density nor anything that it observes")
         if self.density is None and (self.free or self.value):
-            raise ValueError(f"{self.name}: only observes: a value or a Free parameter needs a density")
+            raise ValueError(
+                f"{self.name}: only observes: a value or a Free parameter needs a density"
+            )
         if self._symbolic.W.ufl_shape:
-            raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}")
+            raise ValueError(
+                f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}"
+            )
         if strangers := self._strangers():
             raise ValueError(
                 f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
@@ -171,11 +187,15 @@ class OwnTerm:
             )
 
         if self.of_volume and self.on is not None:
-            raise ValueError(f"{self.name}: a density is that of a volume or that of an edge, not both")
+            raise ValueError(
+                f"{self.name}: a density is that of a volume or that of an edge, not both"
+            )
         self._refuse_coordinates()
         bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
-            raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
+            raise ValueError(
+                f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}"
+            )
 
     @property
     def densities(self) -> tuple[Callable[..., Expr], ...]:
@@ -190,7 +210,9 @@ class OwnTerm:
     @cached_property
     def placed_parts(self) -> tuple[str, ...]:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
-        return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic.r0)))
+        return tuple(
+            name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic.r0))
+        )
 
     @property
     def free(self) -> tuple[Free, ...]:
@@ -208,9 +230,13 @@ class OwnTerm:
         return tuple(p for p in self.parameters if isinstance(p, ByPlace))
 
     def with_functions(
-        self, made: Callable[[ByPlace], Coefficient], carried: Callable[[GivenField], Coefficient] | None = None
+        self,
+        made: Callable[[ByPlace], Coefficient],
+        carried: Callable[[GivenField], Coefficient] | None = None,
     ) -> OwnTerm:
-        """With functions of numbers (size,) on a model's mesh in place of formulas and of fields that were given."""
+        """With functions of numbers (size,) on a model's mesh in place of formulas and of fields
+        that were given.
+        """
 
         def function_of(p: Any) -> Any:
             if isinstance(p, ByPlace):
@@ -234,12 +260,19 @@ class OwnTerm:
                 jets = (Jet(*(back(part, about) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
                     edge, *rest = rest
-                    rest = [replace(edge, outward=back(edge.outward, about), along=back(edge.along, about)), *rest]
+                    rest = [
+                        replace(
+                            edge, outward=back(edge.outward, about), along=back(edge.along, about)
+                        ),
+                        *rest,
+                    ]
                 return density(*jets, *rest)
 
             return of
 
-        parameters = (replace(p, turn=angle) if isinstance(p, ByPlace) else p for p in self.parameters)
+        parameters = (
+            replace(p, turn=angle) if isinstance(p, ByPlace) else p for p in self.parameters
+        )
         return replace(
             self,
             density=in_frame(self.density) if self.density else None,
@@ -255,20 +288,30 @@ class OwnTerm:
 
         def of(*arguments: Any) -> Expr:
             others, parameters = arguments[: -len(alone)], arguments[-len(alone) :]
-            return density(*others, *(p[0] if one else p for p, one in zip(parameters, alone, strict=True)))
+            return density(
+                *others, *(p[0] if one else p for p, one in zip(parameters, alone, strict=True))
+            )
 
         return of
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the density is linear in the displacement: its second derivatives vanish identically."""
+        """Whether the density is linear in the displacement: its second derivatives vanish
+        identically.
+        """
         W, parts = self._symbolic.W, [getattr(self._symbolic.u, name) for name in self.parts]
-        second = (ufl.algorithms.expand_derivatives(ufl.diff(ufl.diff(W, a), b)) for a in parts for b in parts)
+        second = (
+            ufl.algorithms.expand_derivatives(ufl.diff(ufl.diff(W, a), b))
+            for a in parts
+            for b in parts
+        )
         return all(isinstance(each, ufl.constantvalue.Zero) for each in second)
 
     @cached_property
     def turns(self) -> bool:
-        """Whether it, and what it observes, stays if shell and displacement turn about e3; at random jets."""
+        """Whether it, and what it observes, stays if shell and displacement turn about e3; at
+        random jets.
+        """
 
         def turned(jet: Array, angle: float) -> Array:
             c, s = np.cos(angle), np.sin(angle)
@@ -280,11 +323,16 @@ class OwnTerm:
         )
 
     def mirrored(self, mirror: Mirror) -> bool:
-        """Whether it, and what it observes, stays if shell and displacement are mirrored; at random jets."""
+        """Whether it, and what it observes, stays if shell and displacement are mirrored; at random
+        jets.
+        """
         # the first coordinate changes places with the second, so that the normal stays outward
         if self.varying:
             return False
-        order, S = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")], mirror.reflection
+        order, S = (
+            [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")],
+            mirror.reflection,
+        )
 
         def image(r0: Array, u: Array, m: Array) -> Sample:
             return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S, m[::-1]
@@ -300,13 +348,20 @@ class OwnTerm:
         def mirrors(mirror: Mirror) -> bool:
             return self.mirrored(mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
 
-        shared, name = self.mirrored(Y0) and turns, self.name + (" or what it observes" if self.observed else "")
+        shared, name = (
+            self.mirrored(Y0) and turns,
+            self.name + (" or what it observes" if self.observed else ""),
+        )
         return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(sample, density) for density in self.densities for sample in _random_samples()]
+        values = [
+            self._value(sample, density)
+            for density in self.densities
+            for sample in _random_samples()
+        ]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
@@ -322,8 +377,13 @@ class OwnTerm:
 
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
-        r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
-        m = ufl.Coefficient(ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,))))
+        r0, u = (
+            Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED))))
+            for _ in range(2)
+        )
+        m = ufl.Coefficient(
+            ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,)))
+        )
         try:
             return Symbolic(self._at(r0, u, m, self.densities[0]), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
@@ -355,10 +415,17 @@ class OwnTerm:
         ValueError
             With the density that is not.
         """
-        for column, density in zip(("", *self.observed)[-len(self.densities) :], self.densities, strict=True):
+        for column, density in zip(
+            ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
+        ):
             for sample in _random_samples()[:IN_COORDINATES]:
-                one, other = self._value(sample, density), self._value(_in_other_coordinates(sample), density)
-                if abs(one - other) > SURELY * max(abs(one), abs(other)):  # nan: it has no value there
+                one, other = (
+                    self._value(sample, density),
+                    self._value(_in_other_coordinates(sample), density),
+                )
+                if abs(one - other) > SURELY * max(
+                    abs(one), abs(other)
+                ):  # nan: it has no value there
                     raise ValueError(
                         f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 and r2, which are "
                         "others in each cell: build it from kinematics (inverse_metric, membrane_strain, normal, ...), "
@@ -367,20 +434,26 @@ class OwnTerm:
 
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
-        return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients)
+        return tuple(
+            name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients
+        )
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
         """What its densities take after the jets."""
         return () if self.on is None else (Edge.of(r0, m),)
 
     def _at(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
-        return ufl.as_ufl(density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters)))
+        return ufl.as_ufl(
+            density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters))
+        )
 
     def _same(self, *samples: Sample) -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
-            if not abs(first - second) <= SAME * max(abs(first), abs(second)):  # nan: no symmetry is known
+            if not abs(first - second) <= SAME * max(
+                abs(first), abs(second)
+            ):  # nan: no symmetry is known
                 return False
         return True
 
@@ -433,7 +506,15 @@ def _as_expression(value: float | Array | Free | GivenField | ByPlace | Coeffici
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
     if isinstance(value, ufl.Coefficient):  # of any value
-        value = np.arange(1.0, 1 + prod(value.ufl_shape)) if value.ufl_shape not in ((), (1,)) else 1.0
+        value = (
+            np.arange(1.0, 1 + prod(value.ufl_shape)) if value.ufl_shape not in ((), (1,)) else 1.0
+        )
     if isinstance(value, Free):
-        return ufl.as_ufl(value.value or 1.0)  # of no place in its range, such as zero, that hides terms
-    return ufl.as_ufl(float(value)) if np.ndim(value) == 0 else ufl.as_tensor(np.asarray(value, dtype=float).tolist())
+        return ufl.as_ufl(
+            value.value or 1.0
+        )  # of no place in its range, such as zero, that hides terms
+    return (
+        ufl.as_ufl(float(value))
+        if np.ndim(value) == 0
+        else ufl.as_tensor(np.asarray(value, dtype=float).tolist())
+    )

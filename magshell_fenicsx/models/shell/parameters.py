@@ -24,14 +24,15 @@ class Held:
     components: tuple[int, ...]
 
 
-# "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
+# "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is
+# described
 Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
 
 
 @dataclass(frozen=True)
 class OwnMaterial:
-    """The material of one of several shells: modulus and density over those of the first shell, Poisson's ratio, and
-    the number of its law in `Material.laws`.
+    """The material of one of several shells: modulus and density over those of the first shell,
+    Poisson's ratio, and the number of its law in `Material.laws`.
 
     >>> OwnMaterial(2.0, 0.3).numbers
     (2.0, 0.3, 1.0, 0)
@@ -50,10 +51,11 @@ class OwnMaterial:
 
 @dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber its numbers, and nu is 1/2; of plies their laminate, and nu is that of units.
+    """nu, and h over R; of rubber its numbers, and nu is 1/2; of plies their laminate, and nu is
+    that of units.
 
-    Several shells: `shells` is name -> material, and nu is that of the first; None if all have the same. `laws` has the
-    law of each in their order, and `laminates` is name -> plies.
+    Several shells: `shells` is name -> material, and nu is that of the first; None if all have the
+    same. `laws` has the law of each in their order, and `laminates` is name -> plies.
     """
 
     nu: float
@@ -82,7 +84,9 @@ class Material:
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
     def law_in(self, cells: NDArray[np.float64] | None) -> Law:
-        """That of cells with these `OwnMaterial.numbers` (cells, 4), for arrays (cells, n); None where all have one."""
+        """That of cells with these `OwnMaterial.numbers` (cells, 4), for arrays (cells, n); None
+        where all have one.
+        """
         if cells is None:
             return self.law
         e, nu, _, which = np.moveaxis(cells[:, None], -1, 0)
@@ -125,7 +129,9 @@ class PointForce:
 
 @dataclass(frozen=True)
 class EdgeForce:
-    """A dead force (3,), or a pattern, on a named edge: per length over E h or, if `total`, in all over E h R."""
+    """A dead force (3,), or a pattern, on a named edge: per length over E h or, if `total`, in all
+    over E h R.
+    """
 
     edge: str
     force: NDArray[np.float64] | Pattern
@@ -144,7 +150,8 @@ class EdgeMoment:
 class AreaForce:
     """A dead force (3,), or a pattern, per undeformed area over E h/R, on a patch, or on all.
 
-    A number in place of the vector is a pressure along the undeformed normal, positive from outside.
+    A number in place of the vector is a pressure along the undeformed normal, positive from
+    outside.
     """
 
     patch: str | None

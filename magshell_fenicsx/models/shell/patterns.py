@@ -29,9 +29,13 @@ Inside = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they a
 
 
 class OfPlacement(fem.Function):  # type: ignore[misc]  # dolfinx has no types
-    """A field that follows from the placement; `again` makes it from another one, which may jump from cell to cell."""
+    """A field that follows from the placement; `again` makes it from another one, which may jump
+    from cell to cell.
+    """
 
-    def __init__(self, V: fem.FunctionSpace, name: str, again: Callable[[fem.Function], fem.Function]) -> None:
+    def __init__(
+        self, V: fem.FunctionSpace, name: str, again: Callable[[fem.Function], fem.Function]
+    ) -> None:
         super().__init__(V, name=name)
         self.again = again
 
@@ -60,7 +64,9 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Components:
-    """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are columns of `frame`."""
+    """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are
+    columns of `frame`.
+    """
 
     by_formula: ClassVar[bool] = True
     of_position: list[Callable[[Array, Array, Array], Array]]
@@ -78,7 +84,9 @@ class Components:
 
 @dataclass(frozen=True)
 class WithinRims:
-    """A vector within each rim, another in the rest; rims separate cells, and the first of two that overlap counts."""
+    """A vector within each rim, another in the rest; rims separate cells, and the first of two that
+    overlap counts.
+    """
 
     within: tuple[tuple[Inside, Array], ...]
     outside: Array
@@ -148,13 +156,21 @@ class Carried:
     cells: Cells
 
     def __call__(self, r0: Array, n0: Array | None = None) -> Array:
-        table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[0, :, :, 0]
+        table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[
+            0, :, :, 0
+        ]
         return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
 
     def between(self) -> tuple[Array, Array]:
-        """Values (cells, n, size) and places (cells, n, 3) in own cells at its nodes, and between them."""
-        X = basix.create_lattice(self.of.cell_type, 2 * max(self.of.degree, 1), basix.LatticeType.equispaced, True)
-        at, drawn = (element.tabulate(0, X)[0, :, :, 0] for element in (self.of, self.cells.element))
+        """Values (cells, n, size) and places (cells, n, 3) in own cells at its nodes, and between
+        them.
+        """
+        X = basix.create_lattice(
+            self.of.cell_type, 2 * max(self.of.degree, 1), basix.LatticeType.equispaced, True
+        )
+        at, drawn = (
+            element.tabulate(0, X)[0, :, :, 0] for element in (self.of, self.cells.element)
+        )
         owned = slice(self.cells.owned)
         return np.matmul(at, self.values[owned]), np.matmul(drawn, self.cells.nodal[owned])
 
@@ -194,9 +210,11 @@ def by_patch(
     cells: int,
     key: str = "magnetic.remanent.patches",
 ) -> ByPatch | PatternsByPatch:
-    """A vector for each named patch of a mesh, and one for the "rest"; zero without. All have the same size.
+    """A vector for each named patch of a mesh, and one for the "rest"; zero without. All have the
+    same size.
 
-    A patch may have a pattern of vectors (3,) in place of one; patches that come later take the place of others.
+    A patch may have a pattern of vectors (3,) in place of one; patches that come later take the
+    place of others.
 
     Parameters
     ----------
@@ -261,7 +279,9 @@ def pattern_field(
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
     nodes, n0 = places(r0, Q.element.basix_element.points)
-    field = OfPlacement(Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0])
+    field = OfPlacement(
+        Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
+    )
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
     fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
     field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
@@ -271,13 +291,17 @@ def pattern_field(
 
 def field_of_place(r0: fem.Function, parameter: ByPlace) -> fem.Function:
     """A formula in every cell, of shape (1,), see `pattern_field`; collective."""
-    return pattern_field(Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1)[0]
+    return pattern_field(
+        Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
+    )[0]
 
 
 def pattern_on_edge(
     pattern: Pattern, r0: fem.Function, facets: NDArray[np.int32], finer: int
 ) -> tuple[fem.Function, float | None]:
-    """The same field on some facets of the boundary, where alone it is right: the moments are those along them."""
+    """The same field on some facets of the boundary, where alone it is right: the moments are those
+    along them.
+    """
     V = r0.function_space
     field, _ = pattern_field(Nodal(pattern), r0, finer)
     field.again = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
@@ -289,23 +313,36 @@ def pattern_on_edge(
     local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in pairs]
     element, on = Q.element.basix_element, V.element.basix_element
     corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
-    family, interval, variant = basix.ElementFamily.P, basix.CellType.interval, basix.LagrangeVariant.gll_warped
-    line, along = (basix.create_element(family, interval, one.degree, variant) for one in (on, element))
+    family, interval, variant = (
+        basix.ElementFamily.P,
+        basix.CellType.interval,
+        basix.LagrangeVariant.gll_warped,
+    )
+    line, along = (
+        basix.create_element(family, interval, one.degree, variant) for one in (on, element)
+    )
 
     def side(points: Array, number: int) -> Array:
         a, b = corners[ends[number]]
         return np.asarray(a + points * (b - a))
 
     placed = np.array([on.tabulate(0, side(line.points, i))[0, :, :, 0] for i in range(3)])
-    nodal = np.matmul(placed[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(len(cells), -1, 3)
+    nodal = np.matmul(placed[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(
+        len(cells), -1, 3
+    )
     owned = int(np.sum(facets < topology.index_map(1).size_local))
     edge = Cells(line, nodal, owned, V.mesh.comm)
     x, normals, _ = edge.at(along.points)
     fit = shown(pattern, edge, pattern(inside(x), normals), along)
     nodes = element.points
-    near = [[int(np.argmin(np.linalg.norm(nodes - p, axis=1))) for p in side(along.points, i)] for i in range(3)]
+    near = [
+        [int(np.argmin(np.linalg.norm(nodes - p, axis=1))) for p in side(along.points, i)]
+        for i in range(3)
+    ]
     values = field.x.array.reshape(-1, 3)
-    for cell, number, vectors in zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ():
+    for cell, number, vectors in (
+        zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ()
+    ):
         values[Q.dofmap.list[cell][near[number]]] = vectors
     return field, None if fit.smooth else fit.size
 
@@ -324,11 +361,18 @@ def cells_of(r0: fem.Function) -> Cells:
     """The cells of a placement, or of a meridian's."""
     V = r0.function_space
     owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
-    return Cells(V.element.basix_element, r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list], owned, V.mesh.comm)
+    return Cells(
+        V.element.basix_element,
+        r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list],
+        owned,
+        V.mesh.comm,
+    )
 
 
 def shown(pattern: Pattern, cells: Cells, nodal: Array, element: Element) -> Fit:
-    """A pattern in every cell from its values at the nodes: a formula as it has the same moments; collective."""
+    """A pattern in every cell from its values at the nodes: a formula as it has the same moments;
+    collective.
+    """
     if not getattr(pattern, "by_formula", False):
         return Fit(nodal, smooth=True, size=0.0)
     formulas = getattr(pattern, "formulas", None)
@@ -336,12 +380,15 @@ def shown(pattern: Pattern, cells: Cells, nodal: Array, element: Element) -> Fit
 
 
 def inside(nodes: Array) -> Array:
-    """Places (cells, nodes, 3) just inside their cells: a formula that jumps between two cells has both its values."""
+    """Places (cells, nodes, 3) just inside their cells: a formula that jumps between two cells has
+    both its values.
+    """
     return np.asarray(nodes + INSIDE * (nodes.mean(axis=1, keepdims=True) - nodes))
 
 
 def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
-    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there: (cells, n, 3) each.
+    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there:
+    (cells, n, 3) each.
 
     On a meridian, whose placement is along e_rho and e_z, along (e_rho, e_theta, e_z).
     """
@@ -361,11 +408,15 @@ def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
 def cells_of_body(V: fem.FunctionSpace) -> Cells:
     """The cells of a body."""
     owned = V.mesh.topology.index_map(3).size_local
-    return Cells(V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm)
+    return Cells(
+        V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm
+    )
 
 
 def places_in_body(V: fem.FunctionSpace) -> tuple[Array, Array]:
-    """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3) each."""
+    """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3)
+    each.
+    """
     element = V.element.basix_element
     along = element.tabulate(1, element.points)[:, :, :, 0]
     nodes = V.tabulate_dof_coordinates()[V.dofmap.list]
@@ -375,9 +426,15 @@ def places_in_body(V: fem.FunctionSpace) -> tuple[Array, Array]:
 
 
 def field_in_body(
-    pattern: Pattern, V: fem.FunctionSpace, *, name: str = "Br", key: str = "magnetic.remanent", size: int = 3
+    pattern: Pattern,
+    V: fem.FunctionSpace,
+    *,
+    name: str = "Br",
+    key: str = "magnetic.remanent",
+    size: int = 3,
 ) -> fem.Function:
-    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell; collective.
+    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell;
+    collective.
 
     Parameters
     ----------
@@ -400,7 +457,9 @@ def field_in_body(
     return field
 
 
-def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:
+def refuse_unbounded(
+    vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent"
+) -> None:
     """Look at vectors and places (cells, nodes, 3) of a key of the case; collective.
 
     Raises

@@ -17,9 +17,26 @@ from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.assembly.point_kernels import PointKernel
-from magshell_fenicsx.assembly.shape_tables import Sheet, Table, cell_frames, cell_rule, edge_covector, edge_rule
-from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
-from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, PointTerm, in_own_coordinates
+from magshell_fenicsx.assembly.shape_tables import (
+    Sheet,
+    Table,
+    cell_frames,
+    cell_rule,
+    edge_covector,
+    edge_rule,
+)
+from magshell_fenicsx.models.shell.energy import (
+    Density,
+    ShellTerm,
+    cell_quadrature,
+    edge_quadrature,
+)
+from magshell_fenicsx.models.shell.gradients import (
+    FRAME,
+    PointGradient,
+    PointTerm,
+    in_own_coordinates,
+)
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
 
@@ -114,14 +131,23 @@ class FastResidual:
 class _Cells:
     """Terms with one amplitude on the owned cells."""
 
-    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog) -> None:
+    def __init__(
+        self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
+    ) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
         X, self._weights = cell_rule(degree)
         table, each = Table.tabulate(V.element.basix_element, X), len(X)
-        parts = [name for name in NAMES if name in FIRST or any(name in term.density.jet_parts for term in terms)]
+        parts = [
+            name
+            for name in NAMES
+            if name in FIRST or any(name in term.density.jet_parts for term in terms)
+        ]
         self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
-        cells, frames = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32), cell_frames(V.mesh)
+        cells, frames = (
+            np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32),
+            cell_frames(V.mesh),
+        )
         geometry, count = np.repeat(frames[cells], each, axis=0), len(cells) * each
 
         def placement() -> Array:
@@ -129,7 +155,14 @@ class _Cells:
 
         placed = Follows(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
-            terms, parts, each, count, placed, geometry, lambda field: at_points(field, X, cells), log
+            terms,
+            parts,
+            each,
+            count,
+            placed,
+            geometry,
+            lambda field: at_points(field, X, cells),
+            log,
         )
 
     def begin(self, *, energies: bool) -> None:
@@ -140,7 +173,12 @@ class _Cells:
             return 0.0
         total = 0.0
         for chunk, _ in self._filled(nodal):
-            total += float(np.sum(self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights)) @ self._weights))
+            total += float(
+                np.sum(
+                    self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights))
+                    @ self._weights
+                )
+            )
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
@@ -162,7 +200,9 @@ class _Cells:
 class _Edges:
     """Terms on edges, interior and boundary: the jets on the edges of all cells are found together."""
 
-    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog) -> None:
+    def __init__(
+        self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
+    ) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
         rules = [edge_rule(degree, edge, backwards=False) for edge in range(3)]
@@ -170,7 +210,11 @@ class _Edges:
         each = len(self._weights)
         X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
         table = Table.tabulate(V.element.basix_element, X)
-        parts = [name for name in NAMES if name in CURVED or any(name in term.density.jet_parts for term in terms)]
+        parts = [
+            name
+            for name in NAMES
+            if name in CURVED or any(name in term.density.jet_parts for term in terms)
+        ]
         self._width = 3 * len(parts)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in parts])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
@@ -194,7 +238,9 @@ class _Edges:
             rows, geometry = on_terms[term.name]
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
-                return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
+                return at_points(field, X, cells)[rows].reshape(
+                    len(rows), rows.shape[1] * field.ufl_shape[0]
+                )
 
             at_cells = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
             points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log)
@@ -222,26 +268,41 @@ class _Edges:
                 self._back[numbers] += factors[name] * values.reshape(-1, self._width)
         elements += self._sheet.at_nodes(self._back)
 
-    def _evaluated(self, name: str, kernel: PointKernel | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
-        """A kernel's values in each chunk, at the points of these numbers among those of all cells' edges."""
+    def _evaluated(
+        self, name: str, kernel: PointKernel | None
+    ) -> Iterator[tuple[NDArray[np.intp], Array]]:
+        """A kernel's values in each chunk, at the points of these numbers among those of all cells'
+        edges.
+        """
         if kernel is None:
             return
         rows, points = self._on[name]
         for chunk in points.chunks():
             numbers = rows[chunk].ravel()
-            np.take(self._there, numbers, axis=0, out=points.room(chunk).reshape(len(numbers), -1), mode="clip")
+            np.take(
+                self._there,
+                numbers,
+                axis=0,
+                out=points.room(chunk).reshape(len(numbers), -1),
+                mode="clip",
+            )
             yield numbers, points.evaluate(chunk, kernel)
 
 
 def _placement(r0: fem.Function, table: Table, frames: Array, parts: Sequence[str]) -> Array:
     """(local cells, points, parts, 3) in the cells' own coordinates."""
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
-    jet = in_own_coordinates(Jet(*np.moveaxis(table.jets(nodes), 2, 0)), [x[:, None, None] for x in frames.T])
+    jet = in_own_coordinates(
+        Jet(*np.moveaxis(table.jets(nodes), 2, 0)), [x[:, None, None] for x in frames.T]
+    )
     return np.stack([getattr(jet, part) for part in parts], axis=2)
 
 
-def _where(V: fem.FunctionSpace, density: Density, frames: Array, each: int) -> tuple[NDArray[np.intp], Array]:
-    """(points, sides) among those of all cells' edges, and the geometry that `PointGradient` asks for.
+def _where(
+    V: fem.FunctionSpace, density: Density, frames: Array, each: int
+) -> tuple[NDArray[np.intp], Array]:
+    """(points, sides) among those of all cells' edges, and the geometry that `PointGradient` asks
+    for.
 
     A rule on an edge is symmetric: run backwards, its points come in the opposite order.
     """
@@ -257,7 +318,11 @@ def _where(V: fem.FunctionSpace, density: Density, frames: Array, each: int) -> 
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
-    sides = [frames[cells].reshape(-1, FRAME * density.sides), m.reshape(-1, 2 * density.sides), width[:, None]]
+    sides = [
+        frames[cells].reshape(-1, FRAME * density.sides),
+        m.reshape(-1, 2 * density.sides),
+        width[:, None],
+    ]
     return rows.reshape(-1, density.sides), np.repeat(np.concatenate(sides, axis=1), each, axis=0)
 
 
@@ -299,14 +364,18 @@ def point_parameters(
         of_terms = slopes(p, terms, f"by {name}", serve)
         for served in {id(slope.points): slope.points for slope in of_terms}.values():
             served.begin()
-        parameters[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
+        parameters[name] = Parameter(
+            p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve)
+        )
     return parameters
 
 
 def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
     """The derivatives of those terms that a parameter enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
-    derivatives = [Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered]
+    derivatives = [
+        Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered
+    ]
     points = serve(derivatives) if derivatives else None
     for slope in derivatives:
         assert points

@@ -1,14 +1,17 @@
 """Incompressible rubber: the energies of a neo-Hookean or Mooney-Rivlin shell at any stretch.
 
-The energy per volume is C10 (I1 - 3) + C01 (I2 - 3), E = 6 (C10 + C01). The normal stress is zero and the thickness
-follows from the area (R. W. Ogden, *Non-linear elastic deformations*, 1984): with C = a0^-1 a of the surface, t = tr C
-and d = det C, the stretch of the thickness is d^(-1/2), I1 = t + 1/d and I2 = d + t/d.
+The energy per volume is C10 (I1 - 3) + C01 (I2 - 3), E = 6 (C10 + C01). The normal stress is zero
+and the thickness follows from the area (R. W. Ogden, *Non-linear elastic deformations*, 1984): with
+C = a0^-1 a of the surface, t = tr C and d = det C, the stretch of the thickness is d^(-1/2), I1 = t
++ 1/d and I2 = d + t/d.
 
-A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that the energy of bending is
+A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that the energy of
+bending is
 
     h^2/(24 d) K : W''(E) : K.
 
-Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see docs/theory.md, Rubber.
+Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see
+docs/theory.md, Rubber.
 """
 
 from abc import abstractmethod
@@ -17,11 +20,21 @@ from dataclasses import dataclass
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered, trace
+from magshell_fenicsx.models.shell.law import (
+    Components,
+    Koiter,
+    Law,
+    Scalar,
+    Tensor,
+    lowered,
+    trace,
+)
 
 
 class Incompressible(Law):
-    """What laws of rubber share: they say their energy, its derivatives by the strain, and a stiffness."""
+    """What laws of rubber share: they say their energy, its derivatives by the strain, and a
+    stiffness.
+    """
 
     @property
     def thins(self) -> Scalar:
@@ -37,7 +50,8 @@ class Incompressible(Law):
         adjugate = E[..., 1, 1], -E[..., 0, 1], E[..., 0, 0]
         a = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         S11, S12, S22 = (
-            2 * by_T * raised + 4 * by_D * at.up * turned for raised, turned in zip(a, adjugate, strict=True)
+            2 * by_T * raised + 4 * by_D * at.up * turned
+            for raised, turned in zip(a, adjugate, strict=True)
         )
         return S11, S12, S22
 
@@ -50,7 +64,10 @@ class Incompressible(Law):
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
         T, tau = at.deformed_trace(K), trace(K, up)
-        a, adjugate = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]), (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
+        a, adjugate = (
+            (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]),
+            (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0]),
+        )
         by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
         M11, M12, M22 = (
             by_T * raised + by_tau * once - of_det / 2 * turned
@@ -58,12 +75,18 @@ class Incompressible(Law):
         )
         return M11, M12, M22
 
-    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+    def edge_moment(
+        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
         M, (c1, c2) = self.moment(E, K, up), lowered(across, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
-    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
-        of_square, of_mixed, _, of_drawn = self._stiffness(at := Stretched(E, up))  # c c has no determinant
+    def edge_stiffness(
+        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+    ) -> Scalar:
+        of_square, of_mixed, _, of_drawn = self._stiffness(
+            at := Stretched(E, up)
+        )  # c c has no determinant
         (c1, c2), (a11, a12, a22) = lowered(across, up), at.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return of_square * T**2 - of_mixed * T * square + of_drawn * square**2
@@ -90,7 +113,8 @@ class Rubber(Incompressible):
         first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
         second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
         by_T, by_D = (
-            ((1 - self.number) * one + self.number * two) / (6 * at.d) for one, two in zip(first, second, strict=True)
+            ((1 - self.number) * one + self.number * two) / (6 * at.d)
+            for one, two in zip(first, second, strict=True)
         )
         return by_T, by_D
 

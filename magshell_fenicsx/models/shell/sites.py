@@ -26,7 +26,14 @@ from magshell_fenicsx.models.shell.kinematics import Jet, strain_components
 PointTerm = ShellTerm | HessianTerm
 Array = NDArray[np.float64]
 NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
-RANK = (2, 0, 0, 1, 1, 1)  # pairs of first derivatives come first: the terms' pairs are then neighbours
+RANK = (
+    2,
+    0,
+    0,
+    1,
+    1,
+    1,
+)  # pairs of first derivatives come first: the terms' pairs are then neighbours
 
 
 class Site:
@@ -54,14 +61,22 @@ class Site:
         self._points = Points(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
         self._geometry = self._points.field(2 * sides + 1)
-        self._placements = Follows(lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,))
+        self._placements = Follows(
+            lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
+        )
         self._kernels = {
             t.name: Kernel(
-                t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm) or bool(t.density.work)
+                t.name,
+                t.density,
+                self._points,
+                batches,
+                of_v=isinstance(t, HessianTerm) or bool(t.density.work),
             )
             for t in terms
         }
-        self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
+        self._prestress = (
+            Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
+        )
         self._replaced = False
         for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
             kernel.begin(self._u, self._r0, self._geometry, sides, log)
@@ -69,9 +84,17 @@ class Site:
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
         pairs = Pairs(tuple(sorted(pairs.same, key=_neighbours)), pairs.cross)
         self._coupled = pairs
-        self._contractions = {rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}}
+        self._contractions = {
+            rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}
+        }
 
-    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+    def add(
+        self,
+        u: Array,
+        factors: Mapping[str, float],
+        same: Array,
+        couple: Callable[[int, Array], None],
+    ) -> None:
         """Add the terms' element matrices.
 
         Parameters
@@ -85,7 +108,9 @@ class Site:
         couple
             Takes the number of each batch of interior edges and what couples the cells there.
         """
-        kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
+        kernels = [
+            (kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)
+        ]
         placements = self._placements.renew()
         for kernel, _ in kernels:
             kernel.renew()
@@ -107,13 +132,17 @@ class Site:
     def replace_strain(
         self, u: Array, by: Sequence[tuple[float, Array]], besides: NDArray[np.bool_] | None = None
     ) -> None:
-        """Take the weighted sum of other displacements' membrane strains in place of that of u, in the next `add`.
+        """Take the weighted sum of other displacements' membrane strains in place of that of u, in
+        the next `add`.
 
-        Some local cells keep theirs: those whose nodes move, which the other displacements do not know.
+        Some local cells keep theirs: those whose nodes move, which the other displacements do not
+        know.
         """
         if self._prestress is None:
             return
-        for number, (batch, r0) in enumerate(zip(self.batches, self._placements.renew(), strict=True)):
+        for number, (batch, r0) in enumerate(
+            zip(self.batches, self._placements.renew(), strict=True)
+        ):
             strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
             strain = np.sum(strains, axis=0)
             if besides is not None:
@@ -125,28 +154,44 @@ class Site:
     def _jets(self, batch: Batch, field: Array) -> Array:
         """(points, sides, 6, 3) of a field."""
         nodes = field.reshape(-1, 3)
-        both = [t.jets(nodes[self._dofs[cells]]) for t, cells in zip(batch.rule.tables, batch.cells, strict=True)]
+        both = [
+            t.jets(nodes[self._dofs[cells]])
+            for t, cells in zip(batch.rule.tables, batch.cells, strict=True)
+        ]
         return np.stack(both, axis=2)
 
 
 class Kernel:
     """The point Hessian of one term on a site."""
 
-    def __init__(self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool) -> None:
+    def __init__(
+        self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool
+    ) -> None:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
-        self._varying = [(target, on_batches(field, batches, density.sides)) for target, field in varying]
+        self._varying = [
+            (target, on_batches(field, batches, density.sides)) for target, field in varying
+        ]
 
-    def begin(self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog) -> None:
+    def begin(
+        self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog
+    ) -> None:
         """Declare the kernel."""
         density, name, of_v = self._density, self._name, self._of_v
         self.pairs = _pairs(density)
         z = self._points.field(3 * PARTS) if of_v else u
-        jets = [[_jet(field, side) for side in range(sides)] for field in ((r0, u, z) if of_v else (r0, u))]
+        jets = [
+            [_jet(field, side) for side in range(sides)]
+            for field in ((r0, u, z) if of_v else (r0, u))
+        ]
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
-        W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
-        if density.work:  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
+        W = density.at(
+            jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters
+        )
+        if (
+            density.work
+        ):  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
             W = ufl.dot(ufl.diff(W, u), z) / 2
         self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, at_zero=of_v)
 
@@ -196,21 +241,25 @@ def _jet(field: fem.Function, side: int) -> Jet:
 def parameters_at(
     points: Points, parameters: Sequence[Parameter], sides: int
 ) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
-    """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for.
+    """A density's parameters at points; those that vary, to be filled, are told with the fields
+    that they stand for.
 
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
     at_points = [
-        points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0]) for p in parameters
+        points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0])
+        for p in parameters
     ]
     pairs = zip(at_points, parameters, strict=True)
     return at_points, [(target, p) for target, p in pairs if isinstance(p, fem.Function)]
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
-    """(cells * points, components) of a field that varies over the cells, at reference points (points, 2).
+    """(cells * points, components) of a field that varies over the cells, at reference points
+    (points, 2).
 
-    A `PointField` is known at its own points, in consecutive cells, and what is returned follows it.
+    A `PointField` is known at its own points, in consecutive cells, and what is returned follows
+    it.
     """
     if isinstance(field, PointField):
         return field.at(cells)
@@ -220,9 +269,14 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
     return np.asarray(np.matmul(values, nodal)).reshape(-1, size)
 
 
-def on_batches(field: fem.Function, batches: Sequence[Batch], sides: int = 1) -> Follows[list[Array]]:
+def on_batches(
+    field: fem.Function, batches: Sequence[Batch], sides: int = 1
+) -> Follows[list[Array]]:
     """The values of a field that varies over the cells, at the points of each batch."""
-    return Follows(lambda: [_on_sides(field, batch, range(sides)) for batch in batches], lambda: (values_of(field),))
+    return Follows(
+        lambda: [_on_sides(field, batch, range(sides)) for batch in batches],
+        lambda: (values_of(field),),
+    )
 
 
 def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:

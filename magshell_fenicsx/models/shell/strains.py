@@ -1,8 +1,9 @@
 """Membrane strains, changes of curvature and bending moments at points, in NumPy, to be looked at.
 
-The tensors are those of the energy (`kinematics`, `law`), on the undeformed surface: E_ij = (a_ij - a0_ij)/2,
-K_ij = b_ij - b0_ij and M_ij, what the energy gives for a change of K. The normal is outward and b = n . r,_ij, so
-a sphere has b = -a/R, and a positive moment flattens it: it stretches the inner face.
+The tensors are those of the energy (`kinematics`, `law`), on the undeformed surface: E_ij = (a_ij -
+a0_ij)/2, K_ij = b_ij - b0_ij and M_ij, what the energy gives for a change of K. The normal is
+outward and b = n . r,_ij, so a sphere has b = -a/R, and a positive moment flattens it: it stretches
+the inner face.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,8 @@ class TangentFrame:
     Attributes
     ----------
     jet
-        (6, ..., 3) r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22 in coordinates of the surface, lengths in R.
+        (6, ..., 3) r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22 in coordinates of the surface, lengths
+        in R.
     t
         (..., 2, 3) the frame, tangent to the surface.
     n0
@@ -31,8 +33,8 @@ class TangentFrame:
     dual
         (..., 2, 2) a0^a . t_i as [i, a].
     in_frame, in_space
-        (..., 3, 3) and (..., 3, 3, 3): from S_11, S_12, S_22 in the coordinates to those in the frame, and from these
-        to a tensor in space.
+        (..., 3, 3) and (..., 3, 3, 3): from S_11, S_12, S_22 in the coordinates to those in the
+        frame, and from these to a tensor in space.
     area
         (...) |a0_1 x a0_2|.
     """
@@ -65,7 +67,9 @@ class TangentFrame:
         )
 
     def membrane_strain(self, u: Array) -> Array:
-        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R; not as a difference of two metrics."""
+        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R; not as a difference
+        of two metrics.
+        """
         components = strain_components(self.jet[1:3], u[1:3], _dot)
         return _times(self.in_frame, np.stack(components, axis=-1))
 
@@ -81,7 +85,8 @@ class TangentFrame:
         return np.asarray(m / area[..., None])
 
     def convected(self, v: Array, u: Array, *, thins: Array | float = 0) -> Array:
-        """F v with F = a_i (x) a0^i + s n (x) n0, of vectors (..., 3): how a remanence moves with the shell.
+        """F v with F = a_i (x) a0^i + s n (x) n0, of vectors (..., 3): how a remanence moves with
+        the shell.
 
         The stretch s of the thickness is that of a volume that stays where `thins` is 1, else 1.
         """
@@ -133,10 +138,14 @@ class NaturalFrame:
     thickness: Array
 
     @classmethod
-    def of(cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float) -> "NaturalFrame":
+    def of(
+        cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float
+    ) -> "NaturalFrame":
         """From the tensors of `parts.natural.shape.Natural.at`, times R, and the amplitudes."""
         t0 = frame.t
-        inside = [np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)]
+        inside = [
+            np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)
+        ]
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
         b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
         U = np.eye(2) + inside[0]
@@ -164,12 +173,16 @@ def _components(S: Array) -> Array:
 
 
 def bending_moment(E: Array, K: Array, law: Law) -> Array:
-    """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
+    """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal
+    frame.
+    """
     return np.stack(law.moment(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 
 
 def principal(S: Array) -> tuple[Array, Array]:
-    """The larger and the smaller eigenvalue (...) of S_11, S_12, S_22 (..., 3) in an orthonormal frame."""
+    """The larger and the smaller eigenvalue (...) of S_11, S_12, S_22 (..., 3) in an orthonormal
+    frame.
+    """
     mean, radius = (S[..., 0] + S[..., 2]) / 2, np.hypot((S[..., 0] - S[..., 2]) / 2, S[..., 1])
     return mean + radius, mean - radius
 

@@ -23,10 +23,11 @@ LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a function (1 in the rest).
+    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a
+    function (1 in the rest).
 
-    `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in place of it, which is
-    `carried` in the cells of a model.
+    `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in
+    place of it, which is `carried` in the cells of a model.
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
@@ -39,7 +40,11 @@ class Thickness:
         """Its values at places (..., 3), without patches; of what is given in cells (cells, n, 3)."""
         if self.carried:
             return np.array(self.carried(x)[..., 0])
-        return np.array(self.of_position(*np.moveaxis(x, -1, 0))) if self.of_position else np.ones(x.shape[:-1])
+        return (
+            np.array(self.of_position(*np.moveaxis(x, -1, 0)))
+            if self.of_position
+            else np.ones(x.shape[:-1])
+        )
 
     def shown(self, cells: Cells, nodal: Array) -> Array:
         """The values (cells, nodes) of a formula as `fitted`; collective."""
@@ -67,7 +72,9 @@ class PlacedFactor:
     times: float
 
     def in_cells(self, cells: Cells) -> Array:
-        """Its values (cells, nodes) in cells in space, or on a meridian around its axis; collective."""
+        """Its values (cells, nodes) in cells in space, or on a meridian around its axis;
+        collective.
+        """
         if cells.nodal.shape[-1] == 3:
             nodal = x = self.place.own(cells.nodal)
         else:
@@ -111,7 +118,11 @@ def thickness_field(
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
-        values[inside] = factor.in_cells(some(cells_of(r0), inside)) if isinstance(factor, PlacedFactor) else factor
+        values[inside] = (
+            factor.in_cells(some(cells_of(r0), inside))
+            if isinstance(factor, PlacedFactor)
+            else factor
+        )
     refuse_unfit(values, nodes, V.mesh.comm)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
     field = OfPlacement(Q, "thickness", lambda r: thickness_field(thickness, r, patches))
@@ -139,7 +150,9 @@ def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
     return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
 
 
-def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "loading.loads") -> NDArray[np.bool_]:
+def patch_of(
+    patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "loading.loads"
+) -> NDArray[np.bool_]:
     """Whether each cell belongs to a patch; `key` is the one of the case that names it.
 
     Raises
@@ -154,7 +167,9 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "lo
 
 
 def thick(density: Density, t: fem.Function, component: int = 0) -> Density:
-    """A density per E h times a component of the field t; its first is by default the thickness over h."""
+    """A density per E h times a component of the field t; its first is by default the thickness
+    over h.
+    """
 
     def of(*arguments: Expr) -> Expr:
         *given, factor = arguments

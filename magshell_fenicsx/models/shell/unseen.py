@@ -1,9 +1,10 @@
-"""Parts of cells in which a formula has values that samples do not show, however small these parts are.
+"""Parts of cells in which a formula has values that samples do not show, however small these parts
+are.
 
-The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with values at a few places.
-A part is divided while what the ranges leave open between these may change the integral of the formula's
-variation. So a
-step or a Gaussian of any width is found, at a cost that grows like the logarithm of one over the width.
+The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with
+values at a few places. A part is divided while what the ranges leave open between these may change
+the integral of the formula's variation. So a step or a Gaussian of any width is found, at a cost
+that grows like the logarithm of one over the width.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +21,8 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 AT_ONCE = 4096  # parts that are evaluated together
 OPEN = 5e-3  # of the integral of the variation: what ranges may leave open
-SLIGHT = 1e-4  # of the integral of |f|: so little may be open whatever the variation, as of a step at a rim
+# of the integral of |f|: so little may be open whatever the variation, as of a step at a rim
+SLIGHT = 1e-4
 BOTH = 0.9  # of the difference of values: both sides of a step are seen, and little is left open
 ALIKE = 8.0  # times what values show: derivatives that differ less hide nothing
 SHARE = 0.03  # of the largest part of that: what is divided now, before others
@@ -31,7 +33,10 @@ CHILDREN: dict[
     int, list[tuple[tuple[float, ...], tuple[float, ...]]]
 ] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
     1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
-    2: [((x, y), (s, s)) for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))],
+    2: [
+        ((x, y), (s, s))
+        for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))
+    ],
     3: [((x, y, 0.0), (0.5, 0.5, 1.0)) for x in (0.0, 0.5) for y in (0.0, 0.5)],
 }
 
@@ -55,7 +60,12 @@ class Parts:
 
     @classmethod
     def together(cls, several: "Sequence[Parts]") -> "Parts":
-        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("cell", "corner", "sides")))
+        return cls(
+            *(
+                np.concatenate([getattr(one, name) for one in several])
+                for name in ("cell", "corner", "sides")
+            )
+        )
 
     def pieces(self) -> "list[Parts]":
         """A few at a time."""
@@ -68,7 +78,9 @@ class Parts:
         d = self.corner.shape[1]
         corner = self.corner[:, None] + self.sides[:, None] * at
         return Parts(
-            np.repeat(self.cell, len(children)), corner.reshape(-1, d), (self.sides[:, None] * by).reshape(-1, d)
+            np.repeat(self.cell, len(children)),
+            corner.reshape(-1, d),
+            (self.sides[:, None] * by).reshape(-1, d),
         )
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
@@ -77,12 +89,16 @@ class Parts:
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
 
 
-Look = Callable[[Parts], tuple[Array, Array]]  # places (parts, q, 3), the corners first, and areas (parts,)
+Look = Callable[
+    [Parts], tuple[Array, Array]
+]  # places (parts, q, 3), the corners first, and areas (parts,)
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Places in the reference cell (n, d), the corners first, and pairs of neighbours along each axis (pairs, 2)."""
+    """Places in the reference cell (n, d), the corners first, and pairs of neighbours along each
+    axis (pairs, 2).
+    """
 
     places: Array
     corners: int
@@ -97,11 +113,15 @@ class Lattice:
         X = np.concatenate([corners, every])
         apart = X[None, len(corners) :] - X[len(corners) :, None]
         steps = np.eye(X.shape[1]) / count
-        pairs = [np.argwhere(np.abs(apart - step).max(axis=-1) < 1e-9) + len(corners) for step in steps]
+        pairs = [
+            np.argwhere(np.abs(apart - step).max(axis=-1) < 1e-9) + len(corners) for step in steps
+        ]
         return cls(X, len(corners), pairs, count)
 
     def bent(self, f: Array) -> Array:
-        """By how much derivatives of values (parts, n, formulas), times the sides, differ: (parts, formulas)."""
+        """By how much derivatives of values (parts, n, formulas), times the sides, differ: (parts,
+        formulas).
+        """
         slopes = (self.count * (f[:, pairs[:, 1]] - f[:, pairs[:, 0]]) for pairs in self.pairs)
         return np.asarray(sum(np.ptp(slope, axis=1) for slope in slopes))
 
@@ -132,7 +152,12 @@ class Leaves:
 
 
 def leaves(
-    formulas: Together, first: Parts, look: Look, lattice: Lattice, owned: int, comm: MPI.Comm = MPI.COMM_SELF
+    formulas: Together,
+    first: Parts,
+    look: Look,
+    lattice: Lattice,
+    owned: int,
+    comm: MPI.Comm = MPI.COMM_SELF,
 ) -> Leaves:
     """The first parts, divided where that is needed; collective.
 
@@ -158,22 +183,32 @@ def leaves(
         unseen = np.where(matters, seen.area * seen.between, 0.0)
         most = comm.allreduce(float(unseen[own].max(initial=0.0)), MPI.MAX)
         left = comm.allreduce(float(unseen[own].sum()))
-        slight = SLIGHT * comm.allreduce(float(area @ np.linalg.norm(seen.values, axis=-1).mean(axis=1)))
+        slight = SLIGHT * comm.allreduce(
+            float(area @ np.linalg.norm(seen.values, axis=-1).mean(axis=1))
+        )
         alike = OPEN * variation / max(comm.allreduce(int(own.sum())), 1)
         again = (unseen > alike) & (unseen >= SHARE * min(most, np.finfo(float).max))
-        if left <= max(OPEN * variation, slight) or looked > MOST or not comm.allreduce(int((again & own).sum())):
+        if (
+            left <= max(OPEN * variation, slight)
+            or looked > MOST
+            or not comm.allreduce(int((again & own).sum()))
+        ):
             break
         smaller = parts[again].divided()
         parts = Parts.together([parts[~again], smaller])
         seen = _Seen.together([seen.of(~again), _seen(formulas, smaller, look, lattice)])
     away = (size**2).mean(axis=1)
     share = left / max(variation, np.finfo(float).tiny)
-    return Leaves(parts, seen.area, seen.centre, seen.size, away, variation, share if looked > MOST else 0.0)
+    return Leaves(
+        parts, seen.area, seen.centre, seen.size, away, variation, share if looked > MOST else 0.0
+    )
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """Of each part area, centre, size, what may be between its values, and these (parts, places, formulas)."""
+    """Of each part area, centre, size, what may be between its values, and these (parts, places,
+    formulas).
+    """
 
     area: Array
     centre: Array
@@ -186,20 +221,29 @@ class _Seen:
 
     @classmethod
     def together(cls, several: "Sequence[_Seen]") -> "_Seen":
-        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in cls.__dataclass_fields__))
+        return cls(
+            *(
+                np.concatenate([getattr(one, name) for one in several])
+                for name in cls.__dataclass_fields__
+            )
+        )
 
 
 def _seen(formulas: Together, parts: Parts, look: Look, lattice: Lattice) -> _Seen:
     """A look at each part, with the box of its places and of what bulges between them."""
     x, area = look(parts)
     low, high = x.min(axis=1), x.max(axis=1)
-    bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[:, None]
+    bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[
+        :, None
+    ]
     bulge = np.where(bulge > ROUNDING, bulge, 0.0)
     least, most, bent = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
     most, least = (np.clip(v, -LARGEST, LARGEST) for v in (most, least))
-    between = np.minimum(np.maximum(most - least - BOTH * np.ptp(f, axis=1), 0.0), bent / lattice.count)
+    between = np.minimum(
+        np.maximum(most - least - BOTH * np.ptp(f, axis=1), 0.0), bent / lattice.count
+    )
     between = np.where(bent <= ALIKE * lattice.bent(f), 0.0, between).sum(axis=1)
     return _Seen(area, x.mean(axis=1), (high - low).max(axis=1), between, f)

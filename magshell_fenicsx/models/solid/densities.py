@@ -1,8 +1,10 @@
-"""The compressible rubber that E and nu stand for as a solid: its energies as plain functions of point quantities.
+"""The compressible rubber that E and nu stand for as a solid: its energies as plain functions of
+point quantities.
 
-Energies are over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is the undeformed place,
-u the displacement and H its gradient by X; F = 1 + H. At an end, the face above an edge of the mid-surface, n is
-the undeformed outward normal of the mid-surface and t the edge's tangent, which has the surface on its left.
+Energies are over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is
+the undeformed place, u the displacement and H its gradient by X; F = 1 + H. At an end, the face
+above an edge of the mid-surface, n is the undeformed outward normal of the mid-surface and t the
+edge's tangent, which has the surface on its left.
 """
 
 from dataclasses import dataclass
@@ -15,18 +17,26 @@ from magshell_fenicsx.models.shell.densities import around
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
-    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; of F G^(-1) after a growth G."""
+    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; of F G^(-1) after a
+    growth G.
+    """
     F = ufl.Identity(3) + H
     if growth is not None:
-        return ufl.det(growth) * distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)
+        return ufl.det(growth) * distortion(
+            X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h
+        )
     return shear / (2 * h) * (ufl.det(F) ** (-2 / 3) * ufl.inner(F, F) - 3)
 
 
-def areal_distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
+def areal_distortion(
+    X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None
+) -> Expr:
     """mu/2 (J^(-4/3) I2 - 3), I2 the second invariant of F^T F, as `distortion`."""
     F = ufl.Identity(3) + H
     if growth is not None:
-        return ufl.det(growth) * areal_distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)
+        return ufl.det(growth) * areal_distortion(
+            X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h
+        )
     C = ufl.dot(F.T, F)
     return shear / (2 * h) * (ufl.det(F) ** (-4 / 3) * (ufl.tr(C) ** 2 - ufl.inner(C, C)) / 2 - 3)
 
@@ -45,7 +55,10 @@ def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
 
 
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
-    """The part of Ba = G x: -(G x) . F Br at the deformed place x = X + u, without its value at u = 0."""
+    """The part of Ba = G x: -(G x) .
+
+    F Br at the deformed place x = X + u, without its value at u = 0.
+    """
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
 
@@ -57,28 +70,42 @@ def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> 
 
 
 def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
-    """x . n da/3 under a face, per area of its coordinates: with flat ends through the origin the volume."""
+    """x . n da/3 under a face, per area of its coordinates: with flat ends through the origin the
+    volume.
+    """
     return ufl.dot(x, ufl.cross(x1, x2)) / 3
 
 
-def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
-    """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an origin."""
+def pressure(
+    X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr, origin: Expr | None = None
+) -> Expr:
+    """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an
+    origin.
+    """
     X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
 
 
-def swept(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0) -> Expr:
-    """As `models.shell.densities.swept`: the volume that a face sweeps, per area of its coordinates."""
+def swept(
+    X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0
+) -> Expr:
+    """As `models.shell.densities.swept`: the volume that a face sweeps, per area of its
+    coordinates.
+    """
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
 
 
-def following(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, v: Expr, unit: Expr) -> Expr:
+def following(
+    X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, v: Expr, unit: Expr
+) -> Expr:
     """v . n da: the virtual work of p = 1 in that unit, per area of the face's coordinates."""
     return unit * ufl.dot(v, ufl.cross(X1 + u1, X2 + u2))
 
 
-def sealing(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
+def sealing(
+    X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None
+) -> Expr:
     """`pressure` on a part of an end, per undeformed area."""
     return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
 
@@ -93,11 +120,14 @@ def following_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, v: Expr, unit: Ex
     return following(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), v, unit)
 
 
-def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr) -> Expr:
-    """-Pi of a moment per length about t: intensity times the mean angle that lines along n have turned.
+def turning(
+    X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr
+) -> Expr:
+    """-Pi of a moment per length about t: intensity times the mean angle that lines along n have
+    turned.
 
-    With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a traction linear in z.
-    `past` is that of `models.shell.edges.turning`.
+    With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a
+    traction linear in z. `past` is that of `models.shell.edges.turning`.
     """
     line = n + ufl.dot(H, n)
     sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)
@@ -106,10 +136,11 @@ def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity
 
 @dataclass(frozen=True)
 class MooneyRivlin:
-    """W = mu/2 [(1 - s) (J^(-2/3) I1 - 3) + s (J^(-4/3) I2 - 3)] + kappa/2 (J - 1)^2, moduli over Young's modulus.
+    """W = mu/2 [(1 - s) (J^(-2/3) I1 - 3) + s (J^(-4/3) I2 - 3)] + kappa/2 (J - 1)^2, moduli over
+    Young's modulus.
 
-    s = C01/(C10 + C01) is the `share`; at 0 it is the neo-Hookean law of Zhao et al. (J. Mech. Phys. Solids 124, 2019),
-    whose elements the paper takes.
+    s = C01/(C10 + C01) is the `share`; at 0 it is the neo-Hookean law of Zhao et al. (J. Mech.
+    Phys. Solids 124, 2019), whose elements the paper takes.
 
     Examples
     --------
@@ -128,8 +159,8 @@ class MooneyRivlin:
     def of(cls, nu: float, bulk_to_shear: float, share: float = 0.0) -> "MooneyRivlin":
         """With Young's modulus 1 for small strains.
 
-        For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times that: both
-        Young's modulus and nu then fall short of their limits, by 1/(3 bulk_to_shear).
+        For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times
+        that: both Young's modulus and nu then fall short of their limits, by 1/(3 bulk_to_shear).
         """
         shear = 1 / (2 * (1 + nu))
         return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)), share)

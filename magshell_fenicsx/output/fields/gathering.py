@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields, rubber_fields
+from magshell_fenicsx.output.fields.point_fields import (
+    PointFields,
+    Stresses,
+    principal_fields,
+    rubber_fields,
+)
 from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import (
     SHELL,
@@ -39,7 +44,9 @@ Array = NDArray[np.float64]
 
 
 class RevolvedGatherer:
-    """Gathers displacement and fields of a meridian; strains and moments are recovered from samples in its cells."""
+    """Gathers displacement and fields of a meridian; strains and moments are recovered from samples
+    in its cells.
+    """
 
     def __init__(self, model: "MeridianModel", comm: MPI.Comm) -> None:
         self.comm, self._model = comm, model
@@ -56,11 +63,16 @@ class RevolvedGatherer:
         model, swept, loads = self._model, self._swept, self._model.loads
         r, inner = swept.jets(model.r0), swept.inner_jets(model.r0, self._inner)
         thick, thick_inside = (
-            None if model.thickness is None else swept.scalars(model.thickness, at) for at in (ENDS, self._inner)
+            None if model.thickness is None else swept.scalars(model.thickness, at)
+            for at in (ENDS, self._inner)
         )
         others = loads.contacts, loads.remanence, loads.natural
         own = model.made_of
-        made_of = None if own is None else own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[swept.order, 0]]
+        made_of = (
+            None
+            if own is None
+            else own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[swept.order, 0]]
+        )
         self._law = model.material.law_in(made_of)
         self._fields = PointFields(r, model.material, loads.magnetic, thick, *others, made_of)
         self._stresses = Stresses(inner, model.material, thick_inside, loads.natural, made_of)
@@ -68,7 +80,10 @@ class RevolvedGatherer:
         if isinstance(model.meridian.embedding, Deviated):
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
             deviations = (*embedding.deviations, *grown(loads.growing, mu))
-            w0 = replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s])) / model.material.h
+            w0 = (
+                replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s]))
+                / model.material.h
+            )
             self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))
         if inside := [*model.meridian.patches.values()]:
             number = np.argmax(inside, axis=0)[swept.order, None].astype(np.float64)
@@ -87,7 +102,9 @@ class RevolvedGatherer:
         return [int(i) + 1 for i in np.flatnonzero(np.diff(parts))]
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
+        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other
+        ranks.
+        """
         if self.comm.rank:
             return None
         state = State(u, dict(mu or {}))
@@ -101,26 +118,42 @@ class RevolvedGatherer:
         stresses = self._stresses.of(swept.inner_jets(self._model.u, self._inner), state.mu)
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
-        values = tensors | principal_fields(components) | self._fields.of(swept.jets(self._model.u), state.mu)
+        values = (
+            tensors
+            | principal_fields(components)
+            | self._fields.of(swept.jets(self._model.u), state.mu)
+        )
         if state.mu:
-            add_contact(values, self._model, state, lambda of_cells: np.repeat(of_cells[swept.order, None], 2, axis=1))
+            add_contact(
+                values,
+                self._model,
+                state,
+                lambda of_cells: np.repeat(of_cells[swept.order, None], 2, axis=1),
+            )
         values |= rubber_fields(values, self._law)
         turned = self._around(values)
         fields = resolved_pressure(swept.cells, self._constant | turned)
         shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
-        return Surface(*shape, fields, (), jumps["M"], jumps["E"], shells=self._model.meridian.shells)
+        return Surface(
+            *shape, fields, (), jumps["M"], jumps["E"], shells=self._model.meridian.shells
+        )
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
-        return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
+        return {
+            name: self._swept.around(values, self._fields.weight) for name, values in fields.items()
+        }
 
 
 class RecoveredMeridian:
     """Takes components along and across the meridian from samples in its cells to their ends.
 
-    At a pole, where both are even functions of the arc length, the cell has its mirror image beside it.
+    At a pole, where both are even functions of the arc length, the cell has its mirror image beside
+    it.
     """
 
-    def __init__(self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array) -> None:
+    def __init__(
+        self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array
+    ) -> None:
         s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
         length, cells = np.diff(s), np.arange(len(s))
         samples = s[:, :1] + length * inner[:, 0]
@@ -142,11 +175,19 @@ class RecoveredMeridian:
         self._to_samples = self._recovery.at(
             np.repeat(cells, count), samples.reshape(-1, 1), np.tile(hats, (len(cells), 1))
         )
-        at_ends = np.repeat(cells, 2), vertices[ends].reshape(-1, 1), np.tile(np.eye(2), (len(cells), 1))
+        at_ends = (
+            np.repeat(cells, 2),
+            vertices[ends].reshape(-1, 1),
+            np.tile(np.eye(2), (len(cells), 1)),
+        )
         self._to_ends = self._recovery.at(*at_ends)
 
-    def components(self, stresses: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, float]]:
-        """Those (cells, 2, 3) at the ends, of (cells, q, 3), and by how much those of the samples differ."""
+    def components(
+        self, stresses: Mapping[str, Array]
+    ) -> tuple[dict[str, Array], dict[str, float]]:
+        """Those (cells, 2, 3) at the ends, of (cells, q, 3), and by how much those of the samples
+        differ.
+        """
         at_ends, jumps = {}, {}
         for name, S in stresses.items():
             fit = self._recovery.coefficients(np.concatenate([S, S[self._beside]]))
@@ -164,7 +205,9 @@ class BodyGatherer:
         self._model, self.comm = model, model.V.mesh.comm
         V = model.V
         cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]
-        numbers = V.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
+        numbers = V.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(
+            cells.shape
+        )
         to_vtk = np.argsort(perm_vtk(mesh.CellType.hexahedron, cells.shape[1]))
         self._cells = self._on_first(numbers[:, to_vtk])
         self._fields: dict[str, Array] = {}
@@ -175,8 +218,14 @@ class BodyGatherer:
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced body on rank 0; None on other ranks."""
-        nodes = self._on_first(self._model.system.with_ghosts(u)[: self._model.system.size].reshape(-1, 3))
-        return Surface(self._r0, nodes, self._n0, self._cells, self._fields) if self.comm.rank == 0 else None
+        nodes = self._on_first(
+            self._model.system.with_ghosts(u)[: self._model.system.size].reshape(-1, 3)
+        )
+        return (
+            Surface(self._r0, nodes, self._n0, self._cells, self._fields)
+            if self.comm.rank == 0
+            else None
+        )
 
     def _nodes(self, f: fem.Function) -> Array:
         """Values at the owned nodes of all ranks, in global order, on rank 0."""
@@ -204,7 +253,9 @@ class Gatherer(Protocol):
     comm: MPI.Comm
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The displaced nodes with their fields at the amplitudes mu, on rank 0; None on other ranks."""
+        """The displaced nodes with their fields at the amplitudes mu, on rank 0; None on other
+        ranks.
+        """
 
 
 def gatherer(model: "ShellModel | MeridianModel | SolidModel", comm: MPI.Comm) -> Gatherer:

@@ -19,7 +19,9 @@ NAMED = ("name", "unit", "words")
 
 
 def grid_content(grid: MapGrid, R: float) -> bytes:
-    """The content of a .vtu file with B at a grid's points, which are over R; R is in metres, nan without units."""
+    """The content of a .vtu file with B at a grid's points, which are over R; R is in metres, nan
+    without units.
+    """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
@@ -28,12 +30,18 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     points.SetData(numpy_to_vtk(np.ascontiguousarray(grid.places), deep=True))
     corners = _cells(grid.points)
     starts = np.arange(0, corners.size + 1, corners.shape[1])
-    cells.SetData(*(numpy_to_vtk(each.astype(np.int64), deep=True) for each in (starts, corners.ravel())))
+    cells.SetData(
+        *(numpy_to_vtk(each.astype(np.int64), deep=True) for each in (starts, corners.ravel()))
+    )
     made.SetPoints(points)
     made.SetCells(QUAD if len(grid.points) == 2 else HEXAHEDRON, cells)
     give(made.GetPointData(), "B", grid.values)
     data = made.GetFieldData()
-    numbers = {"corner": grid.corner[None], "sides": grid.sides, "points_along": np.array(grid.points, dtype=float)}
+    numbers = {
+        "corner": grid.corner[None],
+        "sides": grid.sides,
+        "points_along": np.array(grid.points, dtype=float),
+    }
     for name, values in (numbers | ({} if isnan(R) else {"R_in_m": np.array([R])})).items():
         give(data, name, values)
     for name in NAMED:
@@ -52,12 +60,17 @@ def read_map(file: Path) -> tuple[MapGrid, float]:
     """
 
     def made(read: "vtkUnstructuredGrid") -> tuple[MapGrid, float]:
-        numbers, texts = arrays(read.GetFieldData()), {name: _text(read.GetFieldData(), name) for name in NAMED}
+        numbers, texts = (
+            arrays(read.GetFieldData()),
+            {name: _text(read.GetFieldData(), name) for name in NAMED},
+        )
         along = tuple(int(n) for n in numbers["points_along"].ravel())
         values = arrays(read.GetPointData())["B"].reshape(int(np.prod(along)), 3)
         corner, sides = numbers["corner"].reshape(3), numbers["sides"].reshape(-1, 3)
         R = float(numbers["R_in_m"].ravel()[0]) if "R_in_m" in numbers else nan
-        return MapGrid(texts["name"], corner, sides, along, texts["unit"], texts["words"], values), R
+        return MapGrid(
+            texts["name"], corner, sides, along, texts["unit"], texts["words"], values
+        ), R
 
     return read_grid(file, made)
 
@@ -70,7 +83,12 @@ def _cells(points: tuple[int, ...]) -> NDArray[np.int64]:
     """(cells, 4 or 8) the corners of a grid's cells, in VTK's order."""
     number = np.arange(np.prod(points)).reshape(points[::-1])
     low, high = slice(None, -1), slice(1, None)
-    around = [(low, low), (low, high), (high, high), (high, low)]  # of the second and the first side
+    around = [
+        (low, low),
+        (low, high),
+        (high, high),
+        (high, low),
+    ]  # of the second and the first side
     if len(points) == 2:
         return np.stack([number[at].ravel() for at in around], axis=-1)
     return np.stack([number[up, *at].ravel() for up in (low, high) for at in around], axis=-1)

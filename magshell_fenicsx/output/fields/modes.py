@@ -1,7 +1,7 @@
 """Modes and null vectors on the whole deformed shell: fields for ParaView, a table, captions.
 
-A half shell is completed by the symmetric or antisymmetric mirror image of the mode. The coefficients of waves are
-evaluated around the axis.
+A half shell is completed by the symmetric or antisymmetric mirror image of the mode. The
+coefficients of waves are evaluated around the axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,8 +57,9 @@ def mode_surface(
     Parameters
     ----------
     label, vector
-        "m = 7", "torsion": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric": the other
-        half is the mirror image with the opposite sign; any other label: the mode has the model's own symmetry.
+        "m = 7", "torsion": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric":
+        the other half is the mirror image with the opposite sign; any other label: the mode has the
+        model's own symmetry.
     azimuth
         Azimuth of the model's frame, rad.
     mu
@@ -117,7 +118,9 @@ def write_mode(file: Path, surface: Surface, about: About) -> None:
 
 def mode_table(by_point: Mapping[int, Sequence[Mode]]) -> bytes:
     """stability.csv: the modes of each point, in the order of their eigenvalues over E h/R^2."""
-    listed = ((point, n, mode) for point, modes in by_point.items() for n, mode in enumerate(modes, 1))
+    listed = (
+        (point, n, mode) for point, modes in by_point.items() for n, mode in enumerate(modes, 1)
+    )
     lines = ((point, n, mode.label, mode.eigenvalue) for point, n, mode in listed)
     return table_text([COLUMNS, *lines], end="\n").encode()
 
@@ -138,22 +141,31 @@ def mode_caption(number: int, mode: Mode) -> str:
 
 
 def _with_mode(base: Surface, v: Array) -> Surface:
-    """Scale a mode to a largest length of one, and inward at the first node where its normal component is largest."""
+    """Scale a mode to a largest length of one, and inward at the first node where its normal
+    component is largest.
+    """
     inward = -np.einsum("ij,ij->i", v, base.n0)
     size = np.abs(inward)
-    first = np.argmax(size > (1 - 1e-6) * size.max())  # the crests and troughs of a wave differ only by rounding
+    first = np.argmax(
+        size > (1 - 1e-6) * size.max()
+    )  # the crests and troughs of a wave differ only by rounding
     scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first])
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
 
-def _revolved_wave(model: "MeridianModel", u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
+def _revolved_wave(
+    model: "MeridianModel", u: Vector, m: int, vector: Vector
+) -> tuple[Surface, Array]:
     """The surface with at least twelve sectors per wave, and the wave at its nodes.
 
-    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; of m = 0, torsion, V e_theta.
+    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; of m = 0, torsion, V
+    e_theta.
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
-    U_and_V, V, W = vector.reshape(-1, 3)[swept.vertices(model.excluded_modes.waves.V)].T[:, :, None]
+    U_and_V, V, W = vector.reshape(-1, 3)[swept.vertices(model.excluded_modes.waves.V)].T[
+        :, :, None
+    ]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
     radial, azimuthal = (U_and_V - V) * cosine, V * sine
@@ -196,17 +208,24 @@ def gradient_file(folder: Path, of: str) -> Path:
 
 def gradient_files(folder: Path) -> dict[str, Path]:
     """Result -> file of those in a folder."""
-    return {file.stem.removeprefix(PREFIX): file for file in sorted((folder / "fields").glob(f"{PREFIX}*.vtu"))}
+    return {
+        file.stem.removeprefix(PREFIX): file
+        for file in sorted((folder / "fields").glob(f"{PREFIX}*.vtu"))
+    }
 
 
 NAME = "frequencies.csv"
 NUMBERS = ("point", "wave", "omega2", "hertz")
-CONTACT_CHANGE = "contact_change"  # of omega2, relative, if the bodies that touch are four times as stiff
+CONTACT_CHANGE = (
+    "contact_change"  # of omega2, relative, if the bodies that touch are four times as stiff
+)
 
 
 @dataclass(frozen=True)
 class Frequency:
-    """A row: omega2 is ω² ρ R²/E; hertz is nan without a density, and of an unstable mode, which does not vibrate."""
+    """A row: omega2 is ω² ρ R²/E; hertz is nan without a density, and of an unstable mode, which
+    does not vibrate.
+    """
 
     point: int
     wave: str
@@ -243,7 +262,12 @@ def frequency_table(
     lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
     for point, modes in by_point.items():
         for n, mode in enumerate(modes):
-            row = (point, wave_of(mode.label, own[point]), mode.eigenvalue, hertz(mode.eigenvalue, time_unit))
+            row = (
+                point,
+                wave_of(mode.label, own[point]),
+                mode.eigenvalue,
+                hertz(mode.eigenvalue, time_unit),
+            )
             lines.append((*row, contact_changes[point][n]) if contact_changes else row)
     return table_text(lines, end="\n").encode()
 
@@ -252,6 +276,8 @@ def read_frequencies(folder: Path) -> list[Frequency]:
     """The rows of a run's folder; none without the file."""
 
     def made(line: Mapping[str, str]) -> Frequency:
-        return Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
+        return Frequency(
+            int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan")
+        )
 
     return read_csv(folder / NAME, made) if (folder / NAME).exists() else []

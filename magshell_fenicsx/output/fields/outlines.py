@@ -1,4 +1,6 @@
-"""Bodies and sources beside a shell: their outlines and faces where amplitudes have driven them, as .vtp files."""
+"""Bodies and sources beside a shell: their outlines and faces where amplitudes have driven them, as
+.vtp files.
+"""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +23,9 @@ DIGITS = 7  # of the corners of faces
 
 
 def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
-    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven sources and bodies."""
+    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven
+    sources and bodies.
+    """
     lines_in_space = list[Array]()
     for each, Q, t, _ in _placed(loads, mu, h):
         lines_in_space += [line @ Q.T + t for line in getattr(each, "lines", ())]
@@ -37,10 +41,19 @@ def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]
     return tuple(solids_in_space)
 
 
-def _placed(loads: Loads, mu: Mapping[str, float], h: float) -> Iterator[tuple[Any, Array, Array, str]]:
-    """Bodies and sources, their way since all amplitudes were zero, x -> Q x + t, and the names of bodies."""
+def _placed(
+    loads: Loads, mu: Mapping[str, float], h: float
+) -> Iterator[tuple[Any, Array, Array, str]]:
+    """Bodies and sources, their way since all amplitudes were zero, x -> Q x + t, and the names of
+    bodies.
+    """
     for contact in loads.contacts:
-        yield contact.distance, np.eye(3), mu.get(contact.amplitude, 0.0) * h * contact.direction, contact.body
+        yield (
+            contact.distance,
+            np.eye(3),
+            mu.get(contact.amplitude, 0.0) * h * contact.direction,
+            contact.body,
+        )
     if loads.magnetic is None:
         return
     for part in getattr(loads.magnetic.in_space, "parts", ()):
@@ -52,14 +65,20 @@ def _placed(loads: Loads, mu: Mapping[str, float], h: float) -> Iterator[tuple[A
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     """The content of a .vtp file; VTK's own writer takes as long as a step of a path.
 
-    `pole` is positive on the half of a magnet with its north pole, `names` are those of the bodies and magnets.
+    `pole` is positive on the half of a magnet with its north pole, `names` are those of the bodies
+    and magnets.
     """
     sizes = [len(line) for line in lines]
     starts = np.cumsum([sum(sizes), *(len(solid.points) for solid in faces)])
     corners = [np.round(solid.points, DIGITS) for solid in faces]
     triangles = [solid.triangles + start for solid, start in zip(faces, starts, strict=False)]
-    poles = [np.zeros(sum(sizes)), *(np.zeros(len(s.points)) if s.poles is None else s.poles for s in faces)]
-    numbers = np.array([[len(solid.points), len(solid.triangles)] for solid in faces]).reshape(-1, 2)
+    poles = [
+        np.zeros(sum(sizes)),
+        *(np.zeros(len(s.points)) if s.poles is None else s.poles for s in faces),
+    ]
+    numbers = np.array([[len(solid.points), len(solid.triangles)] for solid in faces]).reshape(
+        -1, 2
+    )
     names = "".join(f"{solid.name}\0" for solid in faces).encode()
     about = [
         _array("sizes", "Int64", numbers, f'NumberOfTuples="{len(faces)}"'),
@@ -92,7 +111,9 @@ def _array(name: str, kind: str, values: NDArray[Any], more: str = "") -> str:
 
 
 def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
-    """Lines and faces beside the fields of a point; none without any, no faces in the file of an earlier version."""
+    """Lines and faces beside the fields of a point; none without any, no faces in the file of an
+    earlier version.
+    """
     file = folder / DRIVEN.format(number)
     file = file if file.exists() else folder / STILL
     if not file.exists():
@@ -114,8 +135,15 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
         return lines, ()
     sizes = np.array(parts["sizes"], dtype=int).reshape(-1, 2)
     names = bytes(int(code) for code in parts["names"]).decode().split("\0")
-    triangles = np.array(dict(ARRAY.findall(polys))["connectivity"].split(), dtype=int).reshape(-1, 3)
-    poles, solids, start, first_one = np.array(parts["pole"], dtype=float), list[Solid](), on_lines, 0
+    triangles = np.array(dict(ARRAY.findall(polys))["connectivity"].split(), dtype=int).reshape(
+        -1, 3
+    )
+    poles, solids, start, first_one = (
+        np.array(parts["pole"], dtype=float),
+        list[Solid](),
+        on_lines,
+        0,
+    )
     for name, (n, m) in zip(names, sizes, strict=False):
         own = poles[start : start + n]
         numbers = triangles[first_one : first_one + m] - start

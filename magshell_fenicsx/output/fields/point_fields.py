@@ -1,4 +1,6 @@
-"""Fields at the points of a surface: strains, stresses, densities of energy, and what interprets them."""
+"""Fields at the points of a surface: strains, stresses, densities of energy, and what interprets
+them.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +11,12 @@ from numpy.typing import NDArray
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
+from magshell_fenicsx.models.shell.strains import (
+    NaturalFrame,
+    TangentFrame,
+    bending_moment,
+    principal,
+)
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
@@ -36,7 +43,9 @@ def magnetic_loads(
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if rotates:
         loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
-    if not callable(pattern) and isinstance(h, float):  # the formula of f_mag assumes uniform vectors and thickness
+    if not callable(pattern) and isinstance(
+        h, float
+    ):  # the formula of f_mag assumes uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
         if rotates:
             loads["f_mag"] = (loads["f_mag"] - in_plane_force(g, Ba, pattern, h)) / 2
@@ -67,14 +76,16 @@ def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array
 def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
     """f_mag (..., 3) for uniform Br and Ba.
 
-    f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this equals
-    h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
+    f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this
+    equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
     along, normal_Ba = np.einsum("...ai,...i->...a", dual, Br), np.einsum("...i,i->...", g.n0, Ba)
     trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)
     covariant = np.einsum("...ca,...a->...c", g.b0, along) * normal_Ba[..., None]
-    covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum("...ci,i->...c", g.a, Ba)
+    covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum(
+        "...ci,i->...c", g.a, Ba
+    )
     return np.asarray(h * np.einsum("...c,...ci->...i", covariant, dual))
 
 
@@ -85,10 +96,11 @@ def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
 
 @dataclass(frozen=True)
 class Torque:
-    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (..., 2).
+    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (...,
+    2).
 
-    For a remanence that does not stretch, that and half of (n0 . Ba)(a0^a . Br); `dual` and `transposed` are then the
-    dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3).
+    For a remanence that does not stretch, that and half of (n0 . Ba)(a0^a . Br); `dual` and
+    `transposed` are then the dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3).
     """
 
     n0: Array
@@ -97,7 +109,9 @@ class Torque:
     transposed: Array | None = None
 
     def __call__(self, du: Array) -> Array:
-        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
+        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and
+        u,_2 (..., 2, 3).
+        """
         turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
         torque = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
         if self.dual is not None and self.transposed is not None:
@@ -106,8 +120,12 @@ class Torque:
 
 
 def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
-    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or is convected."""
-    along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba)
+    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or
+    is convected.
+    """
+    along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum(
+        "...ai,i->...a", g.dual, Ba
+    )
     if not rotates:
         return Torque(g.n0, along)
     in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
@@ -139,17 +157,23 @@ class Stresses:
     ) -> None:
         self.frame = frame = TangentFrame.of(r0)
         self._thickness = thickness
-        self._law = material.law_in(made_of).at(r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0)
-        self._natural, self._unit = natural and natural.at(r0[0], self.frame.n0), material.bending_stiffness
+        self._law = material.law_in(made_of).at(
+            r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
+        )
+        self._natural, self._unit = (
+            natural and natural.at(r0[0], self.frame.n0),
+            material.bending_stiffness,
+        )
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
+        """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes
+        mu.
 
         Returns
         -------
         E, M
-            (..., 3) components 11, 12 and 22 of membrane strain and bending moment over D/R, with D of the thickness
-            h; the strain from the natural shape, if there is one.
+            (..., 3) components 11, 12 and 22 of membrane strain and bending moment over D/R, with D
+            of the thickness h; the strain from the natural shape, if there is one.
         E_total
             The strain from the drawn shape, if there is a natural one.
         """
@@ -158,7 +182,9 @@ class Stresses:
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
         if self._natural:
             total["E_total"] = E
-            shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+            shape = NaturalFrame.of(
+                frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
+            )
             E, M = shape.elastic(E), shape.moment(E, K, law)
         else:
             M = bending_moment(E, K, law)
@@ -228,14 +254,15 @@ class PointFields:
     Attributes
     ----------
     constant
-        Name -> values (cells, points, ...) of the fields that do not depend on the displacement: p_mag, k and f_mag
-        of a uniform applied field.
+        Name -> values (cells, points, ...) of the fields that do not depend on the displacement:
+        p_mag, k and f_mag of a uniform applied field.
     n0
         (cells, points, 3) undeformed normals.
     weight
         (cells, points) area; the weight of a cell in the mean over the cells that share a point.
     Br, susceptibility
-        (cells, points, 3) the undeformed remanence, (cells, points, 1) the susceptibility; (cells, points, 0) without.
+        (cells, points, 3) the undeformed remanence, (cells, points, 1) the susceptibility; (cells,
+        points, 0) without.
     """
 
     def __init__(
@@ -251,7 +278,11 @@ class PointFields:
     ) -> None:
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
-        self._natural = natural.at(r0[0], self._frame.n0) if natural and contacts and np.any(self._thins) else None
+        self._natural = (
+            natural.at(r0[0], self._frame.n0)
+            if natural and contacts and np.any(self._thins)
+            else None
+        )
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
@@ -263,7 +294,11 @@ class PointFields:
             self._carried, field = None, None
         if self._carried:
             pattern = self._carried.remanent
-            self.Br = pattern(inside(r0[0]), self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
+            self.Br = (
+                pattern(inside(r0[0]), self.n0)
+                if callable(pattern)
+                else np.broadcast_to(pattern, r0[0].shape)
+            )
         if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(self._geometry(), field, inside(r0[0]), h)
@@ -274,15 +309,17 @@ class PointFields:
         return self._frame.jet
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """The fields of a displacement with the jet u (3 or 6, cells, points, 3) over R, at the amplitudes mu.
+        """The fields of a displacement with the jet u (3 or 6, cells, points, 3) over R, at the
+        amplitudes mu.
 
         Returns
         -------
         Br, Ba
-            (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux density at the
-            deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
+            (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux
+            density at the deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         J
-            (..., 3) the polarisation mu_0 M that the field induces in what is soft, in the same unit.
+            (..., 3) the polarisation mu_0 M that the field induces in what is soft, in the same
+            unit.
         tau
             (..., 3) torque, for a uniform field.
         gap_over_h
@@ -291,13 +328,19 @@ class PointFields:
         frame, fields = self._frame, dict[str, Array]()
         if self._carried:
             moves = self._carried.law == "deformation"
-            fields["Br"] = frame.convected(self.Br, u, thins=self._thins) if moves else frame.rotated(self.Br, u)
+            fields["Br"] = (
+                frame.convected(self.Br, u, thins=self._thins)
+                if moves
+                else frame.rotated(self.Br, u)
+            )
         if self._field:
             fields["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
             m = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
             n = m / np.linalg.norm(m, axis=-1, keepdims=True)
-            fields["J"] = self._field.soft.polarisation(inside(frame.jet[0]), self.n0, n, fields["Ba"])
+            fields["J"] = self._field.soft.polarisation(
+                inside(frame.jet[0]), self.n0, n, fields["Ba"]
+            )
         if self._torque:
             fields["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:
@@ -309,7 +352,9 @@ class PointFields:
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
         if self._natural is not None:
-            shape = NaturalFrame.of(self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+            shape = NaturalFrame.of(
+                self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
+            )
             stretch = stretch * shape.thickness / np.linalg.det(shape.inverse)
         return np.asarray(1 + self._thins * (stretch - 1))
 
@@ -318,7 +363,10 @@ class PointFields:
         factor = 1.0 if self._thickness is None else self._thickness
         factor = factor * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
         factor = np.broadcast_to(factor, r.shape[:-1]).ravel()
-        gaps = [c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
+        gaps = [
+            c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0]
+            for c in self._contacts
+        ]
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:

@@ -1,4 +1,6 @@
-"""Strains, moments and stresses recovered at nodes, and the parts of a surface within which they are smooth."""
+"""Strains, moments and stresses recovered at nodes, and the parts of a surface within which they
+are smooth.
+"""
 
 from collections.abc import Mapping
 
@@ -14,7 +16,8 @@ ROUNDING = {"E": 1e-13, "M": 1e-8}  # smaller strains and moments are zero, up t
 
 
 def relative_jump(values: Array, continuous: Array, weight: Array, zero: float = 0.0) -> float:
-    """The weighted rms of the difference between the cells' values and continuous ones, over the rms of the values.
+    """The weighted rms of the difference between the cells' values and continuous ones, over the
+    rms of the values.
 
     Parameters
     ----------
@@ -40,16 +43,19 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
 
 
 Numbers = NDArray[np.int64]
-SECOND = 0.03  # weight of the second ring of cells around a vertex at an edge, where the first has few
+SECOND = (
+    0.03  # weight of the second ring of cells around a vertex at an edge, where the first has few
+)
 ENOUGH = 1.2  # samples over coefficients of a polynomial, at least
 RIDGE = 1e-10  # keeps fits regular whose samples lie on few lines
 
 
 class Recovery:
-    """Fits a polynomial around each vertex, and blends those of a cell's vertices with barycentric weights.
+    """Fits a polynomial around each vertex, and blends those of a cell's vertices with barycentric
+    weights.
 
-    So the result is continuous where cells share vertices, and polynomials are reproduced. Around a vertex at an edge
-    the second ring of cells has a small weight.
+    So the result is continuous where cells share vertices, and polynomials are reproduced. Around a
+    vertex at an edge the second ring of cells has a small weight.
 
     Parameters
     ----------
@@ -66,20 +72,30 @@ class Recovery:
     """
 
     def __init__(
-        self, cells: Numbers, samples: Array, weight: Array, vertices: Array, frames: Array, degree: int
+        self,
+        cells: Numbers,
+        samples: Array,
+        weight: Array,
+        vertices: Array,
+        frames: Array,
+        degree: int,
     ) -> None:
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
         self._count = len(_powers(cells.shape[1] - 1, degree))
         self._size = np.ones(len(vertices))
         near, share = _patches(cells, len(vertices))
         many = np.diff(near.indptr)
-        of_row = np.repeat(many * weight.shape[1], self._count)  # a row for each coefficient of each vertex
+        of_row = np.repeat(
+            many * weight.shape[1], self._count
+        )  # a row for each coefficient of each vertex
         starts = np.concatenate([[0], np.cumsum(of_row)])
         columns, values = np.zeros(starts[-1], np.int32), np.zeros(starts[-1])
         for number in np.unique(many):
             at = np.flatnonzero(many == number)
             each = near.indptr[at][:, None] + np.arange(number)
-            fit = self._fit(at, samples[near.indices[each]], weight[near.indices[each]] * share[each][..., None])
+            fit = self._fit(
+                at, samples[near.indices[each]], weight[near.indices[each]] * share[each][..., None]
+            )
             sample = near.indices[each][..., None] * weight.shape[1] + np.arange(weight.shape[1])
             places = starts[at * self._count][:, None] + np.arange(self._count * sample[0].size)
             columns[places] = np.tile(sample.reshape(len(at), -1), self._count)
@@ -92,18 +108,27 @@ class Recovery:
         return np.asarray(self._coefficients @ values.reshape(self._coefficients.shape[1], -1))
 
     def at(self, cell: Numbers, places: Array, barycentric: Array) -> "scipy.sparse.csr_matrix":
-        """From coefficients to values at places (n, k) in cells (n,) with barycentric coordinates (n, d + 1)."""
+        """From coefficients to values at places (n, k) in cells (n,) with barycentric coordinates
+        (n, d + 1).
+        """
         vertex = self._cells[cell]
-        y = np.einsum("nvdk,nvk->nvd", self._frames[vertex], places[:, None] - self._vertices[vertex])
-        values = _monomials(y / self._size[vertex][..., None], self._degree) * barycentric[..., None]
+        y = np.einsum(
+            "nvdk,nvk->nvd", self._frames[vertex], places[:, None] - self._vertices[vertex]
+        )
+        values = (
+            _monomials(y / self._size[vertex][..., None], self._degree) * barycentric[..., None]
+        )
         columns = vertex[..., None] * self._count + np.arange(self._count)
         starts = np.arange(len(cell) + 1) * columns[0].size
         return scipy.sparse.csr_matrix(
-            (values.ravel(), columns.ravel(), starts), (len(cell), len(self._vertices) * self._count)
+            (values.ravel(), columns.ravel(), starts),
+            (len(cell), len(self._vertices) * self._count),
         )
 
     def _fit(self, at: Numbers, samples: Array, weight: Array) -> Array:
-        """From the samples (n, cells, q, k) around vertices to coefficients: (n, coefficients, samples)."""
+        """From the samples (n, cells, q, k) around vertices to coefficients: (n, coefficients,
+        samples).
+        """
         n = len(at)
         relative = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[at][:, None]
         y = relative @ np.swapaxes(self._frames[at], 1, 2)
@@ -115,7 +140,9 @@ class Recovery:
         weight = weight.reshape(n, -1)
         root = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
         ridge = np.broadcast_to(RIDGE * np.eye(P.shape[-1]), (n, P.shape[-1], P.shape[-1]))
-        Q, triangle = np.linalg.qr(np.concatenate([root * P, ridge], axis=1))  # of a small condition
+        Q, triangle = np.linalg.qr(
+            np.concatenate([root * P, ridge], axis=1)
+        )  # of a small condition
         return np.asarray(np.linalg.solve(triangle, np.swapaxes(Q[:, : P.shape[1]] * root, 1, 2)))
 
 
@@ -201,8 +228,11 @@ class RecoveredShell:
         self._to_nodes = self._recovery.at(cell, nodes[cell, node], barycentric)
         self._numbers, self._weight, self._table = numbers, weight, table
 
-    def fields(self, tensors: Mapping[str, Array], n0: Array) -> tuple[dict[str, Array], dict[str, float]]:
-        """E, M, ... at the nodes with normals n0 (n, 3), their principal values, by how much samples differ.
+    def fields(
+        self, tensors: Mapping[str, Array], n0: Array
+    ) -> tuple[dict[str, Array], dict[str, float]]:
+        """E, M, ... at the nodes with normals n0 (n, 3), their principal values, by how much
+        samples differ.
 
         Parameters
         ----------
@@ -210,19 +240,27 @@ class RecoveredShell:
             Name -> (m, q, 6) at the samples, see `six`.
         """
         fit = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
-        at_nodes = dict(zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True))
+        at_nodes = dict(
+            zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True)
+        )
         jumps = {
-            name: relative_jump(tensors[name], self._table @ at_nodes[name][self._numbers], self._weight, zero)
+            name: relative_jump(
+                tensors[name], self._table @ at_nodes[name][self._numbers], self._weight, zero
+            )
             for name, zero in ROUNDING.items()
         }
         t = frames(n0)
-        components = {name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in at_nodes.items()}
+        components = {
+            name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in at_nodes.items()
+        }
         smooth = {name: in_space(S, t) for name, S in components.items()}
         return smooth | principal_fields(components), jumps
 
 
 def six(frame: TangentFrame) -> Array:
-    """(..., 6, 3) from S_11, S_12, S_22 in a frame to the components of a tensor in space, times `TWICE`."""
+    """(..., 6, 3) from S_11, S_12, S_22 in a frame to the components of a tensor in space, times
+    `TWICE`.
+    """
     return np.asarray(frame.in_space[..., *UPPER, :] * TWICE[:, None])
 
 
@@ -256,7 +294,9 @@ def smooth_parts(corners: Numbers, sides: Numbers, given: list[Array], normals: 
     on = corners[:, sides].reshape(-1, sides.shape[1])  # nodes of all sides, cell after cell
     order = np.argsort(on, axis=1)
     key = np.take_along_axis(on, order, axis=1)
-    _, first, which, times = np.unique(key, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    _, first, which, times = np.unique(
+        key, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
     which = which.ravel()
     twins = np.flatnonzero((times[which] == 2) & (first[which] != np.arange(len(on))))
     pair = np.column_stack([first[which[twins]], twins])
@@ -271,10 +311,14 @@ def smooth_parts(corners: Numbers, sides: Numbers, given: list[Array], normals: 
     apart = kink > KINK
     for field in given:
         largest = np.abs(field).max() or 1.0
-        apart |= jumps(field) > largest * (JUMP + 2 * kink)  # a field along the normal turns with facets
+        apart |= jumps(field) > largest * (
+            JUMP + 2 * kink
+        )  # a field along the normal turns with facets
     a, b = (pair[~apart] // len(sides)).T
     together = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
-    return np.asarray(scipy.sparse.csgraph.connected_components(together, directed=False)[1], np.int64)
+    return np.asarray(
+        scipy.sparse.csgraph.connected_components(together, directed=False)[1], np.int64
+    )
 
 
 def split(numbers: Numbers, parts: Numbers) -> Numbers:

@@ -66,11 +66,15 @@ class Ring:
     def waves(self) -> Waves | None:
         """Count the waves; None if no single number of them, at least two, makes up the mode."""
         ahead = np.diff(self.theta, append=self.theta[0] + 2 * np.pi)
-        share = np.sqrt((ahead + np.roll(ahead, 1)) / 2)  # of the ring: small elements have many points
+        share = np.sqrt(
+            (ahead + np.roll(ahead, 1)) / 2
+        )  # of the ring: small elements have many points
         values = share * self.w
         left = []
         for m in range(MOST_WAVES + 1):
-            basis = share[:, None] * np.column_stack([np.cos(m * self.theta), np.sin(m * self.theta)])
+            basis = share[:, None] * np.column_stack(
+                [np.cos(m * self.theta), np.sin(m * self.theta)]
+            )
             left.append(float(np.sum((values - basis @ np.linalg.lstsq(basis, values)[0]) ** 2)))
         best = int(np.argmin(left))
         if best < 2 or left[best] >= REST * float(values @ values):
@@ -119,7 +123,9 @@ def _ring(surface: Surface, pieces: Tessellation, crest: Array, height: float) -
         return None
     per_piece = len(pieces.triangles) // len(pieces.nodes)
     of_nodes = surface.r0[pieces.nodes[cut[on_ring] // per_piece]]
-    return Ring(ascending, w_at_ends[on_ring].ravel()[order], _extent(of_nodes, theta[:, 0]) / pieces.degree)
+    return Ring(
+        ascending, w_at_ends[on_ring].ravel()[order], _extent(of_nodes, theta[:, 0]) / pieces.degree
+    )
 
 
 def _cuts(
@@ -129,7 +135,9 @@ def _cuts(
 
     `values` (n, 4) are x, y, z, w at points.
     """
-    alone = np.argmax(is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1)  # the corner on its side of the plane
+    alone = np.argmax(
+        is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1
+    )  # the corner on its side of the plane
     corners = values[np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)]
     tip, base = corners[:, :1], corners[:, 1:]
     part = (height - tip[..., 2]) / (base[..., 2] - tip[..., 2])
@@ -142,7 +150,9 @@ def _connected(ends: Array, place: Array) -> Numbers:
     points = ends.reshape(-1, 2)
     pairs = scipy.spatial.cKDTree(points).query_pairs(SAME_PLACE, output_type="ndarray")
     links = np.concatenate([pairs, np.arange(len(points)).reshape(-1, 2)])
-    graph = scipy.sparse.coo_array((np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points)))
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points))
+    )
     number = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     nearest = np.argmin(np.linalg.norm(points - place[:2], axis=1))
     return np.flatnonzero(number[::2] == number[nearest])

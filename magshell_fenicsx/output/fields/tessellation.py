@@ -53,7 +53,9 @@ class Tessellation:
         vectors = np.cross(*along).reshape(-1, 3)
         if self.flat:
             where, n = self.nodes.ravel(), len(r)
-            vectors = np.column_stack([np.bincount(where, vectors[:, i], n) for i in range(3)])[where]
+            vectors = np.column_stack([np.bincount(where, vectors[:, i], n) for i in range(3)])[
+                where
+            ]
         return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)[:, None])
 
 
@@ -62,7 +64,9 @@ def tessellated(surface: Surface, most: int = 40_000) -> Tessellation:
     if surface.is_body:
         faces = _outer_faces(surface.cells)
         division = _division(2 * len(faces), 4, most)
-        element = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUAL)
+        element = basix.create_element(
+            basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUAL
+        )
         return _divided(faces, element, np.arange(9), _squares(division))
     count = surface.cells.shape[1]
     degree = round((np.sqrt(8 * count + 1) - 3) / 2)
@@ -77,13 +81,18 @@ def _division(pieces: int, wanted: int, most: int) -> int:
 
 
 def _divided(
-    nodes: Numbers, element: "basix.finite_element.FiniteElement", order: Numbers, fine: tuple[Array, Numbers]
+    nodes: Numbers,
+    element: "basix.finite_element.FiniteElement",
+    order: Numbers,
+    fine: tuple[Array, Numbers],
 ) -> Tessellation:
     points, triangles = fine
     table, *slopes = element.tabulate(1, points)[:, :, :, 0][:, :, order]
     numbers = np.arange(len(nodes))[:, None, None] * len(points) + triangles
     corners = numbers.reshape(-1, 3).astype(np.int32)
-    return Tessellation(nodes, table, np.array(slopes), corners, nodes.shape[1] == 3, element.degree)
+    return Tessellation(
+        nodes, table, np.array(slopes), corners, nodes.shape[1] == 3, element.degree
+    )
 
 
 def _triangle(n: int) -> tuple[Array, Numbers]:
@@ -91,7 +100,11 @@ def _triangle(n: int) -> tuple[Array, Numbers]:
     places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]
     number = {place: k for k, place in enumerate(places)}
     up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in places if i + j < n]
-    down = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in places if i + j < n - 1]
+    down = [
+        (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
+        for i, j in places
+        if i + j < n - 1
+    ]
     return np.array(places) / n, np.array(up + down)
 
 
@@ -100,15 +113,21 @@ def _squares(n: int) -> tuple[Array, Numbers]:
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     low = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     right, above = low + 1, low + n + 1
-    triangles = np.concatenate([np.column_stack([low, right, above]), np.column_stack([right, above + 1, above])])
+    triangles = np.concatenate(
+        [np.column_stack([low, right, above]), np.column_stack([right, above + 1, above])]
+    )
     return np.column_stack([x.ravel(), y.ravel()]) / n, triangles
 
 
 def _outer_faces(cells: Numbers) -> Numbers:
-    """The nine nodes of each face that belongs to one hexahedron only, in Basix's order of a square."""
+    """The nine nodes of each face that belongs to one hexahedron only, in Basix's order of a
+    square.
+    """
     body = basix.create_element(basix.ElementFamily.P, basix.CellType.hexahedron, 2, EQUAL)
     square = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUAL)
-    ours = cells[:, np.argsort(np.argsort(perm_vtk(CellType.hexahedron, cells.shape[1])))]  # in Basix's order
+    ours = cells[
+        :, np.argsort(np.argsort(perm_vtk(CellType.hexahedron, cells.shape[1])))
+    ]  # in Basix's order
     faces = []
     for axis in range(3):
         others = [i for i in range(3) if i != axis]

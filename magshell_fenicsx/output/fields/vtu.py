@@ -1,4 +1,6 @@
-"""Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read them back."""
+"""Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read
+them back.
+"""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +32,10 @@ if TYPE_CHECKING:  # VTK takes long to import
 
 Array = NDArray[np.float64]
 Read = TypeVar("Read")
-SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
+SYMMETRIC = (
+    [0, 1, 2, 0, 1, 0],
+    [0, 1, 2, 1, 2, 2],
+)  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
 FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
 SHELLS = "shells"  # their names, in the order of the numbers in `shell`
@@ -60,7 +65,8 @@ class About:
     nu
         Poisson's ratio.
     mirror
-        Unit normal (3,) of the mirror plane of a half shell, then its offset if that is not zero; None for a whole one.
+        Unit normal (3,) of the mirror plane of a half shell, then its offset if that is not zero;
+        None for a whole one.
     R
         In metres; nan of a case without units.
     """
@@ -71,7 +77,9 @@ class About:
     R: float = nan
 
 
-def unstructured_grid(surface: Surface, h: float, *, deformed: bool = False) -> "vtkUnstructuredGrid":
+def unstructured_grid(
+    surface: Surface, h: float, *, deformed: bool = False
+) -> "vtkUnstructuredGrid":
     """The surface or body with u, u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R.
 
     Its points are undeformed, so that warping by the vector `u` deforms it to scale, or deformed.
@@ -88,7 +96,10 @@ def unstructured_grid(surface: Surface, h: float, *, deformed: bool = False) -> 
     starts, nodes = np.arange(0, (number + 1) * count, count), surface.cells.ravel()
     cells.SetData(*(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, nodes)))
     grid.SetPoints(points)
-    grid.SetCells(TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE, cells)
+    grid.SetCells(
+        TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE,
+        cells,
+    )
     own = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
     fields = {name: f if f.ndim < 3 else f[:, *SYMMETRIC] for name, f in surface.fields.items()}
     for name, values in {**dict(zip(OWN_DATA, own, strict=True)), **fields}.items():
@@ -139,8 +150,14 @@ def read_grid(file: Path, made: "Callable[[vtkUnstructuredGrid], Read]") -> "Rea
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
     if not is_whole(file):
-        raise Damaged(f"{file}: is damaged: {'it is cut off' if file.exists() else 'it is missing'}")
-    errors, reader, shown = list[str](), vtkXMLUnstructuredGridReader(), vtkObject.GetGlobalWarningDisplay()
+        raise Damaged(
+            f"{file}: is damaged: {'it is cut off' if file.exists() else 'it is missing'}"
+        )
+    errors, reader, shown = (
+        list[str](),
+        vtkXMLUnstructuredGridReader(),
+        vtkObject.GetGlobalWarningDisplay(),
+    )
     reader.AddObserver("ErrorEvent", lambda _, event: errors.append(event))
     reader.SetFileName(str(file))
     vtkObject.GlobalWarningDisplayOff()  # the message follows
@@ -178,13 +195,21 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     """What a grid of `unstructured_grid` has; whatever is raised, it is none."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(grid.GetNumberOfCells(), -1)
+    cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(
+        grid.GetNumberOfCells(), -1
+    )
     data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
-    fields = {name: f[:, FULL] if f.shape[1:] == (6,) else f for name, f in data.items() if name not in OWN_DATA}
+    fields = {
+        name: f[:, FULL] if f.shape[1:] == (6,) else f
+        for name, f in data.items()
+        if name not in OWN_DATA
+    }
     if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     R = float(numbers["R_in_m"][0]) if "R_in_m" in numbers else nan
-    about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"), R)
+    about = About(
+        float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"), R
+    )
     r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
     if (
         {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
@@ -197,16 +222,20 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
     jump, strain_jump = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
     named = grid.GetFieldData().GetAbstractArray(SHELLS)
     shells = tuple(named.GetValue(i) for i in range(named.GetNumberOfValues())) if named else ()
-    return Surface(r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells), about
+    return Surface(
+        r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells
+    ), about
 
 
 class FieldSeries:
-    """Writes `point_NNNN.vtu` files and updates `path.pvd` after each; continues after an interrupted run.
+    """Writes `point_NNNN.vtu` files and updates `path.pvd` after each; continues after an
+    interrupted run.
 
     Parameters
     ----------
     outlines
-        Name of a point's file with the outlines of sources and bodies, of its number; empty without.
+        Name of a point's file with the outlines of sources and bodies, of its number; empty
+        without.
     grids
         Names of the grids with fields beside the shell; each has files and a list of its own.
     rows
@@ -232,7 +261,9 @@ class FieldSeries:
         while all(map(is_whole, self._files(self.kept))):
             self.kept += 1
         self.kept = min(self.kept, len(rows)) if rows else self.kept
-        self._rows: list[Mapping[str, Any]] = list(rows[: self.kept]) or [{"point": n} for n in range(self.kept)]
+        self._rows: list[Mapping[str, Any]] = list(rows[: self.kept]) or [
+            {"point": n} for n in range(self.kept)
+        ]
         if self.kept:
             self._write_list()
 
@@ -243,7 +274,8 @@ class FieldSeries:
         row: Mapping[str, Any] | None = None,
         beside: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write a point's file; `row` is that of path.csv, `beside` the contents of the files of all grids.
+        """Write a point's file; `row` is that of path.csv, `beside` the contents of the files of
+        all grids.
 
         Raises
         ------
@@ -252,23 +284,33 @@ class FieldSeries:
         """
         if self._outlines:
             write_whole(
-                self._folder / self._outlines.format(number), vtp_content(surface.outlines, surface.solids), waits=False
+                self._folder / self._outlines.format(number),
+                vtp_content(surface.outlines, surface.solids),
+                waits=False,
             )
         for name, content in beside.items():
             write_whole(self._folder / grid_file(name, number), content, waits=False)
-        write_whole(self._folder / point_file(number), vtu_content(surface, self._about), waits=False)
+        write_whole(
+            self._folder / point_file(number), vtu_content(surface, self._about), waits=False
+        )
         self._rows.append(row or {"point": number})
         self._write_list()
 
     def _files(self, number: int) -> list[Path]:
         """The files of a point."""
         names = [point_file(number), *([self._outlines.format(number)] if self._outlines else [])]
-        return [self._folder / name for name in (*names, *(grid_file(grid, number) for grid in self._grids))]
+        return [
+            self._folder / name
+            for name in (*names, *(grid_file(grid, number) for grid in self._grids))
+        ]
 
     def _write_list(self) -> None:
         numbers = [int(row["point"]) for row in self._rows]
         at = abscissae(self._rows)
-        files = [[point_file(n), *([self._outlines.format(n)] if self._outlines else [])] for n in numbers]
+        files = [
+            [point_file(n), *([self._outlines.format(n)] if self._outlines else [])]
+            for n in numbers
+        ]
         write_whole(self._folder / "path.pvd", pvd_content(at, files), waits=False)
         for grid in self._grids:
             content = pvd_content(at, [[grid_file(grid, n)] for n in numbers])
@@ -276,7 +318,9 @@ class FieldSeries:
 
 
 def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
-    """The content of a .pvd file: the files of each point, part 0 the shell, at its place on ParaView's time axis."""
+    """The content of a .pvd file: the files of each point, part 0 the shell, at its place on
+    ParaView's time axis.
+    """
     rows = "\n".join(
         f'    <DataSet timestep="{t!r}" part="{part}" file="{file}"/>'
         for t, each in zip(at, files, strict=True)
@@ -291,8 +335,9 @@ def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
 def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     """Where the points of a path are on ParaView's time axis: they rise.
 
-    The time of a run with motions, in s if it has units; points at rest follow it closely. Else the amplitude that
-    varied, in the case's unit, if it is one and rises all the way; else the numbers of the points.
+    The time of a run with motions, in s if it has units; points at rest follow it closely. Else the
+    amplitude that varied, in the case's unit, if it is one and rises all the way; else the numbers
+    of the points.
 
     Examples
     --------
@@ -330,10 +375,15 @@ def grid_file(name: str, number: int) -> str:
 def vtu_content(surface: Surface, about: About) -> bytes:
     """The content of a .vtu file; VTK's own writer would ignore a full disk.
 
-    LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more on curved surfaces.
+    LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more
+    on curved surfaces.
     """
     grid = unstructured_grid(surface, about.h)
-    numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
+    numbers = {
+        "h_over_R": np.array([about.h]),
+        "poisson_ratio": np.array([about.nu]),
+        "mirror": about.mirror,
+    }
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
     numbers |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
     numbers |= {"R_in_m": None if isnan(about.R) else np.array([about.R])}
@@ -342,7 +392,10 @@ def vtu_content(surface: Surface, about: About) -> bytes:
             give(grid.GetFieldData(), name, values)
     data = grid.GetPointData()
     names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
-    texts = {"units": [f"{name}: {UNITS[name]}" for name in names if name in UNITS], SHELLS: surface.shells}
+    texts = {
+        "units": [f"{name}: {UNITS[name]}" for name in names if name in UNITS],
+        SHELLS: surface.shells,
+    }
     for name, lines in texts.items():
         if lines or name != SHELLS:
             give_texts(grid.GetFieldData(), name, lines)
@@ -365,7 +418,9 @@ def content_of(grid: "vtkUnstructuredGrid") -> bytes:
 
 
 def read_point(folder: Path, number: int) -> tuple[Surface, About]:
-    """The surface of a point in a folder of fields, with the outlines beside it; a half shell is completed."""
+    """The surface of a point in a folder of fields, with the outlines beside it; a half shell is
+    completed.
+    """
     surface, about = read_vtu(folder / point_file(number))
     lines, solids = read_outlines(folder, number)
     surface = replace(surface, outlines=lines, solids=solids)
@@ -373,7 +428,8 @@ def read_point(folder: Path, number: int) -> tuple[Surface, About]:
 
 
 def write_whole_shells(folder: Path) -> list[str]:
-    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the files, none if it is whole.
+    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the files, none if
+    it is whole.
 
     Raises
     ------

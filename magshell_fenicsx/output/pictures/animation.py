@@ -39,7 +39,8 @@ Array = NDArray[np.float64]
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
-    """The factor of the drawn displacements: the least of 1, 2, 5, 10, ... with which the largest is visible.
+    """The factor of the drawn displacements: the least of 1, 2, 5, 10, ... with which the largest
+    is visible.
 
     Examples
     --------
@@ -82,19 +83,32 @@ def animated(
         views = _views(surfaces, h, factor, camera)
         frames = _composed(views, factor, titles, rows, shown, pole)
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
-    palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
+    palette = _palette(
+        [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
+    )  # the same for all
     first, *others = (
-        _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither)) for frame in frames
+        _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither))
+        for frame in frames
     )
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
     content = io.BytesIO()
-    first.save(content, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
+    first.save(
+        content,
+        "GIF",
+        save_all=True,
+        append_images=others,
+        duration=durations,
+        loop=0,
+        optimize=False,
+    )
     return content.getvalue()
 
 
 def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
-    """A frame in the colours of a palette, white where it is white: Pillow takes a neighbour of white there."""
+    """A frame in the colours of a palette, white where it is white: Pillow takes a neighbour of
+    white there.
+    """
     from PIL import Image as Pillow
 
     numbers = np.asarray(reduced).copy()
@@ -118,7 +132,9 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
 
 def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
     """The same window and colours for all frames."""
-    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
+    limits = from_zero(
+        min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h
+    )
     moved = [replace(s, u=factor * s.u) for s in surfaces]
     places = [r for s in moved for r in (s.r0 + s.u, *near_places(s))]
     window = Window.around(camera(np.concatenate([surfaces[0].r0, *places])), WINDOW)
@@ -137,7 +153,9 @@ def _composed(
     shown: Sequence[Row],
     pole: str,
 ) -> list[NDArray[np.uint8]]:
-    """Frames (height, width, 3); the fixed parts are drawn once, then the title, the shell and the marker on copies."""
+    """Frames (height, width, 3); the fixed parts are drawn once, then the title, the shell and the
+    marker on copies.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -154,7 +172,11 @@ def _composed(
     colour_bar(figure, box(across + 30, 90, 16, height - 180), views[0].scale, "vertical")
     figure.text(15 / width, 12 / height, _scale(factor))
     directions(box(across - 60, 4, 70, 70), views[0].camera, STYLE)
-    parts = drawn_parts(rows, str(rows[-1]["amplitude"]))[-MOST_CURVES:] if rows[-1]["amplitude"] else []
+    parts = (
+        drawn_parts(rows, str(rows[-1]["amplitude"]))[-MOST_CURVES:]
+        if rows[-1]["amplitude"]
+        else []
+    )
     room = (height - 70) // max(len(parts), 1)
     markers: dict[int, tuple[Axes, Part, Line2D]] = {}
     for i, part in enumerate(reversed(parts)):  # from below
@@ -189,7 +211,9 @@ def _lay(image: Image, under: NDArray[np.uint8]) -> None:
 
 
 def edge_of(part: Array) -> Array:
-    """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at its rim."""
+    """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at
+    its rim.
+    """
     least = part.copy()
     for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
         least = np.minimum(least, np.roll(part, way, axis))

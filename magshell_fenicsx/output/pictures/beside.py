@@ -1,4 +1,6 @@
-"""What is beside the shell: bodies as glass, magnets with a red north and a blue south pole; names of what is far."""
+"""What is beside the shell: bodies as glass, magnets with a red north and a blue south pole; names
+of what is far.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +25,13 @@ from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 NORTH, SOUTH, BODY = (0.80, 0.36, 0.33), (0.35, 0.52, 0.78), (0.62, 0.66, 0.66)
-MAGNETS, BODIES = (1.0, 0.3), (0.55, 0.3)  # how much of it is seen where there is no shell behind, and where there is
-SLOPES = np.array([[[-1.0, 1, 0]] * 3, [[-1.0, 0, 1]] * 3])  # of a triangle's shape functions, at its corners
+MAGNETS, BODIES = (
+    (1.0, 0.3),
+    (0.55, 0.3),
+)  # how much of it is seen where there is no shell behind, and where there is
+SLOPES = np.array(
+    [[[-1.0, 1, 0]] * 3, [[-1.0, 0, 1]] * 3]
+)  # of a triangle's shape functions, at its corners
 SAME = 1e-3  # over R: lines of a solid are within the box around it
 WITHIN = 2.0  # pixels: a line that is no deeper than this below a face lies on it
 
@@ -42,7 +49,9 @@ class Laid:
         over, back = self.part[covered], under[covered]
         below = back[:, 3] / 255 * (1 - over)
         alpha = over + below
-        colours = (over[:, None] * self.image[covered, :3] + below[:, None] * back[:, :3]) / alpha[:, None]
+        colours = (over[:, None] * self.image[covered, :3] + below[:, None] * back[:, :3]) / alpha[
+            :, None
+        ]
         laid[covered] = np.rint(np.column_stack([colours, 255 * alpha]))
         return laid
 
@@ -56,7 +65,10 @@ class Beside:
 
     @cached_property
     def _seen(self) -> list[InView]:
-        return [InView(_pieces(solid), solid.points, self._camera, self._window) for solid in self._solids]
+        return [
+            InView(_pieces(solid), solid.points, self._camera, self._window)
+            for solid in self._solids
+        ]
 
     @cached_property
     def _visible(self) -> list[NDArray[np.bool_]]:
@@ -65,7 +77,9 @@ class Beside:
         in_front = []
         for i, depth in enumerate(depths):
             others = [self._shell.depth, *(other for k, other in enumerate(depths) if k != i)]
-            in_front.append((depth > -np.inf) & np.logical_and.reduce([depth >= other for other in others]))
+            in_front.append(
+                (depth > -np.inf) & np.logical_and.reduce([depth >= other for other in others])
+            )
         return in_front
 
     @cached_property
@@ -78,7 +92,9 @@ class Beside:
             table = np.array([BODY] if solid.poles is None else [SOUTH, NORTH])
             values = np.zeros(len(solid.points)) if solid.poles is None else solid.poles
             most = float(np.abs(values).max()) or 1.0
-            laid.append(Laid(seen.painted(values[solid.triangles.ravel()], (-most, most), table), part))
+            laid.append(
+                Laid(seen.painted(values[solid.triangles.ravel()], (-most, most), table), part)
+            )
         return laid
 
     @property
@@ -89,8 +105,13 @@ class Beside:
         left, _, _, high = self._window.box
         pieces = list[Array]()
         for solid, seen, visible in zip(self._solids, self._seen, self._visible, strict=True):
-            made: Any = contourpy.contour_generator(z=np.pad(in_pixels(visible), 1, mode="edge")).lines(0.5)
-            pieces += [np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale for line in made]
+            made: Any = contourpy.contour_generator(
+                z=np.pad(in_pixels(visible), 1, mode="edge")
+            ).lines(0.5)
+            pieces += [
+                np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale
+                for line in made
+            ]
             pieces += self._edges(solid, seen)
         return pieces
 
@@ -111,7 +132,10 @@ class Beside:
         for solid, seen in zip(self._solids, self._seen, strict=True):
             for sign, letter in ((1, "N"), (-1, "S")) if solid.poles is not None else ():
                 centres = _centres(solid)
-                own = centres[(_poles(solid) * sign > 0) & seen.shows(centres, 2 * WITHIN / self._window.scale)]
+                own = centres[
+                    (_poles(solid) * sign > 0)
+                    & seen.shows(centres, 2 * WITHIN / self._window.scale)
+                ]
                 if len(own) and self._shell.shows(own.mean(axis=0)[None], 0.0)[0]:
                     x, y = self._camera(own.mean(axis=0))[:2]
                     letters.append((float(x), float(y), letter))
@@ -126,7 +150,9 @@ def _pieces(solid: Solid) -> Tessellation:
 
 def _divided(line: Array) -> Array:
     """A line with places between its own, the last one twice."""
-    t = np.linspace(0.0, 1.0, 24 if len(line) == 2 and np.ptp(line, axis=0).max() > 0.2 else 4)[:, None]
+    t = np.linspace(0.0, 1.0, 24 if len(line) == 2 and np.ptp(line, axis=0).max() > 0.2 else 4)[
+        :, None
+    ]
     return np.concatenate([(1 - t) * line[0] + t * line[-1], line[-1:]])
 
 
@@ -151,7 +177,9 @@ def bare_outlines(surface: Surface) -> tuple[Array, ...]:
     return tuple(
         line
         for line in near_outlines(surface)
-        if not any(((line >= a - SAME) & (line <= b + SAME)).all() for a, b in zip(low, high, strict=True))
+        if not any(
+            ((line >= a - SAME) & (line <= b + SAME)).all() for a, b in zip(low, high, strict=True)
+        )
     )
 
 

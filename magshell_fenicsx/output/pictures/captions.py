@@ -17,13 +17,32 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 WIDE, TALL = 0.6, 0.95  # a digit, over the size of the font
 APART = 4.0  # between a mark and its number, in points
-NAMED = ("lambda_m", "field_angle", "p_over_pc", "force", "load_factor", "time")  # in captions where they are not zero
-AWAY = [(-1, 1), (1, 1), (-1, -1), (1, -1), (0, 1.3), (0, -1.3), (-1.3, 0), (1.3, 0)]  # the preferred first
+NAMED = (
+    "lambda_m",
+    "field_angle",
+    "p_over_pc",
+    "force",
+    "load_factor",
+    "time",
+)  # in captions where they are not zero
+AWAY = [
+    (-1, 1),
+    (1, 1),
+    (-1, -1),
+    (1, -1),
+    (0, 1.3),
+    (0, -1.3),
+    (-1.3, 0),
+    (1.3, 0),
+]  # the preferred first
 MARK = 3.0  # half the size of a mark, in points
 
 
-def write_numbers(axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]], curves: Sequence[Array]) -> None:
-    """Write texts beside marks at places of the data; those that would cover others, or other marks, are left out.
+def write_numbers(
+    axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]], curves: Sequence[Array]
+) -> None:
+    """Write texts beside marks at places of the data; those that would cover others, or other
+    marks, are left out.
 
     Parameters
     ----------
@@ -50,12 +69,23 @@ def write_numbers(axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]]
         place: Array = at[i]
         half = np.array([WIDE * len(text), TALL]) * size / 2
         middles = [place + np.array(away) * (half + APART) for away in AWAY]
-        free = [m for m in middles if _inside(m, half, reach) and not any(_meet(m, half, *other) for other in taken)]
+        free = [
+            m
+            for m in middles
+            if _inside(m, half, reach) and not any(_meet(m, half, *other) for other in taken)
+        ]
         if not free:
             continue
         best = min(free, key=partial(_fault, place, half, at, line))
         taken.append((best, half))
-        axes.text(best[0] / reach[0], best[1] / reach[1], text, transform=axes.transAxes, ha="center", va="center")
+        axes.text(
+            best[0] / reach[0],
+            best[1] / reach[1],
+            text,
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+        )
 
 
 def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) -> tuple[int, int]:
@@ -98,13 +128,17 @@ def caption(h: float, nu: float, row: Row, driven: Iterable[str] = ()) -> str:
     if row["p_over_pc"]:
         parts.append(named_value("p_over_pc", row, 5))
     if row.get("force"):
-        parts.append(f"{named_value('force', row)}, {named_value('w_over_h', row)} {amplitude('force').place}")
+        parts.append(
+            f"{named_value('force', row)}, {named_value('w_over_h', row)} {amplitude('force').place}"
+        )
     if "load_factor" in row:
         parts.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
     if row["amplitude"] == "time":
         parts.append(named_value("time", row))
     others = (amplitude(name).column for name in driven)
-    parts += [named_value(column, row) for column in others if column not in NAMED and row.get(column)]
+    parts += [
+        named_value(column, row) for column in others if column not in NAMED and row.get(column)
+    ]
     return ", ".join(parts)
 
 
@@ -124,4 +158,6 @@ def in_mathematics(value: float, digits: int) -> str:
     ('0.3262', '−5.5', '$-1.5 \\\\times 10^{-6}$')
     """
     mantissa, _, exponent = spelled(value, f".{digits}g").partition("e")
-    return rf"${mantissa} \times 10^{{{int(exponent)}}}$" if exponent else mantissa.replace("-", "−")
+    return (
+        rf"${mantissa} \times 10^{{{int(exponent)}}}$" if exponent else mantissa.replace("-", "−")
+    )

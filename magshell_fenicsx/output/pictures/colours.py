@@ -1,4 +1,6 @@
-"""Fields as colours: values, limits, captions with units; what is zero or cannot be said is named, not drawn."""
+"""Fields as colours: values, limits, captions with units; what is zero or cannot be said is named,
+not drawn.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -51,14 +53,30 @@ SCALARS = {  # of the interactive report, in HTML; of vectors the length
     "w0_over_h": "imperfections w<sub>0</sub>/h",
     SHELL: "shell",
 }
-WITH_SIGN = {"w_over_h", *STRAINS, *MOMENTS, "sigma_1", "sigma_2", "p_mag", "k", "contact_pressure", "w0_over_h"}
+WITH_SIGN = {
+    "w_over_h",
+    *STRAINS,
+    *MOMENTS,
+    "sigma_1",
+    "sigma_2",
+    "p_mag",
+    "k",
+    "contact_pressure",
+    "w0_over_h",
+}
 ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding
 ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
 LEAST_JUMP = 0.01  # per cent
 NOISE = 20.0  # colour limit over the difference between fields of cells and the smooth ones
 NONE = 0.01  # of the larger of two fields: what is smaller is zero
-UNRESOLVED, SLIGHT = 0.05, 0.02  # differences between cells, and strains over those of bending, that are not drawn
-DETAIL, AROUND = 0.15, 2.0  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
+UNRESOLVED, SLIGHT = (
+    0.05,
+    0.02,
+)  # differences between cells, and strains over those of bending, that are not drawn
+DETAIL, AROUND = (
+    0.15,
+    2.0,
+)  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
 FEW = 12  # cells that carry a pressure whose distribution is not resolved
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 
@@ -98,16 +116,26 @@ def moments(surface: Surface, h: float) -> tuple[list[Coloured], str]:
 
 
 def bent_alone(surface: Surface, h: float) -> str:
-    """That strains are not drawn, where they are small beside those of bending and differ from cell to cell."""
-    if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or (surface.strain_jump or 0.0) < UNRESOLVED:
+    """That strains are not drawn, where they are small beside those of bending and differ from cell
+    to cell.
+    """
+    if (
+        not {*STRAINS, *MOMENTS} <= surface.fields.keys()
+        or (surface.strain_jump or 0.0) < UNRESOLVED
+    ):
         return ""
     largest, bending = (
-        max(float(np.abs(surface.fields[name]).max()) for name in names) for names in (STRAINS, MOMENTS)
+        max(float(np.abs(surface.fields[name]).max()) for name in names)
+        for names in (STRAINS, MOMENTS)
     )
     bending *= h / 2
     if not 0 < largest < SLIGHT * bending:
         return ""
-    times = f"{float(f'{bending / largest:.1g}'):.0f}" if largest > 1e-4 * bending else "more than 10 000"
+    times = (
+        f"{float(f'{bending / largest:.1g}'):.0f}"
+        if largest > 1e-4 * bending
+        else "more than 10 000"
+    )
     return (
         f"Strains of the mid-surface are not drawn: those of bending are {times} times larger, "
         f"and the former differ from cell to cell by {100 * (surface.strain_jump or 0.0):.2g} % (rms)."
@@ -115,12 +143,23 @@ def bent_alone(surface: Surface, h: float) -> str:
 
 
 def stretches(surface: Surface) -> list[Coloured]:
-    """Stretches and true stresses of rubber; stresses are white at zero. Shells of another law beside it have none."""
+    """Stretches and true stresses of rubber; stresses are white at zero.
+
+    Shells of another law beside it have none.
+    """
     coloured = []
     for name, said in STRETCHES.items():
         if (values := surface.fields.get(name)) is not None:
-            low, high, signed = float(np.nanmin(values)), float(np.nanmax(values)), name.startswith("sigma")
-            limits = from_zero(low, max(high, ROUNDING["E_1"])) if signed else (low, max(high, low + 1e-9))
+            low, high, signed = (
+                float(np.nanmin(values)),
+                float(np.nanmax(values)),
+                name.startswith("sigma"),
+            )
+            limits = (
+                from_zero(low, max(high, ROUNDING["E_1"]))
+                if signed
+                else (low, max(high, low + 1e-9))
+            )
             coloured.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
     return coloured
 
@@ -138,10 +177,14 @@ def _largest(surface: Surface, names: Iterable[str]) -> float:
     return max(float(np.abs(surface.fields[name]).max()) for name in names)
 
 
-def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -> tuple[list[Coloured], list[str]]:
-    """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible.
+def _principal(
+    surface: Surface, captions: dict[str, str], jump: float | None
+) -> tuple[list[Coloured], list[str]]:
+    """Two fields with the same colours, white at zero, so that rounding of a constant field is
+    invisible.
 
-    One that is zero beside the other, or no larger than what the mesh leaves of both, is named, not drawn.
+    One that is zero beside the other, or no larger than what the mesh leaves of both, is named, not
+    drawn.
     """
     if not captions.keys() <= surface.fields.keys():
         return [], []
@@ -166,13 +209,17 @@ def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -
 
 
 def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
-    """The colour limit far above that by which the fields of cells differ: what is zero but for the mesh is pale."""
+    """The colour limit far above that by which the fields of cells differ: what is zero but for the
+    mesh is pale.
+    """
     sizes = surface.fields[first] ** 2 + surface.fields[second] ** 2
     return NOISE * jump * float(np.sqrt(sizes.mean()))
 
 
 def _limit(surface: Surface, first: str, second: str) -> float:
-    """The colour limit of two fields: their largest magnitude, without peaks of small area such as at a point load."""
+    """The colour limit of two fields: their largest magnitude, without peaks of small area such as
+    at a point load.
+    """
     size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
     if (largest := float(size.max())) < ROUNDING[first]:
         return 1.0
@@ -185,15 +232,19 @@ def _limit(surface: Surface, first: str, second: str) -> float:
 
 
 def couple(surface: Surface) -> Array | None:
-    """The moment (n, 3) of the field on the carried remanence per area, over h E λ_m; None without a field.
+    """The moment (n, 3) of the field on the carried remanence per area, over h E λ_m; None without
+    a field.
 
-    λ_m is the largest length of the applied field, so that of a uniform field it is the product of unit vectors.
+    λ_m is the largest length of the applied field, so that of a uniform field it is the product of
+    unit vectors.
     """
     fields = surface.fields
     if not {"Br", "Ba"} <= fields.keys():
         return None
     largest = float(np.nan_to_num(np.linalg.norm(fields["Ba"], axis=1)).max())
-    return np.asarray(np.cross(fields["Br"], fields["Ba"]) / largest, np.float64) if largest else None
+    return (
+        np.asarray(np.cross(fields["Br"], fields["Ba"]) / largest, np.float64) if largest else None
+    )
 
 
 def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
@@ -222,7 +273,9 @@ def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
 
 
 def contact(surface: Surface) -> list[Coloured]:
-    """The gap and the pressure of bodies; none where nothing touches or the mesh resolves no pressure."""
+    """The gap and the pressure of bodies; none where nothing touches or the mesh resolves no
+    pressure.
+    """
     if not {"gap_over_h", "contact_pressure"} <= surface.fields.keys():
         return []
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
@@ -234,7 +287,9 @@ def contact(surface: Surface) -> list[Coloured]:
 
 
 def pressure_said(surface: Surface) -> str:
-    """Return the note under the contact pressure: nothing touches, no cell resolves it, or few cells carry it."""
+    """Return the note under the contact pressure: nothing touches, no cell resolves it, or few
+    cells carry it.
+    """
     pressure = surface.fields["contact_pressure"]
     unresolved, most = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
     if not most:
@@ -247,7 +302,9 @@ def pressure_said(surface: Surface) -> str:
 
 
 def contact_region(surface: Surface) -> Array | None:
-    """Places (8, 3) around the contact, if it is so small that a picture of the whole shell would not show it."""
+    """Places (8, 3) around the contact, if it is so small that a picture of the whole shell would
+    not show it.
+    """
     r = surface.r0 + surface.u
     touching = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]
     if not len(touching):

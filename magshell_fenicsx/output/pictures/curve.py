@@ -1,4 +1,6 @@
-"""The load-displacement or pressure-volume curve as a picture, and natural frequencies along a path."""
+"""The load-displacement or pressure-volume curve as a picture, and natural frequencies along a
+path.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -48,12 +50,16 @@ INSET = 0.4  # of the axes
 CROWDED = 0.02  # of the points of all curves: an inset that covers more has no place
 
 
-def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, place: str = POLE) -> "Figure":
-    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked and numbered.
+def curve_figure(
+    rows: Sequence[Row], amplitude: str, style: OutputSection, place: str = POLE
+) -> "Figure":
+    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are
+    marked and numbered.
 
-    Of a programme each step is drawn, the last one largest, but for steps of a single straight line. Stable parts are
-    solid, unstable parts dashed; an unstable part that its marks would hide is drawn again in an inset. A user-defined
-    amplitude is drawn over the displacement of the pole, or what is called so.
+    Of a programme each step is drawn, the last one largest, but for steps of a single straight
+    line. Stable parts are solid, unstable parts dashed; an unstable part that its marks would hide
+    is drawn again in an inset. A user-defined amplitude is drawn over the displacement of the pole,
+    or what is called so.
 
     Parameters
     ----------
@@ -89,7 +95,11 @@ def worth_drawing(parts: Sequence[Part]) -> list[Part]:
     names = [axes_for(part)[0].name for part in parts]
     for name, part in zip(names, parts, strict=True):
         widths[name] = max(widths[name], float(np.ptp(_points(part)[0])))
-    bent = (part for name, part in zip(names[:-1], parts[:-1], strict=True) if _bends(part, ROUNDING * widths[name]))
+    bent = (
+        part
+        for name, part in zip(names[:-1], parts[:-1], strict=True)
+        if _bends(part, ROUNDING * widths[name])
+    )
     return [*bent, parts[-1]]
 
 
@@ -104,13 +114,23 @@ def _bends(part: Part, least: float) -> bool:
     if np.ptp(x) <= least:
         return False
     wide, high = (float(np.ptp(values)) or 1.0 for values in (x, y))
-    (a, b), x, y = np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high], (x - x[0]) / wide, (y - y[0]) / high
-    return bool(len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0))
+    (a, b), x, y = (
+        np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high],
+        (x - x[0]) / wide,
+        (y - y[0]) / high,
+    )
+    return bool(
+        len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0)
+    )
 
 
 def legend(figure: "Figure", most: int) -> None:
     """One legend above all axes, where it covers no curve."""
-    entries = {name: line for axes in figure.axes for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    entries = {
+        name: line
+        for axes in figure.axes
+        for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     if entries:
         figure.legend(
             entries.values(),
@@ -125,17 +145,28 @@ def legend(figure: "Figure", most: int) -> None:
 
 def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
     """Draw a part of a path in given axes."""
-    x_label, y_label = (named(each, of.rows[0], pole, r"\$").label for each in axes_for(of))  # a name is plain text
+    x_label, y_label = (
+        named(each, of.rows[0], pole, r"\$").label for each in axes_for(of)
+    )  # a name is plain text
     drawn = draw_lines(axes, of)
     marked = [row for row in of.rows if row["label"] in LOCATED]
     solutions = [row for row in of.rows if row["label"] == SOLUTION]
     for row in solutions:
         name, inside = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
-        axes.plot(*place(row, of.amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
+        axes.plot(
+            *place(row, of.amplitude),
+            "s",
+            color="C2",
+            markerfacecolor=inside,
+            markersize=4.5,
+            label=label,
+        )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
-    texts = [str(of.numbers[int(row["point"])]) for row in marked] + [str(row["branch"]) for row in solutions]
+    texts = [str(of.numbers[int(row["point"])]) for row in marked] + [
+        str(row["branch"]) for row in solutions
+    ]
     places = [place(row, of.amplitude) for row in (*marked, *solutions)]
     write_numbers(axes, list(zip(places, texts, strict=True)), drawn)
     axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
@@ -147,7 +178,9 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
 
-def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | None = None) -> list[Array]:
+def draw_lines(
+    axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | None = None
+) -> list[Array]:
     """Draw the lines, points and marks of a part; its smooth curves (2, n).
 
     Parameters
@@ -161,7 +194,9 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
         curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
         drawn.append(curve)
         crossings = [row for row in of.rows if row["label"] in LOCATED and row not in line.rows]
-        for unstable, pieces in groupby(_pieces(line, curve, crossings, at), key=lambda piece: piece[2]):
+        for unstable, pieces in groupby(
+            _pieces(line, curve, crossings, at), key=lambda piece: piece[2]
+        ):
             ends = [(first, last) for first, last, _ in pieces]
             piece = curve[:, ends[0][0] : ends[-1][1] + 1]
             axes.plot(*piece, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
@@ -182,18 +217,25 @@ def draw_lines(axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | N
     return drawn
 
 
-def _pieces(line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceOf) -> Iterator[tuple[int, int, bool]]:
+def _pieces(
+    line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceOf
+) -> Iterator[tuple[int, int, bool]]:
     """The first and last point of each piece of a smooth curve, and whether it is unstable.
 
-    Between two rows a mode that the model excludes crosses zero at the first or the last of the `crossings` there.
+    Between two rows a mode that the model excludes crosses zero at the first or the last of the
+    `crossings` there.
     """
     extent = np.ptp(curve, axis=1)[:, None]
     for i, unstable in enumerate(line.unstable):
         (row, after), low, high = line.rows[i : i + 2], i * FINE, (i + 1) * FINE
-        within = [it for it in crossings if int(row["point"]) < int(it["point"]) < int(after["point"])]
+        within = [
+            it for it in crossings if int(row["point"]) < int(it["point"]) < int(after["point"])
+        ]
         if within and row["label"] not in LOCATED and is_unstable(row) != unstable:
             at = np.array(place_of(within[0 if unstable else -1]))[:, None]
-            middle = low + int(np.argmin(np.linalg.norm((curve[:, low : high + 1] - at) / extent, axis=0)))
+            middle = low + int(
+                np.argmin(np.linalg.norm((curve[:, low : high + 1] - at) / extent, axis=0))
+            )
             yield low, middle, not unstable
             yield middle, high, unstable
         else:
@@ -201,7 +243,9 @@ def _pieces(line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceO
 
 
 def hidden(axes: "Axes", of: Part) -> Array | None:
-    """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can be seen."""
+    """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can
+    be seen.
+    """
     for line in lines_of(of):
         places = [place(row, of.amplitude) for row in line.rows]
         curve = line.joined(*zip(*places, strict=True), of_load=of_load(of.amplitude))
@@ -215,7 +259,9 @@ def hidden(axes: "Axes", of: Part) -> Array | None:
 
 
 def draw_hidden(axes: "Axes", of: Part) -> None:
-    """Draw an unstable part that its marks hide once more in an inset, in the corner with the least of the curves."""
+    """Draw an unstable part that its marks hide once more in an inset, in the corner with the least
+    of the curves.
+    """
     if (box := hidden(axes, of)) is None:
         return
     points = drawn_points(axes)
@@ -237,7 +283,9 @@ def draw_hidden(axes: "Axes", of: Part) -> None:
 
 def drawn_points(axes: "Axes") -> Array:
     """The places (n, 2) of all lines in axes."""
-    return np.concatenate([np.asarray(line.get_xydata(), float).reshape(-1, 2) for line in axes.lines])
+    return np.concatenate(
+        [np.asarray(line.get_xydata(), float).reshape(-1, 2) for line in axes.lines]
+    )
 
 
 def _once(axes: "Axes", name: str) -> str:
@@ -248,11 +296,13 @@ def _once(axes: "Axes", name: str) -> str:
 NAMED = 12  # most waves in the legend
 
 
-def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection) -> "Figure":
+def frequencies_figure(
+    frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection
+) -> "Figure":
     """Frequencies over the amplitude that varied last; the n-th lowest of each wave is one line.
 
-    Of one point alone over the number of waves, where all have one, else over the number of the mode.
-    In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
+    Of one point alone over the number of waves, where all have one, else over the number of the
+    mode. In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -261,15 +311,22 @@ def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], st
     column = shown(registered(varied).column, rows[0]) if varied else None
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
     vibrating = (it for it in frequencies if it.omega2 > 0 and not np.isnan(it.hertz))
-    of_root = max((it.hertz / np.sqrt(it.omega2) for it in vibrating), default=0.0)  # Hz; 0 without a density
+    of_root = max(
+        (it.hertz / np.sqrt(it.omega2) for it in vibrating), default=0.0
+    )  # Hz; 0 without a density
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
     drawn = [it for it in frequencies if it.point in places]
-    alone, of_waves = len({it.point for it in drawn}) == 1, all(it.wave.isdigit() for it in drawn if it.wave != TORSION)
+    alone, of_waves = (
+        len({it.point for it in drawn}) == 1,
+        all(it.wave.isdigit() for it in drawn if it.wave != TORSION),
+    )
     for n, it in enumerate(drawn, 1):
         signed = np.sign(it.omega2) * of_root * np.sqrt(abs(it.omega2)) if of_root else it.omega2
         place = (int(it.wave) if it.wave.isdigit() else 0) if of_waves else n
-        lines[it.wave, count[it.point, it.wave]].append((place if alone else places[it.point], float(signed)))
+        lines[it.wave, count[it.point, it.wave]].append(
+            (place if alone else places[it.point], float(signed))
+        )
         count[it.point, it.wave] += 1
     width = (style.width or ONE) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
@@ -279,13 +336,22 @@ def frequencies_figure(frequencies: Sequence[Frequency], rows: Sequence[Row], st
     for (wave, number), points in lines.items():
         wave = "waves" if spectrum and wave != TORSION else wave
         named = wave if number == 0 and waves.index(wave) < NAMED else None
-        axes.plot(*zip(*points, strict=True), ".-", color=f"C{waves.index(wave) % 10}", label=named, lw=1, ms=4)
+        axes.plot(
+            *zip(*points, strict=True),
+            ".-",
+            color=f"C{waves.index(wave) % 10}",
+            label=named,
+            lw=1,
+            ms=4,
+        )
     axes.axhline(0, color="0.6", lw=0.6)
     grows = "; below zero it grows" if any(it.omega2 < 0 for it in frequencies) else ""
     said = f"frequency  (Hz){grows}"
     of_one = "waves around the axis" if of_waves else "number of the mode"
     of_path = column.label if column else ""
-    axes.set(xlabel=of_one if alone else of_path, ylabel=said if of_root else r"$\omega^2 \rho R^2/E$")
+    axes.set(
+        xlabel=of_one if alone else of_path, ylabel=said if of_root else r"$\omega^2 \rho R^2/E$"
+    )
     if alone:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if waves not in ([""], ["waves"]):

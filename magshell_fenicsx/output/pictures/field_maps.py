@@ -22,7 +22,10 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 MOST = 6  # maps in the picture
-LEAST, DECADES = 10.0, 3.0  # ratio of the sizes from which colours are logarithms, and how many powers of ten
+LEAST, DECADES = (
+    10.0,
+    3.0,
+)  # ratio of the sizes from which colours are logarithms, and how many powers of ten
 FLAT = 1e-6  # of |B|: a part in the plane as small as this has no lines
 MARGIN = 1.5  # inches of a panel above and below its map: title, axis, colours
 BODY, TALLEST = 0.78, 2.0  # of a panel's width: how wide and tall its map is
@@ -34,9 +37,14 @@ LINE_WIDTH, TINY = 0.6, 1e-300  # points: around the section of the shell, whose
 
 
 def field_maps_figure(
-    maps: Sequence[tuple[MapGrid, float]], surface: Surface, h: float, case: Mapping[str, Any], style: OutputSection
+    maps: Sequence[tuple[MapGrid, float]],
+    surface: Surface,
+    h: float,
+    case: Mapping[str, Any],
+    style: OutputSection,
 ) -> "Figure":
-    """Draw |B| in colours and the lines of the part in the plane; of a box the plane nearest to its middle.
+    """Draw |B| in colours and the lines of the part in the plane; of a box the plane nearest to its
+    middle.
 
     Parameters
     ----------
@@ -55,7 +63,10 @@ def field_maps_figure(
     across = columns(len(shown))
     high, wide = -(-len(shown) // across), (style.width or (ONE if across == 1 else SEVERAL)) / INCH
     with drawing(style):
-        ratio = max(float(np.linalg.norm(grid.sides[1]) / np.linalg.norm(grid.sides[0])) for grid, _ in shown)
+        ratio = max(
+            float(np.linalg.norm(grid.sides[1]) / np.linalg.norm(grid.sides[0]))
+            for grid, _ in shown
+        )
         tall = MARGIN + BODY * min(ratio, TALLEST) * wide / across
         figure = Figure(figsize=(wide, tall * high), dpi=style.dpi, layout="constrained")
         grid_of_axes = figure.subplots(high, across, squeeze=False).ravel()
@@ -78,16 +89,22 @@ def plane_of(grid: MapGrid) -> MapGrid:
 
 
 def section(surface: Surface, grid: MapGrid) -> Array:
-    """Where the deformed mid-surface, or the surface of a solid, meets the plane of a grid: lines (n, 2, 3), over R."""
+    """Where the deformed mid-surface, or the surface of a solid, meets the plane of a grid: lines
+    (n, 2, 3), over R.
+    """
     pieces = tessellated(surface)
     places = pieces.at(surface.r0 + surface.u)
     normal = np.cross(*grid.sides)
     height = (places - grid.corner) @ (normal / np.linalg.norm(normal))
-    height = np.where(np.abs(height) < ON_PLANE, ON_PLANE, height)  # on one side of it, in all pieces
+    height = np.where(
+        np.abs(height) < ON_PLANE, ON_PLANE, height
+    )  # on one side of it, in all pieces
     corners, heights = places[pieces.triangles], height[pieces.triangles]
     crossed = np.abs(np.sign(heights).sum(axis=1)) < 3
     corners, heights = corners[crossed], heights[crossed]
-    alone = np.where(np.sign(heights).sum(axis=1) > 0, heights.argmin(axis=1), heights.argmax(axis=1))
+    alone = np.where(
+        np.sign(heights).sum(axis=1) > 0, heights.argmin(axis=1), heights.argmax(axis=1)
+    )
     rows, ends = np.arange(len(corners)), list[Array]()
     for way in (1, 2):
         other = (alone + way) % 3
@@ -97,7 +114,9 @@ def section(surface: Surface, grid: MapGrid) -> Array:
     return np.stack(ends, axis=1)
 
 
-def _draw(axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, case: Mapping[str, Any]) -> None:
+def _draw(
+    axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, case: Mapping[str, Any]
+) -> None:
     from matplotlib.collections import PolyCollection
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import PathPatch
@@ -112,19 +131,27 @@ def _draw(axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, cas
     )
     B = size_of_unit * grid.values.reshape(ny, nx, 3)
     size = np.linalg.norm(B, axis=-1)
-    low, top = (float(each(size, initial=start)) for each, start in ((np.nanmin, np.inf), (np.nanmax, 0.0)))
+    low, top = (
+        float(each(size, initial=start)) for each, start in ((np.nanmin, np.inf), (np.nanmax, 0.0))
+    )
     low, top = (low, top) if top > 0 else (0.0, 1.0)
     wide = low * LEAST < top
     norm = LogNorm(max(low, top / 10**DECADES), top) if wide else Normalize(low, top)
     image = axes.pcolormesh(x, y, masked(size), norm=norm, cmap="viridis", shading="nearest")
     along = [masked(B @ e) for e in units]
     if any(float(np.nanmax(np.abs(B @ e), initial=0.0)) > FLAT * top for e in units):
-        axes.streamplot(x, y, along[0], along[1], color="white", linewidth=0.6, density=DENSITY, arrowsize=0.6)
+        axes.streamplot(
+            x, y, along[0], along[1], color="white", linewidth=0.6, density=DENSITY, arrowsize=0.6
+        )
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.set(xlabel=_direction(units[0], R), ylabel=_direction(units[1], R))
-    axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{_place(grid, units, length, R)}")
-    bar = axes.figure.colorbar(image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05)
+    axes.set_title(
+        f"{grid.name.replace('_', ' ')}\n{grid.words} field{_place(grid, units, length, R)}"
+    )
+    bar = axes.figure.colorbar(
+        image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05
+    )
     if not wide:
         bar.ax.xaxis.set_major_formatter(number_format())
     flat = length * np.stack([lines @ e for e in units], axis=-1)
@@ -132,7 +159,9 @@ def _draw(axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, cas
         axes.add_patch(PathPatch(with_holes(outlines(flat)), color="0.15", linewidth=LINE_WIDTH))
     else:
         drawn = list(_thickened(flat, length * h))
-        axes.add_collection(PolyCollection(drawn, color="0.15", linewidth=LINE_WIDTH), autolim=False)
+        axes.add_collection(
+            PolyCollection(drawn, color="0.15", linewidth=LINE_WIDTH), autolim=False
+        )
 
 
 def _thickened(lines: Array, h: float) -> Array:
@@ -140,14 +169,19 @@ def _thickened(lines: Array, h: float) -> Array:
     along = lines[:, 1] - lines[:, 0]
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     across *= h / 2 / np.maximum(np.linalg.norm(across, axis=1), TINY)[:, None]
-    return np.stack([lines[:, 0] - across, lines[:, 1] - across, lines[:, 1] + across, lines[:, 0] + across], axis=1)
+    return np.stack(
+        [lines[:, 0] - across, lines[:, 1] - across, lines[:, 1] + across, lines[:, 0] + across],
+        axis=1,
+    )
 
 
 def outlines(lines: Array) -> list[Array]:
     """The polygons that lines (n, 2, 2) with common ends make, in any order."""
     from scipy.spatial import cKDTree  # takes long to import
 
-    lines = lines[np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) > SHORT * np.abs(lines).max(initial=0.0)]
+    lines = lines[
+        np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1) > SHORT * np.abs(lines).max(initial=0.0)
+    ]
     if not len(lines):
         return []
     ends = lines.reshape(-1, 2)
@@ -177,7 +211,9 @@ def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
     for path, (x, y) in zip(paths, (each.T for each in polygons), strict=True):
         hole = sum(other is not path and other.contains_point((x[0], y[0])) for other in paths) % 2
         right = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0
-        turned.append(MatplotlibPath(np.asarray(path.vertices)[::-1], path.codes) if right != hole else path)
+        turned.append(
+            MatplotlibPath(np.asarray(path.vertices)[::-1], path.codes) if right != hole else path
+        )
     return MatplotlibPath.make_compound_path(*turned)
 
 

@@ -1,4 +1,6 @@
-"""Figures of panels: images of shells with outlines, arrows, colour bars and the directions of e1, e2, e3."""
+"""Figures of panels: images of shells with outlines, arrows, colour bars and the directions of e1,
+e2, e3.
+"""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -68,7 +70,9 @@ class Panel:
         left, right, low, high = self.window.box
         if not any(len(arrows.feet) for arrows in self.arrows):
             return self.window.box
-        x, y = np.concatenate([p[:, :2] for a in self.arrows for p in (a.feet, a.feet + a.vectors)]).T
+        x, y = np.concatenate(
+            [p[:, :2] for a in self.arrows for p in (a.feet, a.feet + a.vectors)]
+        ).T
         spare = HEAD * (right - left)
         return (
             min(left, x.min() - spare),
@@ -90,7 +94,12 @@ def drawing(style: OutputSection) -> AbstractContextManager[None]:
     import matplotlib
 
     size = style.font_size
-    own: dict[str, Any] = {"font.size": size, "axes.labelsize": size, "axes.titlesize": size, "legend.fontsize": size}
+    own: dict[str, Any] = {
+        "font.size": size,
+        "axes.labelsize": size,
+        "axes.titlesize": size,
+        "legend.fontsize": size,
+    }
     own |= {"xtick.labelsize": 0.9 * size, "ytick.labelsize": 0.9 * size, "axes.linewidth": 0.6}
     own |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
     return matplotlib.rc_context(own)
@@ -120,7 +129,9 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     below = (4.2 if barred else 0.4) * line
     legend = max((sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0)
     above = gap / 2 + legend * line
-    beside = barred and across < 3  # the directions stand beside the first bar, else in a free panel or at the foot
+    beside = (
+        barred and across < 3
+    )  # the directions stand beside the first bar, else in a free panel or at the foot
     free = 0 if beside else len(panels) % across
     indent = gap / 2 + (0.0 if beside or free else 4.0 * line)
     notes = _wrapped(note, wide * across - indent - gap / 2, style.font_size)
@@ -135,7 +146,9 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
         draw_panel(boxes.axes(start, low + below + (tall - h) / 2, w, h), panel, style)
         for k, arrows in enumerate(panel.arrows):
             y = low + below + tall + above - gap / 2 - (k + 0.5) * line
-            figure.text(*boxes.place(left + gap / 2, y), arrows.name, color=arrows.colour, va="center")
+            figure.text(
+                *boxes.place(left + gap / 2, y), arrows.name, color=arrows.colour, va="center"
+            )
         if panel.scale.colours:
             spare = (4.4 if beside else 2.2) * line  # a power of ten needs the other side
             reach = max(wide - gap - spare - 3.2 * line, 3 * line)
@@ -145,7 +158,12 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     low += -3.3 * line if not beside and not free else 0.4 * line
     directions(boxes.axes(free * wide + gap / 2, low, size, size), panels[0].camera, style)
     for k, text in enumerate(reversed(notes)):
-        figure.text(*boxes.place(indent, (k + 0.5) * line), text, va="center", fontsize=0.9 * style.font_size)
+        figure.text(
+            *boxes.place(indent, (k + 0.5) * line),
+            text,
+            va="center",
+            fontsize=0.9 * style.font_size,
+        )
     return figure
 
 
@@ -171,24 +189,47 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
 
     left, right, low, high = panel.frame
     same = panel.frame == panel.window.box  # pixel by pixel
-    axes.imshow(panel.image, extent=panel.window.box, interpolation="none" if same else "antialiased", aspect="auto")
+    axes.imshow(
+        panel.image,
+        extent=panel.window.box,
+        interpolation="none" if same else "antialiased",
+        aspect="auto",
+    )
     for line, (grey, dashes) in panel.lines:
         axes.plot(*line.T, dashes, color=grey, lw=0.06 * style.font_size)
     for arrows in panel.arrows:
         _draw_arrows(axes, arrows, right - left, style)
     for x, y, text in panel.texts:
-        axes.text(x, y, text, ha="center", va="center", color="white", weight="bold", fontsize=0.9 * style.font_size)
+        axes.text(
+            x,
+            y,
+            text,
+            ha="center",
+            va="center",
+            color="white",
+            weight="bold",
+            fontsize=0.9 * style.font_size,
+        )
     for x, y, name in panel.names:
         around = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
         axes.text(
-            x, y, name, ha="center", va="center", color="0.1", fontsize=0.9 * style.font_size, path_effects=around
+            x,
+            y,
+            name,
+            ha="center",
+            va="center",
+            color="0.1",
+            fontsize=0.9 * style.font_size,
+            path_effects=around,
         )
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
 
 
 def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSection) -> None:
-    """In the plane of the picture; what points to the eye is a dot in a circle, what points away a cross in it."""
+    """In the plane of the picture; what points to the eye is a dot in a circle, what points away a
+    cross in it.
+    """
     flat, length = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
     along = np.linalg.norm(flat, axis=1) < 0.3 * length
     x, y = arrows.feet[:, :2].T
@@ -208,12 +249,30 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
         headaxislength=4.5,
     )
     size = (0.9 * style.font_size) ** 2
-    axes.scatter(x[~along], y[~along], s=size / 9 * thin**2, color=arrows.colour, zorder=4, linewidths=0)
+    axes.scatter(
+        x[~along], y[~along], s=size / 9 * thin**2, color=arrows.colour, zorder=4, linewidths=0
+    )
     for inside, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
         at = along & inside
         if at.any():
-            axes.scatter(x[at], y[at], s=size, facecolors="white", edgecolors=arrows.colour, linewidths=0.8, zorder=5)
-            axes.scatter(x[at], y[at], s=size / 3, color=arrows.colour, marker=marker, linewidths=0.8, zorder=6)
+            axes.scatter(
+                x[at],
+                y[at],
+                s=size,
+                facecolors="white",
+                edgecolors=arrows.colour,
+                linewidths=0.8,
+                zorder=5,
+            )
+            axes.scatter(
+                x[at],
+                y[at],
+                s=size / 3,
+                color=arrows.colour,
+                marker=marker,
+                linewidths=0.8,
+                zorder=6,
+            )
 
 
 def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
@@ -221,7 +280,13 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
     axes.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
     axes.set_axis_off()
     on_screen = axes_on_screen(camera.direction)
-    arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, "lw": 0.7, "mutation_scale": style.font_size * 0.8}
+    arrow = {
+        "arrowstyle": "->",
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "lw": 0.7,
+        "mutation_scale": style.font_size * 0.8,
+    }
     written = list[Array]()
     for number, (x, y) in enumerate(zip(*(0.9 * on_screen).T, strict=True), 1):
         size = float(np.hypot(x, y))
@@ -231,14 +296,20 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
         written.append(_beside(np.array([x, y]), size, written))
-        axes.text(float(written[-1][0]), float(written[-1][1]), f"$e_{number}$", ha="center", va="center")
+        axes.text(
+            float(written[-1][0]), float(written[-1][1]), f"$e_{number}$", ha="center", va="center"
+        )
 
 
 def _beside(end: Array, size: float, others: Sequence[Array]) -> Array:
-    """Where the letter of an arrow stands: ahead of its end, or beside it if another letter is there."""
+    """Where the letter of an arrow stands: ahead of its end, or beside it if another letter is
+    there.
+    """
     ahead, across = 0.4 * end / size, LETTER * np.array([-end[1], end[0]]) / size
     places = [end + ahead, end + across, end - across]
-    free = [place for place in places if all(np.linalg.norm(place - other) > LETTER for other in others)]
+    free = [
+        place for place in places if all(np.linalg.norm(place - other) > LETTER for other in others)
+    ]
     return np.asarray((free or places)[0])
 
 

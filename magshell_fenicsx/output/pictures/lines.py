@@ -1,4 +1,6 @@
-"""What a curve consists of, for pictures and the report alike: steps, lines of points, and how points are joined."""
+"""What a curve consists of, for pictures and the report alike: steps, lines of points, and how
+points are joined.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +22,9 @@ STEEPEST = 3.0  # slope of a curve at a point over the lesser one of the chords 
 
 @dataclass(frozen=True)
 class Part:
-    """The rows in which an amplitude varied, with the one before them, and the numbers of its instabilities."""
+    """The rows in which an amplitude varied, with the one before them, and the numbers of its
+    instabilities.
+    """
 
     amplitude: str
     rows: Sequence[Row]
@@ -29,8 +33,13 @@ class Part:
 
 
 def numbered(rows: Sequence[Row]) -> dict[int, int]:
-    """Point -> number of its instability, from 1 along path.csv; so they are numbered in all pictures and tables."""
-    return {int(row["point"]): n for n, row in enumerate((row for row in rows if row["label"] in LOCATED), 1)}
+    """Point -> number of its instability, from 1 along path.csv; so they are numbered in all
+    pictures and tables.
+    """
+    return {
+        int(row["point"]): n
+        for n, row in enumerate((row for row in rows if row["label"] in LOCATED), 1)
+    }
 
 
 def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
@@ -58,7 +67,9 @@ def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
 def axes_for(part: Part) -> tuple[Quantity, Quantity]:
     """The quantities on the x and the y axis of a part's curve."""
     x, y = axes_of(part.amplitude, part.rows[0])
-    if part.amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part.rows):
+    if part.amplitude == "load" and all(
+        row["w_over_h"] == row["w_pole_over_h"] for row in part.rows
+    ):
         x = shown("w_pole_over_h", part.rows[0])  # moments have no conjugate displacement
     return x, y
 
@@ -70,13 +81,19 @@ def place(row: Row, amplitude: str) -> tuple[float, float]:
 
 
 def named(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
-    """A quantity whose words name the point of `w_pole_over_h`; `dollar` stands for that sign in the name."""
+    """A quantity whose words name the point of `w_pole_over_h`; `dollar` stands for that sign in
+    the name.
+    """
     name = pole_name(row, pole).replace("$", dollar)
-    return replace(of_point, words=of_point.words.replace(POLE, name), note=of_point.note.replace(POLE, name))
+    return replace(
+        of_point, words=of_point.words.replace(POLE, name), note=of_point.note.replace(POLE, name)
+    )
 
 
 def is_unstable(row: Row) -> bool:
-    """Whether the model, or a mode that it excludes, is unstable; an earlier path.csv has no excluded_pivots."""
+    """Whether the model, or a mode that it excludes, is unstable; an earlier path.csv has no
+    excluded_pivots.
+    """
     return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
 
 
@@ -98,22 +115,31 @@ class Line:
 
     @property
     def unstable(self) -> list[bool]:
-        """Whether each of the segments between the rows is: as its end, or if that is located as its beginning.
+        """Whether each of the segments between the rows is: as its end, or if that is located as
+        its beginning.
 
-        Between two located rows the number of unstable directions is that of a row, or one more, at both.
+        Between two located rows the number of unstable directions is that of a row, or one more, at
+        both.
         """
         of_segments: list[bool] = []
         for first, last in pairwise(self.rows):
             rows = [row for row in (last, first) if row["label"] not in LOCATED]
-            a, b = (int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) for row in (first, last))
+            a, b = (
+                int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0))
+                for row in (first, last)
+            )
             between = {a, a + 1} & {b, b + 1}
             alternates = not (of_segments and of_segments[-1])
-            of_segments.append(is_unstable(rows[0]) if rows else min(between, default=0) > 0 or alternates)
+            of_segments.append(
+                is_unstable(rows[0]) if rows else min(between, default=0) > 0 or alternates
+            )
         return of_segments
 
     @property
     def pieces(self) -> list[tuple[int, int, bool]]:
-        """The first and the last row of each part that is stable or unstable, and whether it is unstable."""
+        """The first and the last row of each part that is stable or unstable, and whether it is
+        unstable.
+        """
         parts = []
         for unstable, group in groupby(enumerate(self.unstable), key=lambda each: each[1]):
             numbers = [i for i, _ in group]
@@ -123,9 +149,15 @@ class Line:
     @property
     def level(self) -> list[int]:
         """Its ends, 0 and -1, at which its amplitude has an extreme: a fold in that."""
-        return [i for i in (0, -1) if (self.rows[i]["label"], self.rows[i]["amplitude"]) == ("fold", self.amplitude)]
+        return [
+            i
+            for i in (0, -1)
+            if (self.rows[i]["label"], self.rows[i]["amplitude"]) == ("fold", self.amplitude)
+        ]
 
-    def joined(self, x: Sequence[float], y: Sequence[float], *, of_load: int | None = None) -> Array:
+    def joined(
+        self, x: Sequence[float], y: Sequence[float], *, of_load: int | None = None
+    ) -> Array:
         """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows.
 
         Parameters
@@ -144,17 +176,23 @@ def lines_of(part: Part) -> list[Line]:
     path = [row for row in part.rows if row["label"] != SOLUTION]
     in_time = part.amplitude == "time"
     branches = sorted({int(row["branch"]) for row in path})
-    of_branches = [_line([row for row in path if row["branch"] == b], part.amplitude) for b in branches]
+    of_branches = [
+        _line([row for row in path if row["branch"] == b], part.amplitude) for b in branches
+    ]
     return [Line(rows, in_time, part.amplitude) for rows in of_branches]
 
 
 def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
-    """The rows of a branch along its curve: those of the model, and what the model excludes at its end."""
+    """The rows of a branch along its curve: those of the model, and what the model excludes at its
+    end.
+    """
     own = [row for row in rows if row["mode"] in OWN_MODES]
     last, before = (place(row, amplitude) for row in (own[-1], own[max(len(own) - 2, 0)]))
     beyond = [row for row in rows[-1:] if row not in own and row["label"] in LOCATED]
     ahead = np.subtract(last, before)
-    return own + [row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0]
+    return own + [
+        row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0
+    ]
 
 
 def of_load(amplitude: str) -> int:
@@ -168,16 +206,18 @@ def smooth(
     located: Sequence[bool] = (),
     level: Sequence[tuple[int, int]] = (),
 ) -> Array:
-    """A smooth curve (2, FINE (n - 1) + 1) through n points; the parameter is the root of the scaled chord.
+    """A smooth curve (2, FINE (n - 1) + 1) through n points; the parameter is the root of the
+    scaled chord.
 
-    Cubics with the slopes of parabolas through three points, limited so that what rises from point to point rises
-    (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). What turns between two points turns smoothly there, what turns
-    at a located point turns at it.
+    Cubics with the slopes of parabolas through three points, limited so that what rises from point
+    to point rises (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). What turns between two
+    points turns smoothly there, what turns at a located point turns at it.
 
     Parameters
     ----------
     located
-        Whether each point is a fold or a bifurcation, where a coordinate that turns has its extreme.
+        Whether each point is a fold or a bifurcation, where a coordinate that turns has its
+        extreme.
     level
         Which coordinate has its extreme at which end, 0 or -1.
     """
@@ -193,7 +233,9 @@ def smooth(
         slopes[coordinate, end] = 0.0
     t, h, rise = np.arange(FINE) / FINE, np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
     first, last = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
-    curve = xy[:, :-1, None] + t * (first + t * (3 * rise - 2 * first - last + t * (first + last - 2 * rise)))
+    curve = xy[:, :-1, None] + t * (
+        first + t * (3 * rise - 2 * first - last + t * (first + last - 2 * rise))
+    )
     return np.concatenate([curve.reshape(2, -1), xy[:, -1:]], axis=1)
 
 
@@ -213,7 +255,9 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
 
 
 def _end(h1: float, h2: float, first: float, second: float) -> float:
-    """The slope at an end: that of a parabola through three points, or none, or STEEPEST times the chord's."""
+    """The slope at an end: that of a parabola through three points, or none, or STEEPEST times the
+    chord's.
+    """
     slope = ((2 * h1 + h2) * first - h1 * second) / (h1 + h2)
     if slope * first <= 0:
         return 0.0
@@ -221,7 +265,8 @@ def _end(h1: float, h2: float, first: float, second: float) -> float:
 
 
 def splined(x: Sequence[float], y: Sequence[float], t: Sequence[float]) -> Array:
-    """The same by cubic splines over the time: with four points a period a vibration keeps its form.
+    """The same by cubic splines over the time: with four points a period a vibration keeps its
+    form.
 
     Equal times, such as those of the point before a motion and of its first, are joined straight.
     """

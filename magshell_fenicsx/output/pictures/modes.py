@@ -46,9 +46,16 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
-SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
-ZERO = 1e-4  # of the largest load on the path: a load as small as this is zero, up to the error of where a path ends
-AGAIN = 5e-3  # of the largest displacements: an instability as near as this to an earlier one is that
+SMALL, APART = (
+    0.15,
+    0.16,
+)  # vectors below this part of the largest have none; their distance over the extent of those
+# of the largest load on the path: a load as small as this is zero, up to the error of where a path
+# ends
+ZERO = 1e-4
+AGAIN = (
+    5e-3  # of the largest displacements: an instability as near as this to an earlier one is that
+)
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -69,7 +76,10 @@ def small_panels(
     camera: Camera,
     note: str = "",
 ) -> "Figure":
-    """All in one window, with captions above them; the layers have the same limits. A note stands at the foot."""
+    """All in one window, with captions above them; the layers have the same limits.
+
+    A note stands at the foot.
+    """
     from matplotlib.figure import Figure
 
     number, line, gap = len(surfaces), LINE * style.font_size, GAP / INCH
@@ -85,12 +95,19 @@ def small_panels(
     height = -(-number // across) * each + below + foot
     figure = Figure(figsize=(width, height), dpi=style.dpi)
     boxes = Boxes(figure)
-    figure.text(*boxes.place(gap / 2, 0.5 * line), note, va="center", fontsize=0.9 * style.font_size)
+    figure.text(
+        *boxes.place(gap / 2, 0.5 * line), note, va="center", fontsize=0.9 * style.font_size
+    )
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
         panel = Background(surface, camera, 0, window).panel(layer, style)
         left, low = i % across * wide, height - (i // across + 1) * each
         draw_panel(boxes.axes(left + gap / 2, low, wide - gap, tall), panel, style)
-        figure.text(*boxes.place(left + wide / 2, low + tall + lines * line / 2), caption, ha="center", va="center")
+        figure.text(
+            *boxes.place(left + wide / 2, low + tall + lines * line / 2),
+            caption,
+            ha="center",
+            va="center",
+        )
     reach = min(width - gap - 8 * line, 4.0)
     box = boxes.axes((width - reach) / 2, foot + 1.7 * line, reach, 0.65 * line)
     colour_bar(figure, box, panel.scale, room=reach)
@@ -113,9 +130,14 @@ def solutions_figure(
     surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
 ) -> "Figure":
     """Draw the deformed shells of some rows with the same colours."""
-    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
+    limits = from_zero(
+        min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h
+    )
     layers = [
-        Coloured("w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$") for s in surfaces
+        Coloured(
+            "w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$"
+        )
+        for s in surfaces
     ]
     captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
     with drawing(style):
@@ -132,9 +154,14 @@ CAPTION = "$w$ of the mode over its largest, of any sign"
 
 
 def modes_figure(
-    surfaces: Sequence[Surface], captions: Sequence[str], style: OutputSection, camera: Camera, most: int = MOST_PANELS
+    surfaces: Sequence[Surface],
+    captions: Sequence[str],
+    style: OutputSection,
+    camera: Camera,
+    most: int = MOST_PANELS,
 ) -> "Figure":
-    """Draw one small panel per mode: the deformed shell plus the mode, coloured by the mode's normal displacement.
+    """Draw one small panel per mode: the deformed shell plus the mode, coloured by the mode's
+    normal displacement.
 
     Parameters
     ----------
@@ -151,7 +178,9 @@ def modes_figure(
     layers = []
     for surface in surfaces:
         w = surface.fields["mode_w"]
-        layers.append(Coloured("mode_w", w / (np.abs(w).max() or 1.0), (-1.0, 1.0), SIGNED, CAPTION))
+        layers.append(
+            Coloured("mode_w", w / (np.abs(w).max() or 1.0), (-1.0, 1.0), SIGNED, CAPTION)
+        )
     with drawing(style):
         return small_panels(moved, layers, captions, style, camera, note)
 
@@ -172,33 +201,52 @@ def mode_figures(
     singular = [row for row in rows if row["label"] in LOCATED]
     met = _met_again(singular)
     first = [row for row in singular if int(row["point"]) in met]
-    if panels := [panel for row in first if (panel := _null_vector(folder, row, rows, numbers, met))]:
+    if panels := [
+        panel for row in first if (panel := _null_vector(folder, row, rows, numbers, met))
+    ]:
         yield "instabilities", _figure(panels, style, camera)
     table = folder / "stability.csv"
     if not table.exists():
         return
-    listed = read_csv(table, lambda line: (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"]))))
+    listed = read_csv(
+        table, lambda line: (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"])))
+    )
     for row in rows:
         point = int(row["point"])
         modes = [mode for number, mode in listed if number == point]
-        files = [(mode_file(folder, point, str(n), mode.label), n, mode) for n, mode in enumerate(modes, 1)]
-        if panels := [(read_vtu(file)[0], mode_caption(n, mode)) for file, n, mode in files if file.exists()]:
+        files = [
+            (mode_file(folder, point, str(n), mode.label), n, mode)
+            for n, mode in enumerate(modes, 1)
+        ]
+        if panels := [
+            (read_vtu(file)[0], mode_caption(n, mode)) for file, n, mode in files if file.exists()
+        ]:
             yield f"modes_{point:04d}", _figure(panels, style, camera)
 
 
-def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera) -> "Figure":
+def _figure(
+    panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera
+) -> "Figure":
     surfaces, captions = zip(*panels, strict=True)
     return modes_figure(surfaces, captions, style, camera)
 
 
 def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
-    """Point of an instability -> the rows of the same one where the path comes back to it, itself the first."""
+    """Point of an instability -> the rows of the same one where the path comes back to it, itself
+    the first.
+    """
     met: dict[int, list[Row]] = {}
-    moved = [name for name in (singular[0] if singular else ()) if quantity(name).kind in ("displacement", "place")]
+    moved = [
+        name
+        for name in (singular[0] if singular else ())
+        if quantity(name).kind in ("displacement", "place")
+    ]
     sizes = {name: max(abs(float(row[name])) for row in singular) for name in moved}
 
     def alike(one: Row, other: Row) -> bool:
-        near = all(abs(float(one[name]) - float(other[name])) <= AGAIN * sizes[name] for name in moved)
+        near = all(
+            abs(float(one[name]) - float(other[name])) <= AGAIN * sizes[name] for name in moved
+        )
         return near and all(one[name] == other[name] for name in ("label", "mode", "amplitude"))
 
     for row in singular:
@@ -211,7 +259,11 @@ def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
 
 
 def _null_vector(
-    folder: Path, row: Row, rows: Sequence[Row], numbers: dict[int, int], met: Mapping[int, Sequence[Row]]
+    folder: Path,
+    row: Row,
+    rows: Sequence[Row],
+    numbers: dict[int, int],
+    met: Mapping[int, Sequence[Row]],
 ) -> tuple[Surface, str] | None:
     """The surface with a null vector, and its caption: numbers, kind, where on the path."""
     label = "" if row["mode"] in OWN_MODES else str(row["mode"])
@@ -235,16 +287,26 @@ def _null_vector(
     return surface, f"{which}: {row['label']}{kind}{where}"
 
 
-def gradients_figure(by_result: Mapping[str, Surface], style: OutputSection, camera: Camera) -> "Figure":
-    """One panel for each result and field: red raises the result, blue lowers it; of vectors their length."""
+def gradients_figure(
+    by_result: Mapping[str, Surface], style: OutputSection, camera: Camera
+) -> "Figure":
+    """One panel for each result and field: red raises the result, blue lowers it; of vectors their
+    length.
+    """
     count = sum(name in surface.fields for surface in by_result.values() for name in WORDS)
     width = panel_width(style, columns(count))
     with drawing(style):
-        panels = [panel for of, surface in by_result.items() for panel in _panels(of, surface, style, camera, width)]
+        panels = [
+            panel
+            for of, surface in by_result.items()
+            for panel in _panels(of, surface, style, camera, width)
+        ]
         return panels_figure(panels, style, NOTE)
 
 
-def _panels(of: str, surface: Surface, style: OutputSection, camera: Camera, width: int) -> Iterator[Panel]:
+def _panels(
+    of: str, surface: Surface, style: OutputSection, camera: Camera, width: int
+) -> Iterator[Panel]:
     view = Background(surface, camera, width)
     for name in (name for name in WORDS if name in surface.fields):
         caption, values = f"{of.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]

@@ -12,14 +12,26 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.grids import read_map
 from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About, grid_file, point_file, read_point, read_vtu, write_whole_shells
+from magshell_fenicsx.output.fields.vtu import (
+    About,
+    grid_file,
+    point_file,
+    read_point,
+    read_vtu,
+    write_whole_shells,
+)
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
 from magshell_fenicsx.output.pictures.field_maps import field_maps_figure
 from magshell_fenicsx.output.pictures.layout import drawing, written
 from magshell_fenicsx.output.pictures.lines import drawn_parts
-from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
+from magshell_fenicsx.output.pictures.modes import (
+    gradients_figure,
+    mode_figures,
+    searched,
+    solutions_figure,
+)
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.readings import readings_figure
 from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
@@ -83,7 +95,10 @@ class Drawn:
 
     def maps_at(self, row: Row) -> list[tuple[MapGrid, float]]:
         """The grids beside the shell at a point, and R in metres."""
-        files = (self.folder / "fields" / grid_file(name, int(row["point"])) for name in self.resolved.get(MAPS) or ())
+        files = (
+            self.folder / "fields" / grid_file(name, int(row["point"]))
+            for name in self.resolved.get(MAPS) or ()
+        )
         return [read_map(file) for file in files]
 
 
@@ -94,7 +109,8 @@ def plot(
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
 ) -> list[str]:
-    """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
+    """Draw the pictures again, also animation.gif if requested, and write report.html again; see
+    `draw`.
 
     A picture of somebody else in the folder is refused, not replaced.
     """
@@ -121,11 +137,15 @@ def plotted(folders: Sequence[Path], out: Path, options: Mapping[str, Any], **al
     if len(folders) == 1:
         return f"{', '.join(plot(folders[0], options=options, **alone))} in {folders[0]}/"
     if any(value is not None and value is not False and value != [] for value in alone.values()):
-        raise CaseError("plot: of several runs the curves are drawn in one picture: give one folder for more")
+        raise CaseError(
+            "plot: of several runs the curves are drawn in one picture: give one folder for more"
+        )
     return ", ".join(plot_runs(folders, out, options))
 
 
-def plot_runs(folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None) -> list[str]:
+def plot_runs(
+    folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None
+) -> list[str]:
     """Draw the curves of several runs in one picture; the names of its files.
 
     Raises
@@ -145,7 +165,10 @@ def plot_runs(folders: Sequence[Path], file: Path, options: Mapping[str, Any] | 
 
 
 def draw(
-    folder: Path, point: int | None = None, options: Mapping[str, Any] | None = None, shapes: Sequence[int] = ()
+    folder: Path,
+    point: int | None = None,
+    options: Mapping[str, Any] | None = None,
+    shapes: Sequence[int] = (),
 ) -> list[str]:
     """Draw every picture of a finished or interrupted run.
 
@@ -207,11 +230,17 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
                 add_shapes(curve, parts, chosen, style, run.camera)
         yield from written(curve, style, "curve")
         if run.resolved.get("sensors"):
-            yield from written(readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors")
-    for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
+            yield from written(
+                readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors"
+            )
+    for name, figure in figures(
+        in_its_field(surface, run.headline, run.rows), about.h, style, run.camera
+    ).items():
         yield from written(figure, style, name)
     if maps := run.maps_at(run.headline):
-        yield from written(field_maps_figure(maps, surface, about.h, run.resolved, style), style, "field_maps")
+        yield from written(
+            field_maps_figure(maps, surface, about.h, run.resolved, style), style, "field_maps"
+        )
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
         yield from written(figure, style, name)
     if frequencies := read_frequencies(run.folder):
@@ -223,19 +252,27 @@ def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
         yield from written(gradients_figure(by_result, style, run.camera), style, "gradients")
     if solutions := searched(run.rows)[:MOST_PANELS]:
         surfaces = [run.at(each)[0] for each in solutions]
-        yield from written(solutions_figure(surfaces, solutions, about.h, style, run.camera), style, "solutions")
+        yield from written(
+            solutions_figure(surfaces, solutions, about.h, style, run.camera), style, "solutions"
+        )
 
 
 def in_its_field(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
-    """A surface without the direction of a field that is zero, and without the remanence where no row has a field."""
+    """A surface without the direction of a field that is zero, and without the remanence where no
+    row has a field.
+    """
     if row["lambda_m"]:
         return surface
     none = {"Ba"} if any(each["lambda_m"] for each in rows) else {"Ba", "Br"}
-    return replace(surface, fields={name: values for name, values in surface.fields.items() if name not in none})
+    return replace(
+        surface,
+        fields={name: values for name, values in surface.fields.items() if name not in none},
+    )
 
 
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:
-    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied; see `draw`.
+    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied;
+    see `draw`.
 
     After a motion only it, at equal times.
 

@@ -20,8 +20,11 @@ SILENT = 1e-6  # of the largest reading: a component as small as this is zero
 MILLI = 1e3
 
 
-def readings_figure(rows: Sequence[Row], amplitude: str, case: Mapping[str, Any], style: OutputSection) -> "Figure":
-    """Draw the components that each sensor reads over the load of the last step; unstable parts are dashed.
+def readings_figure(
+    rows: Sequence[Row], amplitude: str, case: Mapping[str, Any], style: OutputSection
+) -> "Figure":
+    """Draw the components that each sensor reads over the load of the last step; unstable parts are
+    dashed.
 
     Parameters
     ----------
@@ -37,11 +40,18 @@ def readings_figure(rows: Sequence[Row], amplitude: str, case: Mapping[str, Any]
     def over_load(column: str) -> PlaceOf:
         return lambda row: (load.on_axis(row), size * float(row[column]))
 
-    largest = max(abs(float(row[f"{name}_B{axis}"])) for name in names for axis in "xyz" for row in part.rows)
+    largest = max(
+        abs(float(row[f"{name}_B{axis}"])) for name in names for axis in "xyz" for row in part.rows
+    )
     across = columns(min(len(names), MOST))
-    high, wide = -(-min(len(names), MOST) // across), (style.width or (ONE if across == 1 else SEVERAL)) / INCH
+    high, wide = (
+        -(-min(len(names), MOST) // across),
+        (style.width or (ONE if across == 1 else SEVERAL)) / INCH,
+    )
     with drawing(style):
-        figure = Figure(figsize=(wide, 0.75 * wide / across * high), dpi=style.dpi, layout="constrained")
+        figure = Figure(
+            figsize=(wide, 0.75 * wide / across * high), dpi=style.dpi, layout="constrained"
+        )
         grid = figure.subplots(high, across, squeeze=False).ravel()
         for axes, name in zip(grid, names, strict=False):
             for k, axis in enumerate("xyz"):

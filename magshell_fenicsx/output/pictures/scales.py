@@ -22,7 +22,8 @@ LETTERS = 3.2  # the same on a short bar, in heights of a letter
 
 @dataclass(frozen=True)
 class Scale:
-    """Limits of colours, a colour map (`SIGNED`, `NEAR` or one of matplotlib's; empty for none), and what they mean.
+    """Limits of colours, a colour map (`SIGNED`, `NEAR` or one of matplotlib's; empty for none),
+    and what they mean.
 
     `beyond`: whether values lie below and above the limits.
     """
@@ -36,8 +37,8 @@ class Scale:
 def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colormap":
     """A colour map between limits.
 
-    That of fields with a sign is white at zero and equally dark at equal distances from it: between zero and a positive
-    limit it is its red half.
+    That of fields with a sign is white at zero and equally dark at equal distances from it: between
+    zero and a positive limit it is its red half.
     """
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap, to_rgb
@@ -50,12 +51,17 @@ def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colorma
         return colormaps[name].resampled(COLOURS)
     at = 0.5 + np.linspace(*limits, COLOURS) / (2 * max(map(abs, limits)))
     colours = colormaps["RdBu_r"](at)[:, :3]
-    near = np.clip(1 - np.abs(at - 0.5) / 0.1, 0, 1)[:, None]  # the map's own middle is a light grey
-    return ListedColormap(np.minimum(colours + near * (1 - np.array(colormaps["RdBu_r"](0.5)[:3])), 1), name)
+    near = np.clip(1 - np.abs(at - 0.5) / 0.1, 0, 1)[
+        :, None
+    ]  # the map's own middle is a light grey
+    return ListedColormap(
+        np.minimum(colours + near * (1 - np.array(colormaps["RdBu_r"](0.5)[:3])), 1), name
+    )
 
 
 def from_zero(low: float, high: float, least: float = 0.01) -> tuple[float, float]:
-    """Limits of a field with a sign: its own and zero; what is below a part `least` of the other end is none.
+    """Limits of a field with a sign: its own and zero; what is below a part `least` of the other
+    end is none.
 
     Examples
     --------
@@ -84,8 +90,15 @@ def colour_bar(
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
 
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
-    reach = axes.get_position().width * figure.get_figwidth() * 72 / rcParams["font.size"]  # letters
+    extend = {
+        (True, True): "both",
+        (True, False): "min",
+        (False, True): "max",
+        (False, False): "neither",
+    }
+    reach = (
+        axes.get_position().width * figure.get_figwidth() * 72 / rcParams["font.size"]
+    )  # letters
     short = orientation == "horizontal" and reach < 16
     few, close = (3, max(CLOSE, LETTERS / reach)) if short else (5, CLOSE)
     low, high = of.limits
@@ -137,7 +150,9 @@ def number_format(limits: tuple[int, int] = (-3, 4)) -> "ScalarFormatter":
             power, offset = self.orderOfMagnitude, self.offset
             if not len(self.locs):
                 return ""
-            return (rf"$\times 10^{{{power}}}$" if power else "") + (f"{offset:+.10g}" if offset else "")
+            return (rf"$\times 10^{{{power}}}$" if power else "") + (
+                f"{offset:+.10g}" if offset else ""
+            )
 
     numbers = Numbers(useMathText=False)
     numbers.set_powerlimits(limits)

@@ -33,7 +33,10 @@ WIDE, TALL = 0.26, 0.34  # of a shell on a curve, over the axes
 GREY = 0.8
 DARK, RIM = 0.3, 0.8  # of the line around a shell, and how much of it is seen
 EACH_WAY, MARGIN = 9, 0.02  # places that are tried; the room around them, over the axes
-COVERED, MET = 12.0, 50.0  # how bad it is to cover all of the curve, or another shell, beside one width of the axes
+COVERED, MET = (
+    12.0,
+    50.0,
+)  # how bad it is to cover all of the curve, or another shell, beside one width of the axes
 
 
 def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Figure":
@@ -58,17 +61,23 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
         if axes_names[folder] != axes_names[next(iter(parts))]:
             over = " over ".join(reversed([q.name for q in axes_for(other)]))
             asked = " over ".join(reversed(axes_names[next(iter(parts))]))
-            raise CaseError(f"{folder}: its curve is {over}, that of {next(iter(parts))} {asked}: draw them alone")
+            raise CaseError(
+                f"{folder}: its curve is {over}, that of {next(iter(parts))} {asked}: draw them alone"
+            )
     cases = {folder: case_in(folder) for folder in parts}
     width = (style.width or ONE) / INCH
     with drawing(style):
         figure = Figure(figsize=(width, 0.8 * width), dpi=style.dpi, layout="constrained")
         axes = figure.subplots()
         for i, (name, part) in enumerate(zip(labels(cases), parts.values(), strict=True)):
-            draw_lines(axes, part, f"C{i % 10 if i % 10 < 3 else i % 10 + 1}")  # C3 is that of the marks
+            draw_lines(
+                axes, part, f"C{i % 10 if i % 10 < 3 else i % 10 + 1}"
+            )  # C3 is that of the marks
             axes.plot([], [], color=f"C{i % 10 if i % 10 < 3 else i % 10 + 1}", lw=1.2, label=name)
         pole = pole_of(next(iter(cases.values())))
-        x_label, y_label = (named(each, first.rows[0], pole, r"\$").label for each in axes_for(first))
+        x_label, y_label = (
+            named(each, first.rows[0], pole, r"\$").label for each in axes_for(first)
+        )
         axes.set(xlabel=x_label, ylabel=y_label)
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(number_format())
@@ -125,22 +134,35 @@ def _said(value: Any) -> str:
 
 
 def add_shapes(
-    figure: "Figure", parts: Sequence[Part], shapes: Sequence[tuple[Row, Surface]], style: OutputSection, camera: Camera
+    figure: "Figure",
+    parts: Sequence[Part],
+    shapes: Sequence[tuple[Row, Surface]],
+    style: OutputSection,
+    camera: Camera,
 ) -> None:
-    """Put the shell at some points on the curves of a figure, each where it covers least, with a line to its point.
+    """Put the shell at some points on the curves of a figure, each where it covers least, with a
+    line to its point.
 
     All have one scale; displacements that would not be seen are drawn larger, which the title says.
     """
     from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
-    on = [next((i for i in range(len(parts) - 1, -1, -1) if row in parts[i].rows), None) for row, _ in shapes]
+    on = [
+        next((i for i in range(len(parts) - 1, -1, -1) if row in parts[i].rows), None)
+        for row, _ in shapes
+    ]
     factor = magnification([surface for _, surface in shapes])
     moved = [replace(surface, u=factor * surface.u) for _, surface in shapes]
     for drawn_on in dict.fromkeys(i for i in on if i is not None) if factor > 1 else ():
-        before = f"{figure.axes[drawn_on].get_title()}; " if figure.axes[drawn_on].get_title() else ""
+        before = (
+            f"{figure.axes[drawn_on].get_title()}; " if figure.axes[drawn_on].get_title() else ""
+        )
         figure.axes[drawn_on].set_title(rf"{before}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()
-    everything, taken = camera(np.concatenate([s.r0 + s.u for s in moved])), dict[int, list[Array]]()
+    everything, taken = (
+        camera(np.concatenate([s.r0 + s.u for s in moved])),
+        dict[int, list[Array]](),
+    )
     for number, (row, _), surface in zip(on, shapes, moved, strict=True):
         if number is None:
             continue
@@ -148,12 +170,20 @@ def add_shapes(
         box = axes.get_window_extent()
         tall = Window.around(everything, 1000).shape[0] / 1000
         width = max(int(min(WIDE * box.width, TALL * box.height / tall)), 8)
-        image = _drawn(Background(surface, camera, width, Window.around(everything, width)).plain(GREY))
+        image = _drawn(
+            Background(surface, camera, width, Window.around(everything, width)).plain(GREY)
+        )
         size = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         at = np.array(place(row, parts[number].amplitude))
         corner = _free(axes, at, size, taken.setdefault(number, []))
         taken[number].append(np.array([corner, corner + size]))
-        line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": MARK / 2}
+        line = {
+            "arrowstyle": "-",
+            "color": "0.5",
+            "linewidth": 0.6,
+            "shrinkA": 0,
+            "shrinkB": MARK / 2,
+        }
         end = _nearest(axes, image, at, corner, size)
         begin, (x, y) = (float(at[0]), float(at[1])), corner + size / 2
         axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line, zorder=3)
@@ -174,10 +204,14 @@ def _drawn(image: Image) -> Image:
     return lined[rows[0] : rows[-1] + 1, across[0] : across[-1] + 1]
 
 
-def _nearest(axes: "Axes", image: Image, at: Array, corner: Array, size: Array) -> tuple[float, float]:
+def _nearest(
+    axes: "Axes", image: Image, at: Array, corner: Array, size: Array
+) -> tuple[float, float]:
     """Where in the axes an image at a corner is nearest to a point of the data."""
     down, right = np.nonzero(image[..., 3] > 127)
-    inside = corner + size * np.column_stack([(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]])
+    inside = corner + size * np.column_stack(
+        [(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]]
+    )
     box = axes.get_window_extent()
     target = axes.transAxes.inverted().transform(axes.transData.transform(at))
     x, y = inside[np.linalg.norm((inside - target) * [box.width, box.height], axis=1).argmin()]
@@ -185,7 +219,9 @@ def _nearest(axes: "Axes", image: Image, at: Array, corner: Array, size: Array) 
 
 
 def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array:
-    """The lower left corner of a box, in parts of the axes, that covers little and is near its point."""
+    """The lower left corner of a box, in parts of the axes, that covers little and is near its
+    point.
+    """
     inside = axes.transAxes.inverted().transform
     points = inside(axes.transData.transform(drawn_points(axes)))
     target = inside(axes.transData.transform(at))
@@ -193,7 +229,10 @@ def _free(axes: "Axes", at: Array, size: Array, taken: Sequence[Array]) -> Array
     def fault(low: Array) -> float:
         high = low + size
         covered = ((points > low) & (points < high)).all(axis=1).mean()
-        met = sum(float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None))) for a, b in taken)
+        met = sum(
+            float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None)))
+            for a, b in taken
+        )
         return float(COVERED * covered + MET * met + np.linalg.norm(low + size / 2 - target))
 
     along = (np.linspace(MARGIN, max(1 - MARGIN - part, MARGIN), EACH_WAY) for part in size)

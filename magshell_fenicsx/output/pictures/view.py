@@ -1,4 +1,6 @@
-"""What is seen of a surface: a parallel projection, the triangle in front at each pixel, colours, shade."""
+"""What is seen of a surface: a parallel projection, the triangle in front at each pixel, colours,
+shade.
+"""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -37,7 +39,9 @@ AROUND = 0.02  # margin around what is drawn, over its largest side
 
 @dataclass(frozen=True)
 class Camera:
-    """A parallel projection along a direction (3,), from the shell to the eye; e3 is up on the picture."""
+    """A parallel projection along a direction (3,), from the shell to the eye; e3 is up on the
+    picture.
+    """
 
     direction: Array
 
@@ -69,13 +73,17 @@ class Window:
 
     @staticmethod
     def around(places: Array, width: int, tallest: float = 1.3) -> "Window":
-        """The window, so many pixels wide, in which all projected places (n, 2 or 3) are; at most so tall over wide."""
+        """The window, so many pixels wide, in which all projected places (n, 2 or 3) are; at most
+        so tall over wide.
+        """
         low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
         margin = AROUND * max(high - low)
         low, high = low - margin, high + margin
         wide, tall = high - low
         spare = max(tall / tallest - wide, 0.0) / 2
-        return Window((low[0] - spare, high[0] + spare, low[1], high[1]), width / (wide + 2 * spare))
+        return Window(
+            (low[0] - spare, high[0] + spare, low[1], high[1]), width / (wide + 2 * spare)
+        )
 
 
 class InView:
@@ -93,22 +101,35 @@ class InView:
         left, _, _, high = window.box
         scale = FINER * window.scale
         places = camera(pieces.at(r))
-        places[:, 0], places[:, 1] = (places[:, 0] - left) * scale - 0.5, (high - places[:, 1]) * scale - 0.5
+        places[:, 0], places[:, 1] = (
+            (places[:, 0] - left) * scale - 0.5,
+            (high - places[:, 1]) * scale - 0.5,
+        )
         self._index = np.empty((height, width), np.int32)
         self._depth = np.empty((height, width), np.float32)
         self._places, self._r = np.ascontiguousarray(places), r
-        corners, pixels = _pointers(self._places, pieces.triangles), _pointers(self._index, self._depth)
+        corners, pixels = (
+            _pointers(self._places, pieces.triangles),
+            _pointers(self._index, self._depth),
+        )
         library()[1].rasterise(*corners, len(pieces.triangles), width, height, *pixels)
 
     @cached_property
     def _lit(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """At points the cosines between normals and the ways to the eye and to the lamp, and the cosine of full light.
+        """At points the cosines between normals and the ways to the eye and to the lamp, and the
+        cosine of full light.
 
-        Full light has what faces the eye. If nothing faces the lamp as well as that, what faces it best has full light:
-        so a plate that is turned away from the lamp has the colours of the bar too.
+        Full light has what faces the eye. If nothing faces the lamp as well as that, what faces it
+        best has full light: so a plate that is turned away from the lamp has the colours of the bar
+        too.
         """
-        normals, lamp = self.camera(self._pieces.normals(self._r)), np.array(LAMP) / np.linalg.norm(LAMP)
-        eye, to_lamp = (np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp))
+        normals, lamp = (
+            self.camera(self._pieces.normals(self._r)),
+            np.array(LAMP) / np.linalg.norm(LAMP),
+        )
+        eye, to_lamp = (
+            np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp)
+        )
         best = float(np.where(eye < 0, -to_lamp, to_lamp).max(initial=-1.0))
         return eye, to_lamp, min(float(lamp[2]), best)
 
@@ -123,25 +144,40 @@ class InView:
 
     @property
     def depth(self) -> NDArray[np.float32]:
-        """Of what is in front, towards the eye, at FINER drawn pixels for each; -inf where the surface is not."""
+        """Of what is in front, towards the eye, at FINER drawn pixels for each; -inf where the
+        surface is not.
+        """
         return self._depth
 
     def depth_around(self, places: Array) -> Array:
         """The largest depth (n,) of what is drawn at or next to places (n, 2) of the projection."""
         left, _, _, high = self.window.box
         height, width = self._depth.shape
-        x, y = (np.nan_to_num((places - [left, high]) * [1, -1]) * FINER * self.window.scale).astype(int).T
-        around = [(np.clip(y + j, 0, height - 1), np.clip(x + i, 0, width - 1)) for i in NEXT for j in NEXT]
+        x, y = (
+            (np.nan_to_num((places - [left, high]) * [1, -1]) * FINER * self.window.scale)
+            .astype(int)
+            .T
+        )
+        around = [
+            (np.clip(y + j, 0, height - 1), np.clip(x + i, 0, width - 1))
+            for i in NEXT
+            for j in NEXT
+        ]
         return np.asarray(np.max([self._depth[at] for at in around], axis=0), np.float64)
 
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
-        """The image (height, width, 4) of values (n,) at nodes, grey where they are nan; transparent around."""
+        """The image (height, width, 4) of values (n,) at nodes, grey where they are nan;
+        transparent around.
+        """
         table, at = colours(np.arange(colours.N))[:, :3], self._pieces.at(values)
         nowhere = np.isnan(at)
         image = self.painted(np.where(nowhere, limits[0], at), limits, table)
         if not nowhere.any():
             return image
-        bright = self.painted(nowhere * 1.0, (0.0, 1.0), np.repeat([[0.0], [1.0]], 3, axis=1))[..., :1] > NONE_HERE
+        bright = (
+            self.painted(nowhere * 1.0, (0.0, 1.0), np.repeat([[0.0], [1.0]], 3, axis=1))[..., :1]
+            > NONE_HERE
+        )
         return np.where(bright, self.plain(NO_VALUE), image)
 
     def plain(self, grey: float) -> Image:
@@ -188,7 +224,12 @@ def library() -> tuple[Any, Any]:
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
-    kinds = {"float64": "double[]", "float32": "float[]", "int32": "int32_t[]", "uint8": "uint8_t[]"}
+    kinds = {
+        "float64": "double[]",
+        "float32": "float[]",
+        "int32": "int32_t[]",
+        "uint8": "uint8_t[]",
+    }
     return [library()[0].from_buffer(kinds[array.dtype.name], array) for array in arrays]
 
 
@@ -206,11 +247,15 @@ def run_camera(surface: Surface, style: OutputSection) -> Camera:
     if style.camera is None:
         return _best(surface, deflected_place(surface))
     polar, azimuth = np.radians([style.camera.polar, style.camera.azimuth])
-    return Camera(np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]))
+    return Camera(
+        np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    )
 
 
 def _best(surface: Surface, place: Array) -> Camera:
-    """The camera from which a place is visible; beside sources or bodies turned to where the shell fills more."""
+    """The camera from which a place is visible; beside sources or bodies turned to where the shell
+    fills more.
+    """
     usual, near = Camera(towards(place)), near_outlines(surface)
     if not near:
         return usual
@@ -219,22 +264,31 @@ def _best(surface: Surface, place: Array) -> Camera:
 
     def size(camera: Camera) -> float:
         """The part of the picture that the shell covers."""
-        (a, b, c), box = np.moveaxis(camera(corners)[..., :2], 1, 0), Window.around(camera(everything), 1).box
+        (a, b, c), box = (
+            np.moveaxis(camera(corners)[..., :2], 1, 0),
+            Window.around(camera(everything), 1).box,
+        )
         x, y = np.moveaxis(np.stack([b - a, c - a]), -1, 0)
-        return float(np.abs(x[0] * y[1] - x[1] * y[0]).sum() / 2 / ((box[1] - box[0]) * (box[3] - box[2])))
+        return float(
+            np.abs(x[0] * y[1] - x[1] * y[0]).sum() / 2 / ((box[1] - box[0]) * (box[3] - box[2]))
+        )
 
     best = max((Camera(towards(place, aside)) for aside in ASIDE), key=size)
     return best if size(best) > LARGER * size(usual) else usual
 
 
 def towards(place: Array, aside: float = -0.5) -> Array:
-    """A camera direction (3,) from which a point (3,) of a shell is visible: from above and from the side."""
+    """A camera direction (3,) from which a point (3,) of a shell is visible: from above and from
+    the side.
+    """
     heading = (np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -0.5) + aside
     return np.array([4.2 * np.cos(heading), 4.2 * np.sin(heading), 2.75])
 
 
 def deflected_place(surface: Surface) -> Array:
-    """The middle (3,) of where the normal displacement is largest: of a ring its axis, whatever node is ahead."""
+    """The middle (3,) of where the normal displacement is largest: of a ring its axis, whatever
+    node is ahead.
+    """
     size = np.abs(surface.w)
     return np.asarray(surface.r0[size >= ALIKE * size.max()].mean(axis=0))
 
@@ -251,8 +305,14 @@ def near_outlines(surface: Surface) -> tuple[Array, ...]:
     r = surface.r0 + surface.u
     middle, reach = r.mean(axis=0), FAR * float(np.ptp(r, axis=0).max())
     whole = _joined(surface.outlines, SAME * reach)
-    far = {number for line, number in zip(surface.outlines, whole, strict=True) if _farthest(line, middle) > reach}
-    return tuple(line for line, number in zip(surface.outlines, whole, strict=True) if number not in far)
+    far = {
+        number
+        for line, number in zip(surface.outlines, whole, strict=True)
+        if _farthest(line, middle) > reach
+    }
+    return tuple(
+        line for line, number in zip(surface.outlines, whole, strict=True) if number not in far
+    )
 
 
 def near_solids(surface: Surface) -> tuple[Solid, ...]:

@@ -1,4 +1,5 @@
-"""The part of a report to play with: the deformed shell to turn, a slider along the path, the curve linked to it.
+"""The part of a report to play with: the deformed shell to turn, a slider along the path, the curve
+linked to it.
 
 All data stand in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
 """
@@ -21,7 +22,15 @@ from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
 from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellated
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
-from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named, of_load
+from magshell_fenicsx.output.pictures.lines import (
+    Part,
+    axes_for,
+    drawn_parts,
+    is_unstable,
+    lines_of,
+    named,
+    of_load,
+)
 from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, from_zero
 from magshell_fenicsx.output.pictures.view import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
@@ -56,7 +65,9 @@ class Thinned:
 
 
 def thinned(surface: Surface, most: int) -> Thinned:
-    """The surface in at most about `most` vertices; where there are more, those within a small cube become one."""
+    """The surface in at most about `most` vertices; where there are more, those within a small cube
+    become one.
+    """
     pieces = tessellated(surface, MOST)
     r, size = pieces.at(surface.r0), SAME
     kept, triangles = _joined(r, pieces.triangles, size)
@@ -65,17 +76,32 @@ def thinned(surface: Surface, most: int) -> Thinned:
         kept, triangles = _joined(r, pieces.triangles, size)
         size *= 1.3
     outwards, corners = pieces.at(surface.n0)[kept][triangles].sum(axis=1), r[kept][triangles]
-    turned = np.einsum("ij,ij->i", np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), outwards) < 0
+    turned = (
+        np.einsum(
+            "ij,ij->i", np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), outwards
+        )
+        < 0
+    )
     triangles[turned] = triangles[turned][:, ::-1]  # the image of a half has the other orientation
     return Thinned(pieces, kept, triangles)
 
 
-def _joined(r: Array, triangles: NDArray[np.int32], size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _joined(
+    r: Array, triangles: NDArray[np.int32], size: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
-    key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2] if size > 1e-5 else _exact(cubes)
+    key = (
+        (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
+        if size > 1e-5
+        else _exact(cubes)
+    )
     _, kept, number = np.unique(key, return_index=True, return_inverse=True)
     corners = number[triangles]
-    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    whole = (
+        (corners[:, 0] != corners[:, 1])
+        & (corners[:, 1] != corners[:, 2])
+        & (corners[:, 2] != corners[:, 0])
+    )
     return kept, corners[whole]
 
 
@@ -113,7 +139,11 @@ class Interactive:
 def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
     """The data of a run's folder; None without fields of two points, or without Plotly."""
     fields = folder / "fields"
-    rows = [row for row in read_rows(folder / "path.csv") if (fields / point_file(int(row["point"]))).exists()]
+    rows = [
+        row
+        for row in read_rows(folder / "path.csv")
+        if (fields / point_file(int(row["point"]))).exists()
+    ]
     if len(rows) < 2 or (library := plotly()) is None:
         return None
     last = next(row for row in reversed(rows) if row["label"] != SOLUTION)
@@ -130,7 +160,9 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
         "h": about.h,
         "camera": run_camera(surface, style_of(case)).direction.tolist(),
         "r0": packed.add(mesh.at(surface.r0), np.uint16),
-        "triangles": packed.raw(mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)),
+        "triangles": packed.raw(
+            mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)
+        ),
         "u": [packed.add(mesh.at(s.u), np.int16) for s in shells],
         "lines": [[np.round(line, 4).tolist() for line in near_outlines(s)] for s in shells],
         "solids": [[_solid(solid, packed) for solid in near_solids(s)] for s in shells],
@@ -145,11 +177,17 @@ def _solid(solid: Solid, packed: "_Packed") -> dict[str, Any]:
     """The faces of a body or a magnet; the sign of its poles at its corners."""
     poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
     triangles = packed.raw(solid.triangles.astype(np.uint16))
-    return {"name": solid.name, "r": packed.add(solid.points, np.uint16), "triangles": triangles, "poles": poles}
+    return {
+        "name": solid.name,
+        "r": packed.add(solid.points, np.uint16),
+        "triangles": triangles,
+        "poles": poles,
+    }
 
 
 def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
-    """At most about so many rows of a path, besides the first, the last, and instabilities and solutions.
+    """At most about so many rows of a path, besides the first, the last, and instabilities and
+    solutions.
 
     Between them the shape changes about equally: a snap has as many as the slow part before it.
     """
@@ -157,15 +195,22 @@ def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
     others = [row for row in rows if row not in special]
     count = min(len(others), max(most - len(special), 2))
     way = _way(others)
-    even = {int(np.abs(way - at).argmin()) for at in np.linspace(0, way[-1], count)} | {0, len(others) - 1}
+    even = {int(np.abs(way - at).argmin()) for at in np.linspace(0, way[-1], count)} | {
+        0,
+        len(others) - 1,
+    }
     left = [i for i in range(len(others)) if i not in even]
     more = count - len(even)
-    even |= {left[round(i * (len(left) - 1) / max(more - 1, 1))] for i in range(min(more, len(left)))}
+    even |= {
+        left[round(i * (len(left) - 1) / max(more - 1, 1))] for i in range(min(more, len(left)))
+    }
     return sorted([*special, *(others[i] for i in even)], key=lambda row: int(row["point"]))
 
 
 def _way(rows: Sequence[Row]) -> Array:
-    """How far the shape has changed until each row: of all displacements over their range, and half of it per point."""
+    """How far the shape has changed until each row: of all displacements over their range, and half
+    of it per point.
+    """
     moved = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
     values = np.array([[float(row[name]) for name in moved] for row in rows]).reshape(len(rows), -1)
     ranges = np.ptp(values, axis=0)
@@ -176,7 +221,9 @@ def _way(rows: Sequence[Row]) -> Array:
 
 def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     """The numbers of path.csv that vary, names of columns, and the lines of the curve of each step."""
-    varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
+    varied = next(
+        (str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), ""
+    )
     parts = _parts(rows, varied) if varied else []
     quantities = _quantities(rows[0])
     first = list[str]()
@@ -238,7 +285,9 @@ def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _parts(rows: Sequence[Row], varied: str) -> list[Part]:
-    """The steps of a curve as in curve.png, after those that it leaves out, such as the field before the loads."""
+    """The steps of a curve as in curve.png, after those that it leaves out, such as the field
+    before the loads.
+    """
     drawn = drawn_parts(rows, varied)
     among = {int(row["point"]) for part in drawn for row in part.rows}
     before = [row for row in rows if int(row["point"]) not in among]
@@ -247,7 +296,9 @@ def _parts(rows: Sequence[Row], varied: str) -> list[Part]:
     for name in names:
         own = [row for row in before if row["amplitude"] == name]
         first = max(rows.index(own[0]) - 1, 0)
-        others.append(Part(name, [*rows[first : first + 1], *own] if rows[first] is not own[0] else own))
+        others.append(
+            Part(name, [*rows[first : first + 1], *own] if rows[first] is not own[0] else own)
+        )
     return [part for part in (*others, *drawn) if len(part.rows) > 1]
 
 
@@ -257,11 +308,19 @@ def label(of_axis: Quantity, row: Row, pole: str) -> str:
     words = f"{at_point.words} {at_point.note}".strip()
     unit = f" ({at_point.shown_unit})" if at_point.shown_unit else ""
     minus = "−" if at_point.sign < 0 else ""
-    return str(Markup("{}{}{}").format(words, Markup(f" {minus}{at_point.html}") if at_point.symbol else "", unit))
+    return str(
+        Markup("{}{}{}").format(
+            words, Markup(f" {minus}{at_point.html}") if at_point.symbol else "", unit
+        )
+    )
 
 
-def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed") -> list[dict[str, Any]]:
-    """Every scalar and every length of a vector, with the colours of the pictures and the limits of the whole path."""
+def _fields(
+    shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed"
+) -> list[dict[str, Any]]:
+    """Every scalar and every length of a vector, with the colours of the pictures and the limits of
+    the whole path.
+    """
     fields = []
     for name, caption in SCALARS.items():
         values = [_values(shell, name, h) for shell in shells]
@@ -278,12 +337,23 @@ def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed
             low, high = from_zero(low, high)
             colours = _stops(SIGNED, (low, high))
         if name == SHELL:
-            caption = f"{caption}: {', '.join(f'{i} {each}' for i, each in enumerate(shells[0].shells))}"
+            caption = (
+                f"{caption}: {', '.join(f'{i} {each}' for i, each in enumerate(shells[0].shells))}"
+            )
         parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in present]
         steps = [np.rint(255 * part).astype(np.uint8) for part in parts]
         still = all((step == steps[0]).all() for step in steps)
         places = [packed.raw(step) for step in (steps[:1] if still else steps)]
-        fields.append({"name": name, "label": caption, "low": low, "high": high, "colours": colours, "at": places})
+        fields.append(
+            {
+                "name": name,
+                "label": caption,
+                "low": low,
+                "high": high,
+                "colours": colours,
+                "at": places,
+            }
+        )
     return fields
 
 

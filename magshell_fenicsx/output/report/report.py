@@ -78,18 +78,26 @@ def write_report(folder: Path, *, playable: bool = True) -> None:
     Raises
     ------
     OSError
-        If summary.json or path.csv is missing, or the report cannot be written; an older report stays unchanged.
+        If summary.json or path.csv is missing, or the report cannot be written; an older report
+        stays unchanged.
     """
     write_whole(folder / NAME, report(folder, playable=playable).encode())
 
 
 def report(folder: Path, *, playable: bool = True) -> str:
     """The content of report.html."""
-    from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined  # takes long to import
+    from jinja2 import (
+        BytecodeCache,
+        Environment,
+        FileSystemLoader,
+        StrictUndefined,
+    )  # takes long to import
     from jinja2.bccache import Bucket
 
     class Compiled(BytecodeCache):
-        """Python's code of the template; Jinja checks that it is that of the file and of this Python."""
+        """Python's code of the template; Jinja checks that it is that of the file and of this
+        Python.
+        """
 
         def load_bytecode(self, bucket: Bucket) -> None:
             if code := recall(f"template_{bucket.key}"):
@@ -113,16 +121,24 @@ def report(folder: Path, *, playable: bool = True) -> str:
 def _content(folder: Path, playable: bool) -> dict[str, Any]:
     """The values of the template."""
     summary, lines = read_run(folder)
-    played = interactive(folder, summary["case"]) if playable else None  # it moves in place of the animation
+    played = (
+        interactive(folder, summary["case"]) if playable else None
+    )  # it moves in place of the animation
     classical = not is_flat(summary["case"]) or any(float(line["p_over_pc"]) for line in lines)
-    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"]))
+    path = path_table(
+        lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"])
+    )
     return {
         "name": folder.resolve().name,
         "summary": summary,
         "verdict": verdict(summary, lines),
         "groups": _groups(summary, classical),
         "dimensions": _dimensions(summary, classical),
-        "pictures": list(_pictures(folder, _shown(summary["case"], read_rows(folder / "path.csv")), played is None)),
+        "pictures": list(
+            _pictures(
+                folder, _shown(summary["case"], read_rows(folder / "path.csv")), played is None
+            )
+        ),
         "interactive": played,
         "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
@@ -130,8 +146,12 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
-        "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column) if summary["sensitivities"] else "",
-        "gradients": [row for of, it in summary.get("gradients", {}).items() for row in _gradients(of, it)],
+        "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column)
+        if summary["sensitivities"]
+        else "",
+        "gradients": [
+            row for of, it in summary.get("gradients", {}).items() for row in _gradients(of, it)
+        ],
         "how_to_estimate": _how_to_estimate(summary["case"]),
         "path": path,
         "rows": list(zip(*(column.cells for column in path), strict=True)),
@@ -152,7 +172,9 @@ def _head(name: str, line: Line) -> Markup:
 
 
 def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
-    """Name and value of the numbers without units; `classical`: whether p_c says something of the run."""
+    """Name and value of the numbers without units; `classical`: whether p_c says something of the
+    run.
+    """
     of, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
@@ -172,13 +194,20 @@ def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
 
 def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup, str]]:
     """Name, value and unit of the quantities that the case gives with units."""
-    dims, magnetic, measured = summary["dimensions"], summary["case"].get("magnetic") or {}, summary.get("in_units", {})
+    dims, magnetic, measured = (
+        summary["dimensions"],
+        summary["case"].get("magnetic") or {},
+        summary.get("in_units", {}),
+    )
     named = {
         "radius R": (dims["radius"], "m"),
         "thickness h": (dims["thickness"], "m"),
         "Young’s modulus E": (dims["youngs_modulus"], "Pa"),
         "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
-        "classical pressure p<sub>c</sub>": (measured.get("classical_pressure_Pa") if classical else None, "Pa"),
+        "classical pressure p<sub>c</sub>": (
+            measured.get("classical_pressure_Pa") if classical else None,
+            "Pa",
+        ),
         "unit of the force, 2πD/R": (measured.get("unit_force_N"), "N"),
         "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
         "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),
@@ -199,12 +228,18 @@ def _shown(case: dict[str, Any], rows: Sequence[Row]) -> str:
 
 def _pictures(folder: Path, shown_at: str, moving: bool) -> Iterator[tuple[str, str, bool]]:
     """Source and caption of each picture in the folder, and whether it is shown small."""
-    beside = all(_narrow((folder / name).read_bytes()) for name in SMALL if (folder / name).exists())
+    beside = all(
+        _narrow((folder / name).read_bytes()) for name in SMALL if (folder / name).exists()
+    )
     for pattern, told in PICTURES.items():
         caption = told.replace("the last point", shown_at)
         for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
             content = base64.b64encode(light(file.read_bytes())).decode()
-            yield f"data:image/{file.suffix[1:]};base64,{content}", caption, beside and pattern in SMALL
+            yield (
+                f"data:image/{file.suffix[1:]};base64,{content}",
+                caption,
+                beside and pattern in SMALL,
+            )
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
@@ -222,11 +257,22 @@ def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[st
 def _solution(it: dict[str, Any]) -> list[Markup | str]:
     names = (shown(name, it).name for name in SOLUTION_COLUMNS)
     numbers = (number(it[name]) for name in names)
-    return [f"{it['point']}", f"{it['solution']}", stability(it), *numbers, number(it["residual"], 2)]
+    return [
+        f"{it['point']}",
+        f"{it['solution']}",
+        stability(it),
+        *numbers,
+        number(it["residual"], 2),
+    ]
 
 
 def _frequency(it: Frequency) -> list[Markup | str]:
-    return [f"{it.point}", it.wave or "–", number(it.omega2), "–" if isnan(it.hertz) else number(it.hertz)]
+    return [
+        f"{it.point}",
+        it.wave or "–",
+        number(it.omega2),
+        "–" if isnan(it.hertz) else number(it.hertz),
+    ]
 
 
 def _gradients(of: str, it: dict[str, Any]) -> Iterator[list[Markup | str]]:
@@ -246,7 +292,11 @@ def _how_to_estimate(case: dict[str, Any]) -> str:
         return "mesh.tolerance was ignored because this run has no scalar result; the default mesh was used"
     if case["model"] == "shell" and shell_of(case)["geometry"] in ADAPTED:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
-    finer = "mesh.degree one higher" if shell_of(case)["geometry"] == "mesh" else "mesh.refinement twice as large"
+    finer = (
+        "mesh.degree one higher"
+        if shell_of(case)["geometry"] == "mesh"
+        else "mesh.refinement twice as large"
+    )
     return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"
 
 
@@ -291,7 +341,9 @@ def _narrow(content: bytes) -> bool:
 
 
 def light(content: bytes) -> bytes:
-    """A PNG file as it is, or if it is large with the page's width, in all its colours; other files as they are."""
+    """A PNG file as it is, or if it is large with the page's width, in all its colours; other files
+    as they are.
+    """
     if len(content) < LARGE or not content.startswith(b"\x89PNG"):
         return content
     from PIL import Image

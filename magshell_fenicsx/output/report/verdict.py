@@ -1,4 +1,6 @@
-"""The result of a run for its report: one sentence, and the path as a table of the columns that vary."""
+"""The result of a run for its report: one sentence, and the path as a table of the columns that
+vary.
+"""
 
 import math
 import re
@@ -17,13 +19,18 @@ from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_l
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, quantity, shown
 
-ROUNDING = 1e-15, 1e-9  # displacements and forces as small as this, in any unit or over their largest, are zero
+ROUNDING = (
+    1e-15,
+    1e-9,
+)  # displacements and forces as small as this, in any unit or over their largest, are zero
 LEAST, MOST = 1e-3, 1e6  # magnitudes between them are written without a power of ten
 DIGITS = 6
 LEAST_BEYOND = 0.1  # per cent of an overshoot
 Summary = Mapping[str, Any]
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
-NEAR_POLE = 5.0  # degrees: a dimple at the pole is deepest on a ring as small as this, at no azimuth
+NEAR_POLE = (
+    5.0  # degrees: a dimple at the pole is deepest on a ring as small as this, at no azimuth
+)
 
 
 def number(value: float, digits: int = DIGITS) -> Markup:
@@ -68,9 +75,15 @@ def column(values: Sequence[float], beside: Sequence[float] = ()) -> tuple[int, 
     exponent = 0 if LEAST <= largest < MOST or not largest else order
     texts = [f"{v / 10.0**exponent:.{max(0, DIGITS - 1 - order + exponent)}f}" for v in values]
     if largest and "." in texts[0]:
-        spare = min(len(t) - len(t.rstrip("0")) for t, v in zip(texts, values, strict=True) if math.isfinite(v))
+        spare = min(
+            len(t) - len(t.rstrip("0"))
+            for t, v in zip(texts, values, strict=True)
+            if math.isfinite(v)
+        )
         texts = [t[: len(t) - spare].rstrip(".") for t in texts]
-    return exponent, [_signed(t) if math.isfinite(v) else Markup("") for t, v in zip(texts, values, strict=True)]
+    return exponent, [
+        _signed(t) if math.isfinite(v) else Markup("") for t, v in zip(texts, values, strict=True)
+    ]
 
 
 def power(exponent: int) -> Markup:
@@ -109,7 +122,9 @@ class Column:
 
 
 def symbol(name: str) -> Markup:
-    """The heading of a column of numbers; a named point or a user-defined amplitude has its own name."""
+    """The heading of a column of numbers; a named point or a user-defined amplitude has its own
+    name.
+    """
     return head(quantity(name))
 
 
@@ -120,11 +135,14 @@ def head(of_column: Quantity) -> Markup:
 
 def pole_head(line: Line, pole: str = POLE) -> Markup:
     """The heading of w_pole_over_h, with the point that it belongs to."""
-    return Markup("{}, {}").format(head(shown("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the "))
+    return Markup("{}, {}").format(
+        head(shown("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the ")
+    )
 
 
 def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> list[Column]:
-    """The columns that vary, in the order of interest; a displacement equal to an earlier one is left out.
+    """The columns that vary, in the order of interest; a displacement equal to an earlier one is
+    left out.
 
     What is in the case's units is shown in these alone.
 
@@ -136,13 +154,17 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
         Name of the point of w_pole_over_h.
     """
     first_line = lines[0] if lines else {}
-    in_units = {of_column.name for name in first_line if (of_column := shown(name, first_line)).name != name}
+    in_units = {
+        of_column.name for name in first_line if (of_column := shown(name, first_line)).name != name
+    }
     names = [name for name in first_line if name != "point" and name not in in_units]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
     varying: dict[str, list[str]] = {}
     for name in order:
         values = [line.get(name, "") for line in lines]
-        again = name.startswith("w_") and any(_same(values, other) for key, other in varying.items() if key[:2] == "w_")
+        again = name.startswith("w_") and any(
+            _same(values, other) for key, other in varying.items() if key[:2] == "w_"
+        )
         if name in ("point", "label") or (len(set(values)) > 1 and not again):
             varying[name] = values
     energies = _energies(lines, [name for name in varying if quantity(name).kind == "energy"])
@@ -150,7 +172,9 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     for name in varying:
         of_column = shown(name, first_line)
         of_all = energies if of_column.kind == "energy" else ()
-        table[name] = _column(of_column, [line.get(of_column.name, "") for line in lines], length_unit, of_all)
+        table[name] = _column(
+            of_column, [line.get(of_column.name, "") for line in lines], length_unit, of_all
+        )
     if at_pole := table.get("w_pole_over_h"):
         table["w_pole_over_h"] = replace(at_pole, head=pole_head(lines[0], pole))
     return list(table.values())
@@ -161,26 +185,41 @@ def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
     return [float(line[shown(name, line).name]) for line in lines for name in names]
 
 
-def _column(of_column: Quantity, values: Sequence[str], length_unit: str, beside: Sequence[float] = ()) -> Column:
+def _column(
+    of_column: Quantity, values: Sequence[str], length_unit: str, beside: Sequence[float] = ()
+) -> Column:
     """A column; `beside` are the numbers of others with the same power of ten."""
     if of_column.kind == "text":
         varied = (
-            [quantity(amplitude(value).column).words for value in values] if of_column.name == "amplitude" else values
+            [quantity(amplitude(value).column).words for value in values]
+            if of_column.name == "amplitude"
+            else values
         )
         return Column(head(of_column), Markup(), varied, numeric=False)
     if of_column.kind == "count":
         return Column(head(of_column), Markup(), values)
     exponent, cells = column([float(value) for value in values], beside)
     size = power(exponent) if exponent else Markup()
-    title = Markup("{} {}").format(head(of_column), of_column.note) if of_column.note else head(of_column)
-    in_case = {"place": "m", "reaction": "N", "moment": "N m"}  # of a path.csv without columns in units
+    title = (
+        Markup("{} {}").format(head(of_column), of_column.note)
+        if of_column.note
+        else head(of_column)
+    )
+    in_case = {
+        "place": "m",
+        "reaction": "N",
+        "moment": "N m",
+    }  # of a path.csv without columns in units
     unit = of_column.shown_unit or (in_case.get(of_column.kind, "") if length_unit else "")
     return Column(title, Markup("{} {}").format(size, unit), cells)
 
 
 def _same(values: Sequence[str], others: Sequence[str]) -> bool:
     """Whether two columns have equal numbers, up to rounding."""
-    return all(isclose(float(a), float(b), rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(values, others, strict=True))
+    return all(
+        isclose(float(a), float(b), rel_tol=1e-9, abs_tol=1e-9)
+        for a, b in zip(values, others, strict=True)
+    )
 
 
 def located(lines: Sequence[Line]) -> list[Line]:
@@ -202,16 +241,23 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         stable = sum(it["stable"] for it in solutions)
         more = "further solution" + "s" * (len(solutions) != 1)
         sentences.append(
-            Markup("A search has found {} {}, {} of them stable.").format(len(solutions), more, stable or "none")
+            Markup("A search has found {} {}, {} of them stable.").format(
+                len(solutions), more, stable or "none"
+            )
         )
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
     sentences += _snaps(summary)
     sentences += _error(summary)
-    sentences += [Markup("{}.").format(remark[0].upper() + remark[1:]) for remark in summary.get("remarks", [])]
+    sentences += [
+        Markup("{}.").format(remark[0].upper() + remark[1:])
+        for remark in summary.get("remarks", [])
+    ]
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
-        sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
+        sentences.insert(
+            0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"])
+        )
     return Markup(" ").join(sentences)
 
 
@@ -223,18 +269,30 @@ def _snaps(summary: Summary) -> list[Markup]:
         return []
     in_ms = "snap_jump_ms" in summary
     jump, departure = (
-        Markup("{} ms").format(number(summary[f"snap_{key}_ms"], 4)) if in_ms else number(snaps[0][key], 4)
+        Markup("{} ms").format(number(summary[f"snap_{key}_ms"], 4))
+        if in_ms
+        else number(snaps[0][key], 4)
         for key in ("jump", "departure")
     )
-    bare = "" if in_ms else Markup(" (times in R √(ρ/E); with a density of the shell they are in ms)")
+    bare = (
+        "" if in_ms else Markup(" (times in R √(ρ/E); with a density of the shell they are in ms)")
+    )
     beyond = 100 * float(snaps[0]["overshoot"])
-    more = Markup(", and overshoots by {} % of its way").format(number(beyond, 2)) if beyond > LEAST_BEYOND else ""
-    words = "The snap takes {} from 10 to 90 % of its way, after a departure from the fold of {}{}{}."
+    more = (
+        Markup(", and overshoots by {} % of its way").format(number(beyond, 2))
+        if beyond > LEAST_BEYOND
+        else ""
+    )
+    words = (
+        "The snap takes {} from 10 to 90 % of its way, after a departure from the fold of {}{}{}."
+    )
     return [Markup(words).format(jump, departure, bare, more)]
 
 
 def _error(summary: Summary) -> list[Markup]:
-    """The estimated error of a run with a tolerance, and the best estimate of its rounds if that is another."""
+    """The estimated error of a run with a tolerance, and the best estimate of its rounds if that is
+    another.
+    """
     tolerance = summary.get("tolerance") or {}
     if (estimate := tolerance.get("error_estimate")) is None:
         return []
@@ -247,7 +305,9 @@ def _error(summary: Summary) -> list[Markup]:
         said += Markup("; another mesh gives {} with {}").format(number(best["result"], 9), least)
     on_branch = (tolerance.get("branch") or {}).get("error_estimate")
     if on_branch is not None:
-        said += Markup(", that of the bifurcation; at the end of the branch it is {}").format(number(on_branch, 2))
+        said += Markup(", that of the bifurcation; at the end of the branch it is {}").format(
+            number(on_branch, 2)
+        )
     return [said + "."]
 
 
@@ -260,15 +320,22 @@ def _barrier(summary: Summary) -> Markup:
 def value(line: Line, summary: Summary) -> Markup:
     """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)", or in units alone.
 
-    That is what is in these units already, "t = 2 s", and the pressure on a flat shell, which p_c says nothing of.
+    That is what is in these units already, "t = 2 s", and the pressure on a flat shell, which p_c
+    says nothing of.
     """
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
     size = shown(name, line)
-    in_that_unit = size.symbol == quantity(name).symbol and float(line[size.name]) == float(line[name])
+    in_that_unit = size.symbol == quantity(name).symbol and float(line[size.name]) == float(
+        line[name]
+    )
     if size.name != name and (in_that_unit or (name == "p_over_pc" and is_flat(summary["case"]))):
         return Markup("{} = {} {}").format(head(size), number(float(line[size.name])), size.si)
-    measured = Markup(" ({} {})").format(number(float(line[size.name])), size.si) if size.name != name else ""
+    measured = (
+        Markup(" ({} {})").format(number(float(line[size.name])), size.si)
+        if size.name != name
+        else ""
+    )
     return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
 
 
@@ -305,11 +372,16 @@ def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
     return summary, lines
 
 
-def _instability(line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None) -> Markup:
+def _instability(
+    line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None
+) -> Markup:
     kind = line["label"]
     if line["mode"]:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
-    at, place = value(line, summary), _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
+    at, place = (
+        value(line, summary),
+        _displacement(line, pole_name(line, pole_of(summary["case"])), lines),
+    )
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
@@ -320,12 +392,20 @@ def _instability(line: Line, summary: Summary, lines: Sequence[Line], mode_at: S
 
 
 def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
-    """Where a mode is largest, in words; as a direction on a sphere, as imperfections give their places."""
+    """Where a mode is largest, in words; as a direction on a sphere, as imperfections give their
+    places.
+    """
     if place is None:
         return Markup("")
     dimensions = summary["dimensions"]
     in_metres = bool(dimensions["radius"]) and dimensions["units"] == "SI"
-    key, numbers = next(iter(place_in_units(place, shell_of(summary["case"])["geometry"], in_metres=in_metres).items()))
+    key, numbers = next(
+        iter(
+            place_in_units(
+                place, shell_of(summary["case"])["geometry"], in_metres=in_metres
+            ).items()
+        )
+    )
     if key == "degrees" and numbers[0] < NEAR_POLE:
         return Markup("; its mode is largest near the pole")
     if key == "degrees":
@@ -335,7 +415,9 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
     return Markup("; its mode is largest at {}").format(angles)
 
 
-def place_in_units(place: Sequence[float], geometry: str, *, in_metres: bool) -> dict[str, list[float]]:
+def place_in_units(
+    place: Sequence[float], geometry: str, *, in_metres: bool
+) -> dict[str, list[float]]:
     """A place in the unit of the report: polar and azimuth on a sphere, elsewhere coordinates.
 
     Examples
@@ -355,11 +437,17 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     path = [line for line in lines if line["branch"] == "0" and line["label"] not in LOCATED]
     last = path[-1] if path else None
     if last is None or not last["amplitude"]:
-        return Markup("Nothing loads the shell: this is its undeformed state." if not summary["stopped"] else "")
+        return Markup(
+            "Nothing loads the shell: this is its undeformed state."
+            if not summary["stopped"]
+            else ""
+        )
     arrived = last["label"] in ("target", "field") and not summary["stopped"]
     reached = "The run reached its target" if arrived else "The last point"
     place = pole_name(last, pole_of(summary["case"]))
-    sentence = Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place, lines))
+    sentence = Markup("{}: {}, {}.").format(
+        reached, value(last, summary), _displacement(last, place, lines)
+    )
     return sentence + _untouched(last)
 
 
@@ -382,7 +470,11 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     """The displacement, and the force on what moves."""
     varied = amplitude(line["amplitude"])
     at_pole = Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line, lines), pole)
-    force = [q for q in axes_of(line["amplitude"], line) if q.kind == "reaction" or q.name.startswith("force")]
+    force = [
+        q
+        for q in axes_of(line["amplitude"], line)
+        if q.kind == "reaction" or q.name.startswith("force")
+    ]
     if force and varied.column != "force":
         return Markup("{}, {}").format(_amount(force[0], line, lines), at_pole)
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
@@ -397,4 +489,6 @@ def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
 
 def _amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
     told = amount(of_column.name, line, lines)
-    return Markup("{} = {}{}").format(head(of_column), told, f" {of_column.shown_unit}" if of_column.shown_unit else "")
+    return Markup("{} = {}{}").format(
+        head(of_column), told, f" {of_column.shown_unit}" if of_column.shown_unit else ""
+    )

@@ -1,8 +1,8 @@
 """DIR/checkpoint: the case, then every result and finding of a history, each on disk before the
 next is computed.
 
-Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through adios4dolfinx 0.9.3)
-raises on one rank in `Close` then, and the other ranks wait for ever.
+Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through
+adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the other ranks wait for ever.
 """
 
 import json
@@ -46,13 +46,21 @@ def framed(content: bytes) -> bytes:
 
 
 def read_frame(stream: BinaryIO) -> bytes | None:
-    """The element at the stream's position; None, with the position unchanged, if there is no complete one."""
+    """The element at the stream's position; None, with the position unchanged, if there is no
+    complete one.
+    """
     start = stream.tell()
     head = stream.read(HEAD.size)
     if len(head) == HEAD.size:
         mark, length, checksum = HEAD.unpack(head)
-        left = stream.seek(0, os.SEEK_END) - stream.seek(start + HEAD.size)  # a damaged length may be any number
-        if mark == MARK and length <= left and zlib.crc32(content := stream.read(length)) == checksum:
+        left = stream.seek(0, os.SEEK_END) - stream.seek(
+            start + HEAD.size
+        )  # a damaged length may be any number
+        if (
+            mark == MARK
+            and length <= left
+            and zlib.crc32(content := stream.read(length)) == checksum
+        ):
             return content
     stream.seek(start)
     return None
@@ -72,7 +80,8 @@ class Ordering:
     comm
         The communicator of all ranks.
     known
-        On rank 0, the (n, 3) positions on the affine mesh in the order to use, or None for the present order.
+        On rank 0, the (n, 3) positions on the affine mesh in the order to use, or None for the
+        present order.
 
     Raises
     ------
@@ -100,7 +109,10 @@ class Ordering:
         else:
             self.places, self._mine = places, self._found(places, mine, comm)
         self._parts = self._within.allgather(self._mine)
-        self.size, self.last = len(self._mine) * self._values, self._within.rank == self._within.size - 1
+        self.size, self.last = (
+            len(self._mine) * self._values,
+            self._within.rank == self._within.size - 1,
+        )
 
     def _found(self, places: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
         """The numbers of this rank's nodes among the known ones."""
@@ -122,7 +134,9 @@ class Ordering:
         return np.array_equal(np.concatenate(self._parts), np.arange(len(self.places)))
 
     def gather(self, u: Vector) -> Array:
-        """All values (n, components) of a displacement on rank 0 of its space; empty on other ranks."""
+        """All values (n, components) of a displacement on rank 0 of its space; empty on other
+        ranks.
+        """
         parts = self._within.gather(u)
         whole = np.empty((len(self.places), self._values)) if parts else np.empty((0, self._values))
         for where, part in zip(self._parts, parts or [], strict=False):
@@ -234,7 +248,8 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file of a run that begins (`begun`), or of an earlier run; an incomplete last entry is cut off.
+        The file of a run that begins (`begun`), or of an earlier run; an incomplete last entry is
+        cut off.
     V
         The displacement's space.
     comm
@@ -293,7 +308,9 @@ class Checkpoint:
         found = find()
         parts = self._comm.gather(found.vector)
         vectors = [part for part in parts or () if part is not None]
-        head = json.dumps({"values": found.values, "parts": [part.size for part in vectors]}, default=_plain)
+        head = json.dumps(
+            {"values": found.values, "parts": [part.size for part in vectors]}, default=_plain
+        )
         self._append(b"\n".join([head.encode(), b"".join(part.tobytes() for part in vectors)]))
         return found
 
@@ -306,7 +323,9 @@ class Checkpoint:
         parts, rank = decoded["parts"], self._comm.rank
         if len(parts) != self._comm.size or not self._ordering.is_present:
             return Finding(decoded["values"])
-        return Finding(decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank])
+        return Finding(
+            decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank]
+        )
 
     def _refuse_other_kind(self, *, is_other: bool) -> None:
         """See that the file has a result where a result is wanted, and a finding where one is.
@@ -317,7 +336,9 @@ class Checkpoint:
             If it is the other: the history has gone another way than that of the file.
         """
         if is_other:
-            raise Damaged(f"{self._file}: is damaged: its results are in another order than this run's")
+            raise Damaged(
+                f"{self._file}: is damaged: its results are in another order than this run's"
+            )
 
     def record(self, result: Point | str) -> None:
         """Put a result on disk."""
@@ -325,7 +346,10 @@ class Checkpoint:
             self._append(json.dumps({"failure": result}).encode())
             return
         size = self._ordering.size
-        beyond = [self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1) for v in (result.state.u, result.du)]
+        beyond = [
+            self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1)
+            for v in (result.state.u, result.du)
+        ]
         u, du = (self._ordering.gather(v[:size]) for v in (result.state.u, result.du))
         self._append(_encoded(result, u, du, beyond))
 
@@ -371,15 +395,28 @@ def _plain(number: Any) -> Any:
 
 
 def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> bytes:
-    """A line of JSON with the numbers of a point, then its two vectors; `beyond` has their numbers without a node."""
-    numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
-    return json.dumps({**numbers, "mu": point.state.mu, "beyond": beyond}).encode() + b"\n" + u.tobytes() + du.tobytes()
+    """A line of JSON with the numbers of a point, then its two vectors; `beyond` has their numbers
+    without a node.
+    """
+    numbers = {
+        f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")
+    }
+    return (
+        json.dumps({**numbers, "mu": point.state.mu, "beyond": beyond}).encode()
+        + b"\n"
+        + u.tobytes()
+        + du.tobytes()
+    )
 
 
 def _difference(saved: Any, present: Any, key: str = "") -> str:
     """The first key with different values, and both values."""
     if isinstance(saved, dict) and isinstance(present, dict):
         name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
-        return _difference(saved.get(name), present.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
+        return _difference(
+            saved.get(name),
+            present.get(name),
+            f"{key}.{name}".removeprefix(".").removeprefix("case."),
+        )
     values = ["nothing" if value is None else json.dumps(value) for value in (saved, present)]
     return f"{key} is {values[0]} there and {values[1]} here"

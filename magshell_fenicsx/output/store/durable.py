@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.reading import open_regular, read_whole
 
-EACH = 1.0  # s between two waits for the disk: on a busy one each takes as long as a point of a small model
+# s between two waits for the disk: on a busy one each takes as long as a point of a small model
+EACH = 1.0
 
 
 class Damaged(CaseError):
@@ -46,7 +47,11 @@ def open_result(file: Path) -> BinaryIO:
 
 def _special(e: OSError) -> Exception:
     """What is raised for a file that no run has written, as a run writes regular files."""
-    return Damaged(f"{e.filename}: is damaged: {e.strerror}") if e.errno in (EFBIG, EINVAL, EISDIR) else e
+    return (
+        Damaged(f"{e.filename}: is damaged: {e.strerror}")
+        if e.errno in (EFBIG, EINVAL, EISDIR)
+        else e
+    )
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -74,7 +79,8 @@ def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> Non
 def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
     """Write a file; at every moment either the complete old file or the complete new one exists.
 
-    Without `waits` a failure of power may lose it: for files that a resumed run writes again where they are not whole.
+    Without `waits` a failure of power may lose it: for files that a resumed run writes again where
+    they are not whole.
 
     Raises
     ------
@@ -110,8 +116,9 @@ def sync_folder(folder: Path) -> None:
 class AppendedFile:
     """A file that grows by complete pieces.
 
-    A killed process loses none. A failure of power may lose the pieces since the disk was last waited for: that is at
-    the first piece, at later ones if `EACH` seconds have passed, and at the end.
+    A killed process loses none. A failure of power may lose the pieces since the disk was last
+    waited for: that is at the first piece, at later ones if `EACH` seconds have passed, and at the
+    end.
 
     Parameters
     ----------

@@ -30,8 +30,8 @@ def given_folder(out: Path | str) -> Path:
     Raises
     ------
     CaseError
-        If the name is empty, as that of a variable which is not set: the working folder is `.`. If no folder may have
-        it, or none can be looked for there.
+        If the name is empty, as that of a variable which is not set: the working folder is `.`. If
+        no folder may have it, or none can be looked for there.
     """
     if out == "":
         raise CaseError("--out: is empty; give the name of a folder, . for the working folder")
@@ -42,7 +42,9 @@ def given_folder(out: Path | str) -> Path:
             raise ValueError
         folder.exists()
     except ValueError:
-        raise CaseError(f"--out {str(folder)!r}: is no name in UTF-8 without zero bytes; give another") from None
+        raise CaseError(
+            f"--out {str(folder)!r}: is no name in UTF-8 without zero bytes; give another"
+        ) from None
     except OSError as e:
         raise CaseError(f"--out {folder}: cannot be written: {e.strerror}") from None
     return folder
@@ -64,13 +66,17 @@ def refuse_foreign(folder: Path, names: Iterable[str], what: str) -> None:
         )
 
 
-def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], what: str, case: str = "") -> None:
-    """Refuse a folder for the tables of many runs that has those of another case file, or files of others.
+def refuse_others(
+    folder: Path, names: Sequence[str], kept: Collection[str], what: str, case: str = ""
+) -> None:
+    """Refuse a folder for the tables of many runs that has those of another case file, or files of
+    others.
 
     Parameters
     ----------
     names
-        The tables; the first is a JSON object with the keys `kept`, and the name of the case file as `case`.
+        The tables; the first is a JSON object with the keys `kept`, and the name of the case file
+        as `case`.
     case
         The name of the case file, if another one is refused.
 
@@ -83,7 +89,9 @@ def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], wha
     if content.keys() >= set(kept):
         name = content.get("case")
         if case and isinstance(name, str) and Path(name).stem != Path(case).stem:
-            raise CaseError(f"--out {folder}: has {what} of {name}, which is kept; give another folder")
+            raise CaseError(
+                f"--out {folder}: has {what} of {name}, which is kept; give another folder"
+            )
     elif not any(_object(file).keys() & OF_POINTS for file in (folder / "points").glob("*.json")):
         # of an interrupted one there would be points
         refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), what)
@@ -117,7 +125,9 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
             make(out)
         except OSError as e:
             within = e.filename is not None and Path(e.filename) != out
-            raise CaseError(f"--out {out}: {f'{e.filename} ' * within}cannot be written: {e.strerror}") from None
+            raise CaseError(
+                f"--out {out}: {f'{e.filename} ' * within}cannot be written: {e.strerror}"
+            ) from None
         return out
 
     return from_first(comm, made)
@@ -125,7 +135,8 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
 
 @contextmanager
 def held_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
-    """Lock a folder against other runs inside `with`; ranks of a killed mpirun may still be writing.
+    """Lock a folder against other runs inside `with`; ranks of a killed mpirun may still be
+    writing.
 
     Parameters
     ----------
@@ -163,7 +174,9 @@ def held_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
 
 
 def by_first(
-    comm: "MPI.Comm", do: Callable[[], T], failed: Literal["cannot be written", "cannot be read"] = "cannot be written"
+    comm: "MPI.Comm",
+    do: Callable[[], T],
+    failed: Literal["cannot be written", "cannot be read"] = "cannot be written",
 ) -> T:
     """Let rank 0 write or read; return its result on every rank, see `from_first`. Collective.
 

@@ -21,7 +21,8 @@ PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "
 GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
 NUMBERS = {"*": NUMBER}
 SECTIONS = {"remanent?": dict, "applied?": dict}
-# the types of what is read from summary.json; a key with ? may be absent, * is every key, [...] a list of such items
+# the types of what is read from summary.json; a key with ? may be absent, * is every key, [...] a
+# list of such items
 SHAPE: dict[str, Any] = {
     "case": {
         "model": str,
@@ -31,7 +32,10 @@ SHAPE: dict[str, Any] = {
         "loading?": (dict, list),
     },
     "dimensionless": dict.fromkeys(GROUPS, NUMBER),
-    "dimensions": {**dict.fromkeys(("radius", "thickness", "youngs_modulus"), (*NUMBER, NOTHING)), "units": str},
+    "dimensions": {
+        **dict.fromkeys(("radius", "thickness", "youngs_modulus"), (*NUMBER, NOTHING)),
+        "units": str,
+    },
     "in_units?": NUMBERS,
     "model": {"included": [str], "left_out": [str]},
     "stopped": (str, NOTHING),
@@ -45,7 +49,11 @@ SHAPE: dict[str, Any] = {
     "solutions?": [{"point": int, "stable": bool, "residual": NUMBER}],
     "points": int,
     "mesh": dict.fromkeys(("cells", "dofs", "degree"), int),
-    "tolerance?": {"tolerance": NUMBER, "error_estimate": (*NUMBER, NOTHING), "rounds": [{"result": NUMBER}]},
+    "tolerance?": {
+        "tolerance": NUMBER,
+        "error_estimate": (*NUMBER, NOTHING),
+        "rounds": [{"result": NUMBER}],
+    },
     "timing": dict.fromkeys(PHASES, NUMBER),
     **dict.fromkeys(("factorisations", "iterations", "ranks"), int),
     "blas": str,
@@ -76,7 +84,9 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def _unlike(value: Any, kind: Any, key: str = "") -> str:
-    """The first place where a value is none that a run writes, in words; empty if there is none; see `SHAPE`."""
+    """The first place where a value is none that a run writes, in words; empty if there is none;
+    see `SHAPE`.
+    """
     within: list[tuple[Any, Any, str]] = []
     if isinstance(kind, list) and isinstance(value, list):
         within = [(each, kind[0], f"{key}.{i}") for i, each in enumerate(value)]
@@ -116,7 +126,8 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
 def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
     """The row that a run is about, at which its pictures show the shell.
 
-    With `until: limit` at its end that is the first instability, even if the path goes on from there.
+    With `until: limit` at its end that is the first instability, even if the path goes on from
+    there.
     """
     path = [row for row in rows if row["label"] != SOLUTION]
     loading = case.get("loading") or {}
@@ -132,7 +143,9 @@ def shell_of(case: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def is_flat(case: Mapping[str, Any]) -> bool:
-    """Whether the shell of a case is drawn flat, so that the pressure p_c of a sphere is a unit at most."""
+    """Whether the shell of a case is drawn flat, so that the pressure p_c of a sphere is a unit at
+    most.
+    """
     return shell_of(case).get("geometry") in FLAT
 
 

@@ -18,11 +18,17 @@ POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
 LARGEST = 1e100  # no run writes a larger number
-NO_NUMBERS = ("stretching", "bending", "energy")  # a solid has no such split; an energy of one's own may be no number
+NO_NUMBERS = (
+    "stretching",
+    "bending",
+    "energy",
+)  # a solid has no such split; an energy of one's own may be no number
 
 
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
-    """The point of `w_pole_over_h`: the first named point, or what is there in place of a pole, see `pole_of`."""
+    """The point of `w_pole_over_h`: the first named point, or what is there in place of a pole, see
+    `pole_of`.
+    """
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), pole)
 
 
@@ -92,7 +98,9 @@ def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator=end)
-    writer.writerows([repr(float(v)) if isinstance(v, float) else v for v in line] for line in lines)
+    writer.writerows(
+        [repr(float(v)) if isinstance(v, float) else v for v in line] for line in lines
+    )
     return stream.getvalue()
 
 
@@ -128,7 +136,10 @@ def is_path(file: Path) -> bool:
 
 def read_rows(file: Path) -> list[Row]:
     """The complete rows of a path.csv, also after a kill; see `read_lines`."""
-    return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in read_lines(file)]
+    return [
+        {key: v if key in TEXTS else _number(v) for key, v in row.items()}
+        for row in read_lines(file)
+    ]
 
 
 def read_lines(file: Path) -> list[dict[str, str]]:
@@ -146,15 +157,21 @@ def read_lines(file: Path) -> list[dict[str, str]]:
         raise Damaged(f"{file}: is damaged: no table in UTF-8: {e}") from None
     head = lines[0] if lines else []
     if missing := [name for name in COLUMNS if name not in head]:
-        raise Damaged(f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}")
+        raise Damaged(
+            f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}"
+        )
     counts = {name for name in head if quantity(name).kind == "count"}
     rows = []
     for number, values in enumerate(lines[1:]):
         rows.append(dict(zip(head, values, strict=False)))
         if len(values) != len(head):
-            raise Damaged(f"{file}: is damaged: line {number + 2} has {len(values)} values, its header {len(head)}")
+            raise Damaged(
+                f"{file}: is damaged: line {number + 2} has {len(values)} values, its header {len(head)}"
+            )
         if wrong := _wrong(number, rows[-1], counts):
-            raise Damaged(f"{file}: is damaged: line {number + 2} has {wrong} = {rows[-1][wrong]!r}")
+            raise Damaged(
+                f"{file}: is damaged: line {number + 2} has {wrong} = {rows[-1][wrong]!r}"
+            )
     return rows
 
 

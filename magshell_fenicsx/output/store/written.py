@@ -18,7 +18,17 @@ FIRST = "# files that magshell_fenicsx has written here: another run replaces th
 MESH = "mesh.json"  # the mesh chosen for a tolerance
 OF_PATH = (checkpoint.NAME, "path.csv", MESH)
 NEW = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
-DRAWN = (*PICTURES, "curve", "sensors", "field_maps", "instabilities", "modes", "frequencies", "solutions", "gradients")
+DRAWN = (
+    *PICTURES,
+    "curve",
+    "sensors",
+    "field_maps",
+    "instabilities",
+    "modes",
+    "frequencies",
+    "solutions",
+    "gradients",
+)
 # every name that a run, or `plot` after it, may write, also while it writes
 NAMES = re.compile(
     r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"
@@ -28,10 +38,14 @@ NAMES = re.compile(
 
 
 def of_names(folder: Path) -> set[str]:
-    """What a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`; no link is followed."""
+    """What a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`; no link
+    is followed.
+    """
     parts = [folder, *([folder / "fields"] if _kind(folder / "fields") == "a folder" else [])]
     files = {file.relative_to(folder).as_posix() for part in parts for file in part.iterdir()}
-    return {name for name in files if NAMES.fullmatch(name)} - ({"fields"} if len(parts) > 1 else set())
+    return {name for name in files if NAMES.fullmatch(name)} - (
+        {"fields"} if len(parts) > 1 else set()
+    )
 
 
 def _kind(file: Path) -> str:
@@ -45,9 +59,9 @@ def _kind(file: Path) -> str:
 def written(folder: Path) -> set[str]:
     """Those of `of_names` that a run is known to have written.
 
-    They are listed in written.txt at the end of a run. Without it they are all, if summary.json is a run's, as of
-    earlier versions. The files of a path are, if checkpoint is, also after a kill, or without the list path.csv.
-    What is no regular file is none of theirs.
+    They are listed in written.txt at the end of a run. Without it they are all, if summary.json is
+    a run's, as of earlier versions. The files of a path are, if checkpoint is, also after a kill,
+    or without the list path.csv. What is no regular file is none of theirs.
     """
     present = {name for name in of_names(folder) if not _kind(folder / name)}
     ours = {name for name in present if name.endswith(".unfinished")}  # left by a kill
@@ -74,7 +88,9 @@ def _is_of_run(read: Callable[[], dict[str, Any] | None]) -> bool:
     """Whether a file has what a run depends on."""
     with suppress(OSError, Damaged):
         content = read() or {}
-        return isinstance(content.get("case"), dict) and bool(content.keys() & {"sources", "versions"})
+        return isinstance(content.get("case"), dict) and bool(
+            content.keys() & {"sources", "versions"}
+        )
     return False
 
 
@@ -87,7 +103,9 @@ def refuse_unwritten(folder: Path) -> None:
         With the names of these files.
     """
     kinds = {name: _kind(folder / name) for name in of_names(folder) - written(folder)}
-    refuse_foreign(folder, (f"{name} ({kind})" if kind else name for name, kind in kinds.items()), "a run")
+    refuse_foreign(
+        folder, (f"{name} ({kind})" if kind else name for name, kind in kinds.items()), "a run"
+    )
 
 
 def note(folder: Path, more: Iterable[str] = ()) -> None:

@@ -1,4 +1,6 @@
-"""What all rigid bodies have in common: their sections, where they stand, and their signed distance."""
+"""What all rigid bodies have in common: their sections, where they stand, and their signed
+distance.
+"""
 
 import re
 from abc import ABC, abstractmethod
@@ -26,7 +28,9 @@ ALONG = 1e-6  # part of an axis across the approach that counts as none
 
 
 class Distance(ABC):
-    """The signed distance of a body at approach zero, positive outside, with its outline; all over R."""
+    """The signed distance of a body at approach zero, positive outside, with its outline; all over
+    R.
+    """
 
     @abstractmethod
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
@@ -44,12 +48,16 @@ class Distance(ABC):
 
     @property
     def held(self) -> Sequence[Array]:
-        """Vectors (3,) that a mirror plane through e3 must hold, of a body that is round about them."""
+        """Vectors (3,) that a mirror plane through e3 must hold, of a body that is round about
+        them.
+        """
         return ()
 
     @property
     def across(self) -> Sequence[Array]:
-        """Vectors (3,) of which each may lie in a mirror plane through e3, of a body with several planes."""
+        """Vectors (3,) of which each may lie in a mirror plane through e3, of a body with several
+        planes.
+        """
         return ()
 
 
@@ -93,7 +101,9 @@ class PlacedBody:
         return np.asarray(v / size)
 
     def axes(self, axis: list[float]) -> Array:
-        """Unit vectors as rows (3, 3): along an axis, across it and the approach, and along the approach."""
+        """Unit vectors as rows (3, 3): along an axis, across it and the approach, and along the
+        approach.
+        """
         first = self.across(axis)
         return np.stack([first, np.cross(self.direction, first), self.direction])
 
@@ -101,8 +111,8 @@ class PlacedBody:
 class BodySection(Section):
     """Base of all kinds: a rigid body without friction.
 
-    It touches the shell's face, half a thickness from the mid-surface (of rubber half the deformed one). `kind:
-    contact` moves it; otherwise it stays.
+    It touches the shell's face, half a thickness from the mid-surface (of rubber half the deformed
+    one). `kind: contact` moves it; otherwise it stays.
     """
 
     kind: str
@@ -182,15 +192,20 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
         for name, body in self.given.items():
             context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
-                raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
+                raise ValueError(
+                    f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40"
+                )
             if name in endings():
-                raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
+                raise ValueError(
+                    f"bodies.{name}: is taken, by columns in this unit; choose another name"
+                )
         patch = "of a solid give a force on a patch (kind: indentation, patch)"
         context.needs("bodies", "a mid-surface", hint=patch)
 
 
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
-    """The signed distance from a convex corner in two or three coordinates, less a radius, with derivatives by q.
+    """The signed distance from a convex corner in two or three coordinates, less a radius, with
+    derivatives by q.
 
     Parameters
     ----------

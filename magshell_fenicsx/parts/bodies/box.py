@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size, rounded
+from magshell_fenicsx.parts.bodies.body import (
+    Axis,
+    BodySection,
+    Distance,
+    PlacedBody,
+    Size,
+    rounded,
+)
 from magshell_fenicsx.shape import solids
 from magshell_fenicsx.shape.ground import edges
 from magshell_fenicsx.shape.solids import Solid

@@ -1,10 +1,13 @@
-"""Rigid bodies that press on the shell: the penalty of the gap by its Taylor polynomial at each quadrature point.
+"""Rigid bodies that press on the shell: the penalty of the gap by its Taylor polynomial at each
+quadrature point.
 
-The gap between a body and the shell's face is g(x - a d) - t h/2, with the body's signed distance g at approach zero,
-its approach a along d, the place x of the mid-surface and the factor t of the thickness. The penalty psi(-gap) is zero
-where the gap is open. As of an applied field (`applied`), the polynomial of second order in y = u - a d at the present
-y has the derivatives of the penalty itself, by the displacement and by the approach, for every shape of a body. Where
-the thickness varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the polynomial.
+The gap between a body and the shell's face is g(x - a d) - t h/2, with the body's signed distance g
+at approach zero, its approach a along d, the place x of the mid-surface and the factor t of the
+thickness. The penalty psi(-gap) is zero where the gap is open. As of an applied field (`applied`),
+the polynomial of second order in y = u - a d at the present y has the derivatives of the penalty
+itself, by the displacement and by the approach, for every shape of a body. Where the thickness
+varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the
+polynomial.
 """
 
 from collections.abc import Callable
@@ -26,7 +29,9 @@ from magshell_fenicsx.parts.gap import SOFT, Thinning, expanded, mean_pressure, 
 Array = NDArray[np.float64]
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
-FACE = 1 + 1 + 3 + 1  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
+FACE = (
+    1 + 1 + 3 + 1
+)  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
 LARGEST_OVER_MEAN_PRESSURE = 1.5  # in a cell whose mean is drawn, at most
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
@@ -46,7 +51,8 @@ class Contact:
     direction
         Unit vector (3,) of the approach.
     front
-        Place (3,) of its surface that goes ahead: radii of contact are distances from the axis through it.
+        Place (3,) of its surface that goes ahead: radii of contact are distances from the axis
+        through it.
     stiffness
         k of the penalty, over E h/R^2.
     bound
@@ -56,8 +62,8 @@ class Contact:
     size
         Radius over R of what touches, such as a ball's; infinite for a plane.
     start, lift
-        Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from it to the face;
-        None of one with a position of its own.
+        Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from
+        it to the face; None of one with a position of its own.
     """
 
     body: str
@@ -73,7 +79,9 @@ class Contact:
     lift: Array | None = None
 
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
-        """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness over R."""
+        """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness
+        over R.
+        """
         g, n, N = self.distance(x - approach * self.direction)
         return g - half, n, N
 
@@ -84,9 +92,11 @@ class Contact:
 
 
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
-    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of one.
+    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of
+    one.
 
-    Where the thickness varies, what psi changes by with it (`FACE`,) and its factor (1,) are given too.
+    Where the thickness varies, what psi changes by with it (`FACE`,) and its factor (1,) are given
+    too.
     """
     s = _moved(u, P, motion, approach)
     psi = _polynomial(P, s)
@@ -104,14 +114,20 @@ def thinned_energy(
     natural: Forms | None = None,
     thins: Expr | int = 1,
 ) -> Expr:
-    """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies, multiplies."""
+    """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies,
+    multiplies.
+    """
     s, t = _moved(u, P, motion, approach), thinned(r0, u, natural, thins)
     return _polynomial(P, s) + _of_face(F, factor[0][0] * t if factor else t, s)
 
 
 def _polynomial(P: Expr, s: Expr) -> Expr:
     pairs = enumerate(zip(*PAIRS, strict=True))
-    return P[3] + ufl.dot(_gradient(P), s) + sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
+    return (
+        P[3]
+        + ufl.dot(_gradient(P), s)
+        + sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
+    )
 
 
 def _of_face(F: Expr, t: Expr, s: Expr) -> Expr:
@@ -119,7 +135,9 @@ def _of_face(F: Expr, t: Expr, s: Expr) -> Expr:
     return more * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + more / 2 * F[5])
 
 
-def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms) -> Expr:
+def contact_pressure(
+    r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms
+) -> Expr:
     """The pressure on the shell per undeformed area, at the state of P."""
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
@@ -152,7 +170,8 @@ class Region:
     penetration
         The largest; while nothing touches it is negative, minus the least gap.
     radius, inner, outer
-        Mean distance of the pressure from the axis of the approach, and its least and largest one; 0 without.
+        Mean distance of the pressure from the axis of the approach, and its least and largest one;
+        0 without.
     """
 
     penetration: float
@@ -163,7 +182,9 @@ class Region:
 
 @dataclass(frozen=True)
 class _Expanded:
-    """The penalty of the points that are pressed: which they are, psi and its derivatives by the depth, normals."""
+    """The penalty of the points that are pressed: which they are, psi and its derivatives by the
+    depth, normals.
+    """
 
     pressed: NDArray[np.bool_]
     value: Array
@@ -174,7 +195,10 @@ class _Expanded:
 
     def penalty(self) -> tuple[NDArray[np.bool_], Array]:
         """These points, and psi with its gradient and half its Hessian there."""
-        H = self.second[..., None] * self.n[:, :, None] * self.n[:, None, :] - self.first[..., None] * self.N
+        H = (
+            self.second[..., None] * self.n[:, :, None] * self.n[:, None, :]
+            - self.first[..., None] * self.N
+        )
         return self.pressed, _flat(self.value, -self.first * self.n, H)
 
 
@@ -233,21 +257,38 @@ class Pressing:
         thins = thinning and thinning(self._points)
 
         def factor() -> float | Array:
-            given = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+            given = (
+                1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+            )
             return given if thins is None else given * thins.renew()
 
         self._factor = Follows(factor, lambda: (*thick, *([thins.renew()] if thins else [])))
-        self._face = None if thickness is None and thins is None else PointField(V.mesh, degree, FACE)
+        self._face = (
+            None if thickness is None and thins is None else PointField(V.mesh, degree, FACE)
+        )
         motion = fem.Constant(V.mesh, h * contact.direction)
         varying = () if thickness is None else (thickness,)
-        self.parameters = (self.polynomial, motion, approach, *(() if self._face is None else (self._face, *varying)))
+        self.parameters = (
+            self.polynomial,
+            motion,
+            approach,
+            *(() if self._face is None else (self._face, *varying)),
+        )
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        self._mean: tuple[Array, ...] = ()  # derivatives of a step by place and thickness, in place of the present ones
+        self._mean: tuple[
+            Array, ...
+        ] = ()  # derivatives of a step by place and thickness, in place of the present ones
         self._about: tuple[Array, ...] = ()  # the gap about which the penalty is expanded
 
         def places() -> tuple[Array, ...]:
-            return r0.x.array, u.x.array, approach.value, *thick, *([thins.renew()] if thins else [])
+            return (
+                r0.x.array,
+                u.x.array,
+                approach.value,
+                *thick,
+                *([thins.renew()] if thins else []),
+            )
 
         def forces() -> tuple[Array, ...]:
             return *places(), self.stiffness.value, *self._mean, *self._about
@@ -308,13 +349,17 @@ class Pressing:
         if self._mean:
             by_t[:, 1:] = self._mean[2]
         else:
-            by_t[at.pressed, 1:] = half * np.concatenate([at.first, -at.second * at.n, half * at.second], axis=1)
+            by_t[at.pressed, 1:] = half * np.concatenate(
+                [at.first, -at.second * at.n, half * at.second], axis=1
+            )
         return by_t.reshape(*self.polynomial.values.shape[:2], FACE)
 
     def expand_about(self, gap: Array) -> None:
-        """Take in place of the penalty its Taylor polynomial about a gap, of the same contact elsewhere.
+        """Take in place of the penalty its Taylor polynomial about a gap, of the same contact
+        elsewhere.
 
-        For differences by a number of the case: a body that is hard closes or opens within a far smaller way.
+        For differences by a number of the case: a body that is hard closes or opens within a far
+        smaller way.
         """
         self._about = (gap,)
 
@@ -333,11 +378,15 @@ class Pressing:
         """`place` and `factor`."""
         return self.place, self.factor
 
-    def average(self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float) -> None:
-        """Take the forces of a step in place of the present ones, until `present`; see docs/theory.md, Motion.
+    def average(
+        self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float
+    ) -> None:
+        """Take the forces of a step in place of the present ones, until `present`; see
+        docs/theory.md, Motion.
 
-        Their product with the change of y is that of psi, plus what the step dissipates: the mean gradient is that of
-        psi along the normal, over the penetration and not over time, so that it counts where contact sets in or ceases.
+        Their product with the change of y is that of psi, plus what the step dissipates: the mean
+        gradient is that of psi along the normal, over the penetration and not over time, so that it
+        counts where contact sets in or ceases.
 
         Parameters
         ----------
@@ -362,7 +411,11 @@ class Pressing:
 
         late = part - 0.5
         gradient = -times(mean, normal) - late * (times(p1, n[2]) - times(p0, n[0]))
-        H = times(slope, outer(normal)) - times(mean, bend) + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
+        H = (
+            times(slope, outer(normal))
+            - times(mean, bend)
+            + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
+        )
         by_t = half * (mean + late * (p1 - p0))
         of_both = -half * (times(slope, normal) + late * times(stiff, n[2])) / part
         twice = half**2 * (slope + late * stiff) / part
@@ -373,7 +426,9 @@ class Pressing:
         self._mean = ()
 
     def cell_pressures(self) -> Array:
-        """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than that of nodes."""
+        """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than
+        that of nodes.
+        """
         V = self._u.function_space
         weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
         return np.asarray(self._sizes() @ weights / weights.sum())
@@ -392,8 +447,14 @@ class Pressing:
     def region(self, comm: MPI.Comm, radius: float) -> Region:
         """Where the body touches; `radius` is the mean one."""
         owned = slice(0, self._owned * len(self._points))
-        gap, x = self.gap[owned], (self._r0.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front
-        pressure, d = penalty(-gap, float(self.stiffness.value), SOFT * self._h)[1], self.contact.direction
+        gap, x = (
+            self.gap[owned],
+            (self._r0.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
+        )
+        pressure, d = (
+            penalty(-gap, float(self.stiffness.value), SOFT * self._h)[1],
+            self.contact.direction,
+        )
         most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
         from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[pressure > PRESSED * most]
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)

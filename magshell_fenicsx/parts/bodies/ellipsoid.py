@@ -15,9 +15,12 @@ from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 STEPS = 60  # of Newton's method, which takes about six
-CENTRAL = 1e-12  # of a semi-axis: places nearer to a plane of symmetry are moved there, where the nearest place is one
+# of a semi-axis: places nearer to a plane of symmetry are moved there, where the nearest place is
+# one
+CENTRAL = 1e-12
 SOLVED = 1e-15  # change of the parameter, over the largest semi-axis squared
-FLAT = 1e-9  # least 1 + distance times curvature: beyond a centre of curvature another place is nearest
+# least 1 + distance times curvature: beyond a centre of curvature another place is nearest
+FLAT = 1e-9
 
 
 class EllipsoidSection(BodySection):
@@ -47,9 +50,9 @@ class EllipsoidSection(BodySection):
 class Ellipsoid(Distance):
     """`axes` (3, 3) are its unit vectors as rows, `semi` its semi-axes a_i along them.
 
-    The nearest place of the surface to y has the coordinates a_i² y_i/(t + a_i²), with the largest root t of
-    F(t) = sum (a_i y_i/(t + a_i²))² - 1. F falls and is convex there, so Newton's method from a place with
-    0 <= F <= 2 goes up to the root and never past it.
+    The nearest place of the surface to y has the coordinates a_i² y_i/(t + a_i²), with the largest
+    root t of F(t) = sum (a_i y_i/(t + a_i²))² - 1. F falls and is convex there, so Newton's method
+    from a place with 0 <= F <= 2 goes up to the root and never past it.
     """
 
     centre: Array
@@ -64,9 +67,13 @@ class Ellipsoid(Distance):
         n = normal / steep[:, None]
         g = np.einsum("ni,ni->n", y - foot, n)
         tangent = np.eye(3) - n[:, :, None] * n[:, None, :]
-        S = tangent @ (np.eye(3) / self.semi**2 / steep[:, None, None]) @ tangent  # the curvatures of the surface
+        S = (
+            tangent @ (np.eye(3) / self.semi**2 / steep[:, None, None]) @ tangent
+        )  # the curvatures of the surface
         curvatures, directions = np.linalg.eigh(S)
-        parallel = curvatures / np.maximum(1 + g[:, None] * curvatures, FLAT)  # and of its parallel one
+        parallel = curvatures / np.maximum(
+            1 + g[:, None] * curvatures, FLAT
+        )  # and of its parallel one
         N = np.einsum("nia,na,nja->nij", directions, parallel, directions)
         return g, n @ self.axes, np.einsum("ai,nab,bj->nij", self.axes, N, self.axes, optimize=True)
 
@@ -91,7 +98,9 @@ class Ellipsoid(Distance):
     @property
     def solid(self) -> Solid:
         round_one = solids.globe(1.0)
-        return replace(round_one, points=self.semi * round_one.points).moved(self.axes.T, self.centre)
+        return replace(round_one, points=self.semi * round_one.points).moved(
+            self.axes.T, self.centre
+        )
 
     @property
     def across(self) -> Sequence[Array]:

@@ -20,15 +20,21 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
 
-SHARP = 1e-9  # least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of gap
-EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles
+# least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of
+# gap
+SHARP = 1e-9
+EASY, HARD = (
+    4,
+    8,
+)  # matrices of a step along a contact, whose rim moves from point to point before it settles
 FIRST = 0.1  # of h: the first step of the approach towards a force
 
 
 class ContactSection(PathStep):
     """A body of `bodies` that approaches the shell along its direction, without friction.
 
-    The conjugate of the approach is the force on the body. Free flight up to the first contact is one step.
+    The conjugate of the approach is the force on the body. Free flight up to the first contact is
+    one step.
     """
 
     conjugate: ClassVar[str] = "force on the body"
@@ -65,7 +71,9 @@ class ContactSection(PathStep):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         bodies: Mapping[str, object] = context.sections["bodies"]
-        if (self.body is None and len(bodies) != 1) or (self.body is not None and self.body not in bodies):
+        if (self.body is None and len(bodies) != 1) or (
+            self.body is not None and self.body not in bodies
+        ):
             allowed = ", ".join(bodies) or "none: give it in bodies"
             raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {allowed}")
 
@@ -86,7 +94,9 @@ def finer(options: "StepOptions") -> "StepOptions":
 
 
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:
-    """Body -> name of its approach, the amplitude; a single one needs no name beside it, unless a load is `force`."""
+    """Body -> name of its approach, the amplitude; a single one needs no name beside it, unless a
+    load is `force`.
+    """
     alone = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
     return {name: "approach" if alone else f"approach_{name}" for name in bodies}
 
@@ -150,13 +160,19 @@ class BodiesSeen(Seen):
     varied = (Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),)
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(name for contact in loads.contacts for name in (contact.amplitude, contact.setting))
+        return tuple(
+            name for contact in loads.contacts for name in (contact.amplitude, contact.setting)
+        )
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
-        return {contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts}
+        return {
+            contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts
+        }
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        names = (column for contact in loads.contacts for column in contact_columns(contact.amplitude))
+        names = (
+            column for contact in loads.contacts for column in contact_columns(contact.amplitude)
+        )
         return tuple(column for column in names if column != "force")
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:

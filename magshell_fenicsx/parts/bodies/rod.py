@@ -53,7 +53,9 @@ class Rod(Distance):
         basis = np.stack([e, np.broadcast_to(d, e.shape)], axis=1)  # d(rho, z)/dx
         around = np.eye(3) - np.outer(d, d) - e[:, :, None] * e[:, None, :]
         turned = (n[:, 0] / np.maximum(far, 1e-300))[:, None, None] * around
-        H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(far[:, None, None] > 0, turned, 0.0)
+        H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(
+            far[:, None, None] > 0, turned, 0.0
+        )
         return g, np.einsum("na,nai->ni", n, basis), H
 
     @property
@@ -63,4 +65,6 @@ class Rod(Distance):
 
     @property
     def solid(self) -> Solid:
-        return solids.cylinder(self.radius, 2 * SEEN).moved(frame(self.along), self.end - SEEN * self.along)
+        return solids.cylinder(self.radius, 2 * SEEN).moved(
+            frame(self.along), self.end - SEEN * self.along
+        )

@@ -40,7 +40,11 @@ class Sphere(Distance):
         r = x - self.centre
         far = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
         n = r / far[:, None]
-        return far - self.radius, n, (np.eye(3) - n[:, :, None] * n[:, None, :]) / far[:, None, None]
+        return (
+            far - self.radius,
+            n,
+            (np.eye(3) - n[:, :, None] * n[:, None, :]) / far[:, None, None],
+        )
 
     @property
     def lines(self) -> list[Array]:

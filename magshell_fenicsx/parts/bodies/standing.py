@@ -1,4 +1,6 @@
-"""The rigid bodies of a case in the model's terms: where they stand, how stiff they are, and what they leave."""
+"""The rigid bodies of a case in the model's terms: where they stand, how stiff they are, and what
+they leave.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ from magshell_fenicsx.shape.symmetry import Leaves
 Array = NDArray[np.float64]
 RING = 0.35  # of sqrt(Rh): elements that show the ring of a contact
 NATURAL = 1e6  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
-POINTED = 15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
+POINTED = (
+    15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
+)
 WITHIN = 1e-6  # penetration over h that is rounding
 ROUNDS, FINER = 6, 0.2  # refinements of a search, and how much smaller its range is each time
 AROUND = 1.5  # half the side, over R, of the cube in which bodies may overlap
@@ -32,7 +36,10 @@ ALIKE = 1e-10  # distances and directions of images: rounding
 
 
 def contacts(
-    bodies: Mapping[str, BodySection], approaches: Mapping[str, str], driven: Collection[str], ground: Ground
+    bodies: Mapping[str, BodySection],
+    approaches: Mapping[str, str],
+    driven: Collection[str],
+    ground: Ground,
 ) -> tuple[Contact, ...]:
     """What bodies bring to the model.
 
@@ -66,7 +73,9 @@ def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> 
     stands = section.position is not None and "at" not in section.model_fields_set
     if stands and (ground.geometry == "mesh" or section.direction is not None):
         places = ground.perfect.sample()
-        place = places[np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()]
+        place = places[
+            np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()
+        ]
     else:
         place, _ = located(section.at, ground, key)
     chart = ground.perfect.inverse(place)
@@ -109,7 +118,9 @@ class Pressed:
 
     @classmethod
     def by(cls, contact: Contact, loads: Iterable[Step], ground: Ground) -> "Pressed":
-        """Up to the largest approach of steps: a plane in a ring up to sqrt(2 R a), others on their front."""
+        """Up to the largest approach of steps: a plane in a ring up to sqrt(2 R a), others on their
+        front.
+        """
         h, size = ground.h, contact.size
         reach = min(1.1 * sqrt(2 * (pressed(loads) or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
         return cls(ground.drawn.inverse(contact.front), reach, size)
@@ -124,7 +135,10 @@ class Pressed:
 
 def pressed(loads: Iterable[Step]) -> float:
     """The largest approach over h that a target of steps asks for; 0 without."""
-    return max((abs(load.approach or 0.0) for load in loads if isinstance(load, ContactSection)), default=0.0)
+    return max(
+        (abs(load.approach or 0.0) for load in loads if isinstance(load, ContactSection)),
+        default=0.0,
+    )
 
 
 def body_leaves(contact: Contact) -> Leaves:
@@ -134,7 +148,10 @@ def body_leaves(contact: Contact) -> Leaves:
 
     def alike(S: Array, image: Array) -> bool:
         other = contact.distance(image)[0]
-        return bool(np.abs(S @ d - d).max() < ALIKE and np.abs(other - g).max() < ALIKE * (1 + np.abs(g).max()))
+        return bool(
+            np.abs(S @ d - d).max() < ALIKE
+            and np.abs(other - g).max() < ALIKE * (1 + np.abs(g).max())
+        )
 
     turns = all(alike(Q, x @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
     tilted = [contact.front, d, *contact.distance.held]
@@ -143,7 +160,12 @@ def body_leaves(contact: Contact) -> Leaves:
     def mirrors(mirror: Mirror) -> bool:
         return alike(mirror.reflection, mirror.image(x))
 
-    return Leaves(None if turns else f"bodies.{contact.body} is not turned about e3", tilted, mirrors, azimuths=between)
+    return Leaves(
+        None if turns else f"bodies.{contact.body} is not turned about e3",
+        tilted,
+        mirrors,
+        azimuths=between,
+    )
 
 
 def least_gap(contact: Contact, ground: Ground) -> float:
@@ -166,12 +188,16 @@ def least_gap(contact: Contact, ground: Ground) -> float:
 
 
 def overlap(one: Contact, other: Contact) -> float:
-    """How deep two bodies overlap near the shell at approach zero, over R; negative if they are apart."""
+    """How deep two bodies overlap near the shell at approach zero, over R; negative if they are
+    apart.
+    """
 
     def farther(x: Array) -> Array:
         return np.maximum(one.distance(x)[0], other.distance(x)[0])
 
-    x = np.concatenate([np.random.default_rng(3).uniform(-AROUND, AROUND, (4000, 3)), [one.front, other.front]])
+    x = np.concatenate(
+        [np.random.default_rng(3).uniform(-AROUND, AROUND, (4000, 3)), [one.front, other.front]]
+    )
     values = farther(x)
     return -_refined(farther, x[values.argmin()], float(values.min()), np.full(3, 0.5))
 

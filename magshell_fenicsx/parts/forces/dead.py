@@ -47,8 +47,14 @@ def _or_formula(unit: str) -> Any:
         if isinstance(value, str) and is_formula(value):
             return value
         number = in_units(unit)(value)
-        if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= LARGEST:
-            raise ValueError(f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas")
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, int | float)
+            or not abs(number) <= LARGEST
+        ):
+            raise ValueError(
+                f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas"
+            )
         return number
 
     return BeforeValidator(read, json_schema_input_type=Finite | str)
@@ -61,12 +67,13 @@ VaryingPressure = Annotated[Varying, _or_formula("pascal")]
 
 
 class DeadLoadSection(Section):
-    """One load, at a point of `points`, on an edge, or over the surface, in the units of the shell's numbers.
+    """One load, at a point of `points`, on an edge, or over the surface, in the units of the
+    shell's numbers.
 
-    On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent, which turns
-    with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or `pressure` along the
-    undeformed normal, positive from outside. What is per length or area may be a formula of the undeformed place
-    x, y, z in the shell's length, such as "cos(2*arctan2(y, x))".
+    On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent,
+    which turns with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or
+    `pressure` along the undeformed normal, positive from outside. What is per length or area may be
+    a formula of the undeformed place x, y, z in the shell's length, such as "cos(2*arctan2(y, x))".
     """
 
     at: str | None = None
@@ -115,7 +122,9 @@ class DeadLoadSection(Section):
     @property
     def vector(self) -> list[Varying] | None:
         """Its components, if it has a direction in space."""
-        return next((list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None)
+        return next(
+            (list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None
+        )
 
     @property
     def varies(self) -> bool:
@@ -126,8 +135,8 @@ class DeadLoadSection(Section):
 class DeadSection(PathStep):
     """Loads that keep their direction and grow by a common factor.
 
-    A target is the `factor`, or the `displacement` of the loads along themselves (their work over the sum of
-    their sizes) in the units of the shell's lengths.
+    A target is the `factor`, or the `displacement` of the loads along themselves (their work over
+    the sum of their sizes) in the units of the shell's lengths.
     """
 
     amplitude: ClassVar[str] = "load"
@@ -154,9 +163,13 @@ class DeadSection(PathStep):
         if self.control == "displacement" or self.displacement is not None:
             for has, what in ((self.turns, "moment"), (self.by_place, "potential")):
                 if has:
-                    raise ValueError(f"displacement: a {what} has none; take control: arc or load with factor")
+                    raise ValueError(
+                        f"displacement: a {what} has none; take control: arc or load with factor"
+                    )
         if self.branches and self.turns:
-            raise ValueError("branches: not with a moment, whose potential counts the turns along one path")
+            raise ValueError(
+                "branches: not with a moment, whose potential counts the turns along one path"
+            )
         return self
 
     @property
@@ -185,7 +198,9 @@ class DeadSection(PathStep):
     def warning(self, step: ProgrammeStep) -> str | None:
         """A pressure by formula keeps its direction, where that of a fluid would turn with the
         surface."""
-        varying = next((i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None)
+        varying = next(
+            (i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None
+        )
         if varying is None:
             return None
         return (
@@ -203,7 +218,9 @@ class DeadSection(PathStep):
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         R, span = context.shell.reference, outline.span
         fixed = [load for load in self.loads if not load.varies]
-        forces = [np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v]
+        forces = [
+            np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v
+        ]
         places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
@@ -213,16 +230,25 @@ class DeadSection(PathStep):
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)
-            in_potentials = on_plane and all(mirrors_formula(text, mirror, x, R) for text in potentials)
-            return in_potentials and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
+            in_potentials = on_plane and all(
+                mirrors_formula(text, mirror, x, R) for text in potentials
+            )
+            return in_potentials and all(
+                any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads
+            )
 
         why = "a patch is loaded" if patches else None
         if any(tilted(v) for v in vectors):
             why = "a load is not along e3, or off the axis"
-        around = all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
+        around = (
+            all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
+        )
         if span and not (around and all(scalar_turns(text, span, R) for text in potentials)):
             why = why or "a load differs around e3"
-        energies = [potential(f"potential_{i}", text, np.eye(3), context.scales) for i, text in enumerate(potentials)]
+        energies = [
+            potential(f"potential_{i}", text, np.eye(3), context.scales)
+            for i, text in enumerate(potentials)
+        ]
         return [Leaves(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
 
     def named_points(self) -> list[str]:
@@ -238,7 +264,9 @@ class DeadSection(PathStep):
         return size if size < 0.35 else None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
-        from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
+        from magshell_fenicsx.models.shell.patterns import (
+            LARGEST,
+        )  # the solver takes long to import
 
         scales = context.scales
         for i, load in enumerate(self.loads):
@@ -249,14 +277,26 @@ class DeadSection(PathStep):
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
             if load.potential:  # of the deformed place: the undeformed one is looked at
                 most = LARGEST * scales.E * scales.h
-                yield Formulas(f"{key}.loads.{i}.potential", [load.potential], -most, most, scales.R, deformed=True)
+                yield Formulas(
+                    f"{key}.loads.{i}.potential",
+                    [load.potential],
+                    -most,
+                    most,
+                    scales.R,
+                    deformed=True,
+                )
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.forces.dead_load import dead_load  # the solver takes long to import
+        from magshell_fenicsx.parts.forces.dead_load import (
+            dead_load,
+        )  # the solver takes long to import
 
         mirror = modelled.mirror
         loads = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
-        made = (dead_load(load, f"{step.name}_potential_{i}", context, modelled) for i, load in enumerate(loads))
+        made = (
+            dead_load(load, f"{step.name}_potential_{i}", context, modelled)
+            for i, load in enumerate(loads)
+        )
         return {"dead": {step.name: tuple(made)}}
 
 
@@ -267,7 +307,9 @@ def load_turns(load: DeadLoadSection, span: Span, R: float) -> bool:
     return vector_turns([str(v) for v in load.vector], span, R)
 
 
-def is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float) -> bool:
+def is_image(
+    load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float
+) -> bool:
     """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
     if load.varies or other.varies:
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
@@ -281,7 +323,9 @@ def is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: A
         other.potential is None,
     ):
         return False
-    for own, others in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
+    for own, others in (
+        (getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")
+    ):
         if (own is None) != (others is None):
             return False
         if own and np.abs(mirror.reflection @ own - others).max() > 1e-10 * np.linalg.norm(own):
@@ -289,7 +333,9 @@ def is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: A
     return True
 
 
-def _mirrored_formula(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array) -> bool:
+def _mirrored_formula(
+    load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array
+) -> bool:
     edge = load.edge and mirror.other(load.edge)
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False
@@ -321,7 +367,9 @@ def also_displaced(loads: "Loads") -> tuple[str, ...]:
 class ForcesSeen(Seen):
     """Factors of forces and dead loads, and displacements along them."""
 
-    quantities = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
+    quantities = (
+        Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
+    )
     before_points: ClassVar[bool] = True
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
@@ -335,10 +383,14 @@ class ForcesSeen(Seen):
         model, loads = sight.model, sight.loads
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
         along = also_displaced(loads)
-        return factors | {f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along}
+        return factors | {
+            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along
+        }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.parameters import AreaForce  # the solver takes long to import
+        from magshell_fenicsx.models.shell.parameters import (
+            AreaForce,
+        )  # the solver takes long to import
         from magshell_fenicsx.models.shell.thickness import patch_of
 
         for load in loads.all_dead:
@@ -349,4 +401,8 @@ class ForcesSeen(Seen):
         """w/h of a force, the shell's length of dead loads."""
         if name in sight.loads.forces:
             return sight.model.force_unit * sight.h
-        return sight.model.load_size.get(name, 0.0) / sight.length if name in sight.loads.dead else None
+        return (
+            sight.model.load_size.get(name, 0.0) / sight.length
+            if name in sight.loads.dead
+            else None
+        )

@@ -1,4 +1,6 @@
-"""Dead loads and forces in the model's terms, over E h R and in its frame: the entries of their load vectors."""
+"""Dead loads and forces in the model's terms, over E h R and in its frame: the entries of their
+load vectors.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +21,14 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
+from magshell_fenicsx.models.shell.parameters import (
+    AreaForce,
+    DeadLoad,
+    EdgeForce,
+    EdgeMoment,
+    PointForce,
+    Potential,
+)
 from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field, pattern_on_edge
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
@@ -49,7 +58,9 @@ class Weighted:
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
 
-def entries(V: fem.FunctionSpace, along: Expr, on: Weighted, log: KernelLog, name: str = "load vector") -> Entries:
+def entries(
+    V: fem.FunctionSpace, along: Expr, on: Weighted, log: KernelLog, name: str = "load vector"
+) -> Entries:
     """Owned entries of l with l . u = integral of along . u."""
     load = fem.assemble_vector(log.compile(name, ufl.dot(along, ufl.TestFunction(V)) * on))
     load.scatter_reverse(InsertMode.add)
@@ -64,7 +75,11 @@ def smooth(x: Expr, radius: Expr) -> Expr:
 
 
 def averaged(
-    V: fem.FunctionSpace, direction: NDArray[np.float64], on: Weighted, log: KernelLog, radius: float | None = None
+    V: fem.FunctionSpace,
+    direction: NDArray[np.float64],
+    on: Weighted,
+    log: KernelLog,
+    radius: float | None = None,
 ) -> Entries:
     """l with l . u = average of direction . u; the total is exact on any mesh.
 
@@ -89,13 +104,18 @@ def averaged(
 
 
 def point_entries(
-    V: fem.FunctionSpace, x: NDArray[np.float64], direction: NDArray[np.float64], beside: Inside | None = None
+    V: fem.FunctionSpace,
+    x: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    beside: Inside | None = None,
 ) -> Entries:
     """l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values.
 
     `beside` are the cells that may have it; None for all.
     """
-    near = fem.locate_dofs_geometrical(V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9)
+    near = fem.locate_dofs_geometrical(
+        V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9
+    )
     owned = near[near < V.dofmap.index_map.size_local]
     if beside is not None:
         owned = owned[np.isin(owned, V.dofmap.list[beside])]
@@ -131,15 +151,21 @@ def patch_entries(
     return averaged(V, direction, Weighted(weight, dx), log, radius)
 
 
-def vertex_normal(r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None) -> NDArray[np.float64]:
-    """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those of some cells."""
+def vertex_normal(
+    r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None
+) -> NDArray[np.float64]:
+    """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those
+    of some cells.
+    """
     _, near, (a1, a2) = _corners(r0, x, beside)
     total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
     return np.asarray(total / np.linalg.norm(total))
 
 
 def by_vertex_normal(r0: fem.Function, x: Array, v: Array, beside: Inside | None = None) -> Array:
-    """Derivatives (own cells, nodes, 3) of its component along v by the places of nodes; collective."""
+    """Derivatives (own cells, nodes, 3) of its component along v by the places of nodes;
+    collective.
+    """
     table, near, (a1, a2) = _corners(r0, x, beside)
     total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
     size = np.linalg.norm(total)
@@ -149,13 +175,17 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, beside: Inside | None
 
 
 def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, Inside, Array]:
-    """Slopes of functions (2, corners, nodes); which corners of own cells are at a vertex, and tangents at all."""
+    """Slopes of functions (2, corners, nodes); which corners of own cells are at a vertex, and
+    tangents at all.
+    """
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-    near = np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
+    near = (
+        np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
+    )
     near = near if beside is None else near & beside[:owned, None]
     return gradients, near, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
@@ -171,9 +201,15 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
     if load.varies:
         unit = E * t if load.edge else E * t / R
         pattern = _pattern(load, Q, R, 1 / unit)
-        return EdgeForce(load.edge, pattern, total=False) if load.edge else AreaForce(_over(load), pattern)
+        return (
+            EdgeForce(load.edge, pattern, total=False)
+            if load.edge
+            else AreaForce(_over(load), pattern)
+        )
     force = np.asarray(
-        (1 / mirror.copies if mirror and shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R)
+        (1 / mirror.copies if mirror and shared else 1.0)
+        * (Q @ (load.force or np.zeros(3)))
+        / (E * t * R)
     )
     if load.at is not None:
         return PointForce(load.at, force)
@@ -183,12 +219,16 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
-        return EdgeForce(load.edge, np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * t)), total=False)
+        return EdgeForce(
+            load.edge, np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * t)), total=False
+        )
     if load.pressure is not None:
         assert isinstance(load.pressure, float | int)
         return AreaForce(_over(load), load.pressure * R / (E * t))
     assert load.per_area is not None
-    return AreaForce(_over(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t)))
+    return AreaForce(
+        _over(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t))
+    )
 
 
 def _over(load: DeadLoadSection) -> str | None:
@@ -206,7 +246,10 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
 def account(context: Context, loads: Loads) -> Account:
     """Forces and dead loads."""
     patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
-    words = [f"force on a patch of radius {patch:g} h" if patch else "force at a point" for patch in patches]
+    words = [
+        f"force on a patch of radius {patch:g} h" if patch else "force at a point"
+        for patch in patches
+    ]
     if dead := loads.all_dead:
         words.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
     return Account(words, [] if loads.forces else ["force: none"])
@@ -230,7 +273,9 @@ class Measures(Protocol):
         """Undeformed area of a named patch, or of all."""
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        """A pattern on the undeformed mid-surface or an edge, and the integral of its size as of `pattern_field`."""
+        """A pattern on the undeformed mid-surface or an edge, and the integral of its size as of
+        `pattern_field`.
+        """
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         """The load vector of a force at a named vertex."""
@@ -245,10 +290,11 @@ class DeadLoads:
     entries
         l with l . u = their work at u, in E h R^2.
     size
-        The sum of their sizes over E h R: of a force its length, of a distributed one that of its integral's
-        density.
+        The sum of their sizes over E h R: of a force its length, of a distributed one that of its
+        integral's density.
     spread
-        Of those that are spread: the density, where it is, and whether it has been divided by how large that is.
+        Of those that are spread: the density, where it is, and whether it has been divided by how
+        large that is.
     sizes
         What `size` is as forms, where it depends on the placement.
     """
@@ -259,7 +305,9 @@ class DeadLoads:
     sizes: "Sequence[ufl.Form]" = ()
 
 
-def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog) -> DeadLoads:
+def assemble_dead_loads(
+    loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog
+) -> DeadLoads:
     """The load vector of all but the moments; collective."""
     parts, size = list[Entries](), 0.0
     everywhere, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
@@ -267,13 +315,19 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(V.mesh, value)
 
-    def spread(along: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False) -> None:
+    def spread(
+        along: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False
+    ) -> None:
         parts.append(entries(V, along, measure, log))
         everywhere.append((along, measure, total))
         if not total:
-            sizes.append((constant(strength) if isinstance(strength, float) else strength) * measure)
+            sizes.append(
+                (constant(strength) if isinstance(strength, float) else strength) * measure
+            )
 
-    def spread_pattern(pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False) -> float:
+    def spread_pattern(
+        pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False
+    ) -> float:
         """The integral of its size."""
         along, whole = on.field(pattern, edge)
         strength = ufl.sqrt(ufl.dot(along, along))
@@ -328,7 +382,12 @@ class SurfaceMeasures:
     """`Measures` of a mid-surface."""
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
-        self._V, self._midsurface, self._degree, self._r0 = r0.function_space, midsurface, degree, r0
+        self._V, self._midsurface, self._degree, self._r0 = (
+            r0.function_space,
+            midsurface,
+            degree,
+            r0,
+        )
         self._j0 = kin.jet(r0, midsurface.mesh)
         self.normal = kin.normal(self._j0)
 

@@ -28,7 +28,9 @@ LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
 
 
 class Place(Direction):
-    """A direction from the centre of a hemisphere or cap, `polar: 0` of a pole, centre or tip; or a named point."""
+    """A direction from the centre of a hemisphere or cap, `polar: 0` of a pole, centre or tip; or a
+    named point.
+    """
 
     point: str | None = None
     """Name of a point of `points`, on any geometry"""
@@ -43,7 +45,8 @@ class Place(Direction):
 class IndentationSection(PathStep):
     """A dead force along the undeformed normal at one place of the shell.
 
-    F > 0 pushes in. With `until: points` a depth may be given that the mesh shall be fine enough for.
+    F > 0 pushes in. With `until: points` a depth may be given that the mesh shall be fine enough
+    for.
     """
 
     amplitude: ClassVar[str] = "force"
@@ -98,7 +101,9 @@ class IndentationSection(PathStep):
         if not outline.sphere:
             return np.asarray(outline.embedding(outline.highest[None])[0])
         if 0 < polar < 1 / context.shell.R_over_h:
-            raise CaseError(f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole")
+            raise CaseError(
+                f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole"
+            )
         chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
         return np.asarray(outline.embedding(chart[None])[0])
 
@@ -106,9 +111,15 @@ class IndentationSection(PathStep):
         if self.at.point is not None or not outline.sphere:
             return super().chart_of(place, outline, turn, half=half)
         polar, theta = radians(self.at.polar), radians(self.at.azimuth) - turn
-        return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
+        return (
+            polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)])
+            if polar
+            else np.zeros(2)
+        )
 
-    def refuse_unfit_place(self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array) -> None:
+    def refuse_unfit_place(
+        self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
+    ) -> None:
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, width or 1.0)
         most = room * context.shell.R_over_h
@@ -140,9 +151,15 @@ class IndentationSection(PathStep):
         return 2.0 if fit.solid else 2.8
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.models.shell.parameters import Force  # the solver takes long to import
+        from magshell_fenicsx.models.shell.parameters import (
+            Force,
+        )  # the solver takes long to import
 
-        return {"forces": {step.name: Force(modelled.vertices[step.name], self.patch / context.shell.R_over_h)}}
+        return {
+            "forces": {
+                step.name: Force(modelled.vertices[step.name], self.patch / context.shell.R_over_h)
+            }
+        }
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         if self.until == "zero":

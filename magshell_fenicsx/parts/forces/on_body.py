@@ -11,7 +11,13 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, face_measure
-from magshell_fenicsx.models.shell.patterns import Pattern, cells_of_body, places_in_body, refuse_unbounded, shown
+from magshell_fenicsx.models.shell.patterns import (
+    Pattern,
+    cells_of_body,
+    places_in_body,
+    refuse_unbounded,
+    shown,
+)
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead_load import Entries, Weighted, averaged, smooth, within
 from magshell_fenicsx.platform import compat
@@ -36,23 +42,33 @@ class BodyMeasures:
         self._thickness.x.array[:] = body.at_nodes(Q, body.thickness)
 
     def edge(self, name: str) -> Weighted:
-        return Weighted(1 / self._thickness, face_measure(self._body.mesh, [self._body.faces[name]])(1))
+        return Weighted(
+            1 / self._thickness, face_measure(self._body.mesh, [self._body.faces[name]])(1)
+        )
 
     def area(self, patch: str | None) -> Weighted:
         body, weight = self._body, 1 / self._thickness
         if patch is not None:
             weight = weight * within(body.mesh, patch_of(body.patches, patch))
-        return Weighted(weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4}))
+        return Weighted(
+            weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4})
+        )
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
         nodes, normals = places_in_body(self._V)
-        z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[self._V.dofmap.list]
-        field = fem.Function(fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,))))
+        z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[
+            self._V.dofmap.list
+        ]
+        field = fem.Function(
+            fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,)))
+        )
         vectors = pattern(nodes - z[..., None] * normals, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
         if edge is None:
             middle = replace(cells_of_body(self._V), nodal=nodes - z[..., None] * normals)
-            vectors = shown(pattern, middle, vectors, field.function_space.element.basix_element).nodal
+            vectors = shown(
+                pattern, middle, vectors, field.function_space.element.basix_element
+            ).nodal
         field.x.array.reshape(-1, 3)[field.function_space.dofmap.list] = vectors
         return field, None
 
@@ -67,14 +83,18 @@ class BodyMeasures:
             ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0
         )  # and not through a closed shell
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": SMOOTH})
-        return averaged(self._V, force, Weighted(within * smooth(d - height * normal, radius), dx), self._log)
+        return averaged(
+            self._V, force, Weighted(within * smooth(d - height * normal, radius), dx), self._log
+        )
 
     def _reach(self, x: Array, n: Array) -> float:
         """Distance from the normal line at x of the farthest node of the cells around it."""
         X = self._body.mesh.geometry.x[compat.corner_numbers(self._body.mesh)] - x
         around = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
         across = around - (around @ n)[..., None] * n
-        return float(self._V.mesh.comm.allreduce(np.linalg.norm(across, axis=2).max(initial=0.0), MPI.MAX))
+        return float(
+            self._V.mesh.comm.allreduce(np.linalg.norm(across, axis=2).max(initial=0.0), MPI.MAX)
+        )
 
 
 def thickness_at(body: Body, x: Array) -> float:
@@ -83,10 +103,14 @@ def thickness_at(body: Body, x: Array) -> float:
     return float(body.mesh.comm.allreduce(body.thickness[near].max(initial=0.0), MPI.MAX))
 
 
-def outer_patch(body: Body, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog) -> Entries:
+def outer_patch(
+    body: Body, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
+) -> Entries:
     """An inward force averaged over the outer face around a point, with the weight `smooth`."""
     x, normal = body.points[point], body.normals[point]
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)
     ds = face_measure(body.mesh, [body.faces[OUTER]])(1)
-    return averaged(V, -normal, Weighted(smooth(ufl.SpatialCoordinate(body.mesh) - centre, a), ds), log, radius)
+    return averaged(
+        V, -normal, Weighted(smooth(ufl.SpatialCoordinate(body.mesh) - centre, a), ds), log, radius
+    )

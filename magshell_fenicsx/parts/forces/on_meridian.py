@@ -1,4 +1,6 @@
-"""Loads that keep their direction and leave the rotation, as energies on the meridian that are linear in u."""
+"""Loads that keep their direction and leave the rotation, as energies on the meridian that are
+linear in u.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +15,13 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, Force, PointForce
+from magshell_fenicsx.models.shell.parameters import (
+    AreaForce,
+    DeadLoad,
+    EdgeForce,
+    Force,
+    PointForce,
+)
 from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead_load import within
@@ -37,14 +45,20 @@ class Around:
         for load in forces(loads):
             if isinstance(load, AreaForce):
                 continue
-            of = self.meridian.facets_at(load.point) if isinstance(load, PointForce) else self.meridian.ends[load.edge]
+            of = (
+                self.meridian.facets_at(load.point)
+                if isinstance(load, PointForce)
+                else self.meridian.ends[load.edge]
+            )
             if not any(np.array_equal(of, part) for part in parts):
                 parts.append(of)
         return replace(self, parts=parts, measures=self.carrier.each_ds(parts) if parts else [])
 
     def _ds(self, facets: Facets) -> ufl.Measure:
         each = zip(self.parts, self.measures, strict=True)
-        return next((ds for part, ds in each if np.array_equal(part, facets)), None) or self.carrier.ds(facets)
+        return next(
+            (ds for part, ds in each if np.array_equal(part, facets)), None
+        ) or self.carrier.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
         """Along the undeformed circle of an end, or the mean over that."""
@@ -76,11 +90,17 @@ class Around:
 def dead_loads(
     name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog
 ) -> tuple[Energy, float, Sequence[ufl.Form]]:
-    """All except the moments, with an amplitude's name; the sum of their sizes over E h R, and its forms.
+    """All except the moments, with an amplitude's name; the sum of their sizes over E h R, and its
+    forms.
 
     Vectors are along e3, and points are on the axis.
     """
-    parts, size, sizes, on = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form](), on.with_parts(loads)
+    parts, size, sizes, on = (
+        list[tuple[Expr, Integral]](),
+        0.0,
+        list[ufl.Form](),
+        on.with_parts(loads),
+    )
     for load in forces(loads):
         if isinstance(load, PointForce):
             over = on.pole(load.point)
@@ -98,7 +118,10 @@ def dead_loads(
             continue
         whole = _whole(over, on, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
-            along, strength = -kin.normal(on.carrier.j0) * on.carrier.constant(load.force), abs(load.force)
+            along, strength = (
+                -kin.normal(on.carrier.j0) * on.carrier.constant(load.force),
+                abs(load.force),
+            )
         else:
             vector = np.asarray(load.force)
             along, strength = on.carrier.constant(vector), float(np.linalg.norm(vector))
@@ -107,15 +130,22 @@ def dead_loads(
         sizes.append(2 * np.pi * over(on.carrier.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
-        return sum((over(-ufl.dot(along, u.r)) for along, over in parts[1:]), parts[0][1](-ufl.dot(parts[0][0], u.r)))
+        return sum(
+            (over(-ufl.dot(along, u.r)) for along, over in parts[1:]),
+            parts[0][1](-ufl.dot(parts[0][0], u.r)),
+        )
 
     return Energy(name, energy, name, linear=True), size, sizes
 
 
 def pole_force(name: str, force: Force, unit: float, on: Around, log: KernelLog) -> Energy:
-    """A force against the outward normal at a point on the axis, or spread over a patch of that radius."""
+    """A force against the outward normal at a point on the axis, or spread over a patch of that
+    radius.
+    """
     over = on.patch(force.patch, force.point) if force.patch else on.pole(force.point)
-    begins = np.isclose(on.meridian.cells[:, 0], on.meridian.points[force.point][0]).any()  # the normal is e3 there
+    begins = np.isclose(
+        on.meridian.cells[:, 0], on.meridian.points[force.point][0]
+    ).any()  # the normal is e3 there
     share = on.carrier.constant((1.0 if begins else -1.0) * unit / _whole(over, on, log))
     return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
 

@@ -1,4 +1,6 @@
-"""A measured imperfection: places and heights from a file, their feet on the perfect surface, a smooth function."""
+"""A measured imperfection: places and heights from a file, their feet on the perfect surface, a
+smooth function.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +32,10 @@ MOST_ROWS = 300_000
 MOST_H, MOST_R = 50.0, 0.5  # largest |w0| over h and over R
 FAR = 0.5  # distance over R beyond which a place is not of this shell
 SAME = 0.2  # of the typical distance of neighbours, below which values are averaged
-HOLE, GAPS = 3.0, 4.0  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
+HOLE, GAPS = (
+    3.0,
+    4.0,
+)  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
 SMALLEST, SHOWN = 0.45, 2.0  # element size over sqrt(R h), and over the length of the sharpest bend
 STEPS, STEP = 30, 1e-5  # of Newton's method, and of differences in the chart
 AROUND = 12  # nodes of a mesh file that a quadric goes through
@@ -38,11 +43,12 @@ _fits: dict[tuple[str | None, ...], "_Fit"] = {}  # a run plans its case several
 
 
 class DataSection(FileKeys, ImperfectionSection):
-    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function fits it.
+    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth
+    function fits it.
 
-    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in
-    degrees; or x, y, z of the real surface. A header such as x [mm], w0 [um] has units; without one, places are in
-    the shell's length and w0 is over h.
+    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0
+    (cylinders), angles in degrees; or x, y, z of the real surface. A header such as x [mm], w0 [um]
+    has units; without one, places are in the shell's length and w0 is over h.
     """
 
     kind: Literal["data"]
@@ -74,7 +80,9 @@ class DataSection(FileKeys, ImperfectionSection):
             except TableError as e:
                 raise CaseError(f"{key}.file: {self.file}: {e}") from None
         fit = _fits[this]
-        return Flaw(Factored(fit.function, self.amplitude), fit.size, account=f"{self.file}: {fit.account}")
+        return Flaw(
+            Factored(fit.function, self.amplitude), fit.size, account=f"{self.file}: {fit.account}"
+        )
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,9 @@ class Lengths:
     si: bool
 
     def over_R(self, unit: str | None, name: str) -> float:
-        """The size of a column's unit over R; without one, w0 is over h and a place in the case's length."""
+        """The size of a column's unit over R; without one, w0 is over h and a place in the case's
+        length.
+        """
         if unit in ("h", "R"):
             return self.h if unit == "h" else 1.0
         if unit is None:
@@ -141,7 +151,12 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     """
     columns, units = read_table(file, files or Files())
     wanted = next(
-        (names for names in PLACES if set(names) <= columns.keys() and ("w0" in columns or len(names) == 3)), None
+        (
+            names
+            for names in PLACES
+            if set(names) <= columns.keys() and ("w0" in columns or len(names) == 3)
+        ),
+        None,
     )
     if wanted is None:
         raise TableError(
@@ -149,9 +164,17 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
             "real surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
         )
     names = [*wanted, *(["w0"] if "w0" in columns else [])]
-    if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
-        raise TableError("column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]")
-    return _finite_rows(names, [columns[name] * _factor(units[name], name, lengths) for name in names])
+    if (
+        "w0" in units
+        and units["w0"] is None
+        and any(units[name] for name in wanted if name not in ANGLES)
+    ):
+        raise TableError(
+            "column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]"
+        )
+    return _finite_rows(
+        names, [columns[name] * _factor(units[name], name, lengths) for name in names]
+    )
 
 
 def _factor(unit: str | None, name: str, lengths: Lengths) -> float:
@@ -168,10 +191,14 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
     except ValueError:
         raise TableError("its arrays have different lengths") from None
     if len(rows) > MOST_ROWS:
-        raise TableError(f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average neighbours")
+        raise TableError(
+            f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average neighbours"
+        )
     good = np.isfinite(rows).all(axis=1)
     if good.sum() < max(20, len(rows) // 2):
-        raise TableError(f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of the rows")
+        raise TableError(
+            f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of the rows"
+        )
     return Scan(dict(zip(names, rows[good].T, strict=True)), int((~good).sum()))
 
 
@@ -183,7 +210,9 @@ class _Fit:
 
 
 def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
-    """The smooth function; `standard` is the standard deviation of the noise over h, None to estimate it."""
+    """The smooth function; `standard` is the standard deviation of the noise over h, None to
+    estimate it.
+    """
     import scipy
 
     from magshell_fenicsx.mesh.scattered import scattered
@@ -219,7 +248,9 @@ def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
         f"largest gap {gaps.max():.3g} R"
     )
     lost = f", {scan.lost} rows without a number left out" if scan.lost else ""
-    return _Fit(function, max(SHOWN * _bend(function, surface, sqrt(h)), SMALLEST * sqrt(h)), account + lost)
+    return _Fit(
+        function, max(SHOWN * _bend(function, surface, sqrt(h)), SMALLEST * sqrt(h)), account + lost
+    )
 
 
 def _on_surface(scan: Scan, ground: Ground, surface: Array) -> tuple[Array, Array]:
@@ -231,10 +262,16 @@ def _on_surface(scan: Scan, ground: Ground, surface: Array) -> tuple[Array, Arra
         assert w0 is not None
         polar = columns.get("polar")
         if ground.geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
-            angles = "azimuth and z are of a cylinder" if polar is None else "polar and azimuth are of a sphere"
+            angles = (
+                "azimuth and z are of a cylinder"
+                if polar is None
+                else "polar and azimuth are of a sphere"
+            )
             raise TableError(f"{angles}; on geometry: {ground.geometry} give x, y, z")
         rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
-        return np.column_stack([rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]), w0
+        return np.column_stack(
+            [rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]
+        ), w0
     x = np.column_stack([columns[name] for name in "xyz"])
     away = scipy.spatial.cKDTree(surface).query(x)[0]
     if away.max() > FAR:
@@ -260,11 +297,15 @@ def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     _, cell = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell)
-    return np.column_stack([np.bincount(cell, c) / count for c in places.T]), np.bincount(cell, w0) / count
+    return np.column_stack([np.bincount(cell, c) / count for c in places.T]), np.bincount(
+        cell, w0
+    ) / count
 
 
 def _bend(function: "Scattered", x: Array, length: float) -> float:
-    """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over a length over R."""
+    """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over
+    a length over R.
+    """
     x = x[:: max(1, len(x) // 2000)]
     w, d = function(x), 0.7 * length
     bent = sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
@@ -273,7 +314,8 @@ def _bend(function: "Scattered", x: Array, length: float) -> float:
 
 
 def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
-    """Feet (n, 3) of the normals through places x (n, 3), all over R, and the heights (n,) of these above the surface.
+    """Feet (n, 3) of the normals through places x (n, 3), all over R, and the heights (n,) of these
+    above the surface.
 
     Of a mesh file, on quadrics through its nodes.
     """
@@ -287,8 +329,13 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
     sample = perfect.sample()
     nearest, again = np.unique(scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True)
     chart = np.array([perfect.inverse(place) for place in sample[nearest]])[again]
-    for _ in range(STEPS):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
-        along = [(perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * STEP) for e in STEP * np.eye(2)]
+    for _ in range(
+        STEPS
+    ):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
+        along = [
+            (perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * STEP)
+            for e in STEP * np.eye(2)
+        ]
         J = np.stack(along, axis=-1)
         off = np.einsum("nij,ni->nj", J, x - perfect.perfect(chart))
         step = np.linalg.solve(np.einsum("nij,nik->njk", J, J), off[..., None])[..., 0]
@@ -311,8 +358,12 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
     first /= np.linalg.norm(first, axis=1)[:, None]
     frame = np.stack([first, np.cross(normal, first), normal], axis=1)
-    s, t, z = np.moveaxis(np.einsum("nkj,nij->nki", nodes[near, :3] - centre[:, None], frame), -1, 0)
-    quadric = np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]
+    s, t, z = np.moveaxis(
+        np.einsum("nkj,nij->nki", nodes[near, :3] - centre[:, None], frame), -1, 0
+    )
+    quadric = (
+        np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]
+    )
     a, b, c, d, e, f = quadric[..., 0].T
     p, q, height = np.einsum("nj,nij->ni", x - centre, frame).T
     slope_s, slope_t = b + 2 * d * p + e * q, c + e * p + 2 * f * q

@@ -31,8 +31,8 @@ class Dimple(Local):
 class DimpleSection(LocalSection):
     """w0 = -δ (1 - (φ/φo)²)² around a place, within the distance φo.
 
-    On spheres φ is the angle from the place, at a pole of revolution the distance along the meridian over R,
-    elsewhere the straight distance over R.
+    On spheres φ is the angle from the place, at a pole of revolution the distance along the
+    meridian over R, elsewhere the straight distance over R.
     """
 
     patch: ClassVar[bool] = True

@@ -32,7 +32,8 @@ class FormulaSection(ImperfectionSection):
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
     def flaw(self, ground: Ground, key: str) -> Flaw:
-        """See `ImperfectionSection`; the element size is 2.5/k of the shortest wave sin(k x) that it resembles.
+        """See `ImperfectionSection`; the element size is 2.5/k of the shortest wave sin(k x) that
+        it resembles.
 
         Raises
         ------
@@ -48,7 +49,10 @@ class FormulaSection(ImperfectionSection):
                 f"{key}.w0: {shown(self.w0)}: has no finite value, or one above half a radius, at (x, y, z)/R = "
                 f"({place})"
             )
-        largest, derived = np.ptp(deviation(x)) / abs(deviation.factor or 1.0), with_derivatives(self.w0)
+        largest, derived = (
+            np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
+            with_derivatives(self.w0),
+        )
 
         def sizes(places: Array) -> Array:
             """2.5/k of the wave with the depth of the whole and the curvature of each place."""

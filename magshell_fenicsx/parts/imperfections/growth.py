@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 
 class ImperfectionStep(LoadStep):
-    """An imperfection grows: the factor of its w0, from 0 (the shell without it) to 1 (as given) and beyond.
+    """An imperfection grows: the factor of its w0, from 0 (the shell without it) to 1 (as given)
+    and beyond.
 
-    Displacements are measured from the shape without stress, which grows too; volumes from the shape as drawn.
-    Directions and areas of dead loads, thickness and remanence by formula are those of the drawn shape. `until: target`
-    ends at a factor.
+    Displacements are measured from the shape without stress, which grows too; volumes from the
+    shape as drawn. Directions and areas of dead loads, thickness and remanence by formula are those
+    of the drawn shape. `until: target` ends at a factor.
     """
 
     amplitude: ClassVar[str] = "imperfection"
@@ -46,25 +47,40 @@ class ImperfectionStep(LoadStep):
         return f"{step.name} grows: {', '.join(self.multiplies(step, context))}"
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        return {"growing": {step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))}}
+        return {
+            "growing": {
+                step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))
+            }
+        }
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         keys: Mapping[str, object] = context.sections["imperfections"]
         names = context.loads(ImperfectionStep)
         context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
         if not keys:
-            raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
+            raise ValueError(
+                f"{step.key}.kind: imperfection: the case has none; give shell.imperfections"
+            )
         if not grown_by([step], keys)[step.name]:
-            raise ValueError(f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from 0")
+            raise ValueError(
+                f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from 0"
+            )
         if names[step.name].item is None and len(names) > 1:
-            raise ValueError(f"{step.key}.item: give it: another step grows another item of shell.imperfections")
+            raise ValueError(
+                f"{step.key}.item: give it: another step grows another item of shell.imperfections"
+            )
 
 
 class GrowingSeen(Seen):
     """The amplitudes of imperfections that grow."""
 
     quantities = (
-        Quantity("imperfection", "imperfection", "Factor of the imperfections that grow; 0: without them.", "load"),
+        Quantity(
+            "imperfection",
+            "imperfection",
+            "Factor of the imperfections that grow; 0: without them.",
+            "load",
+        ),
     )
 
     def named(self, loads: "Loads") -> tuple[str, ...]:
@@ -72,7 +88,9 @@ class GrowingSeen(Seen):
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:
-    """Amplitude of a step -> the keys below `shell`, among those given, of the imperfections that it multiplies."""
+    """Amplitude of a step -> the keys below `shell`, among those given, of the imperfections that
+    it multiplies.
+    """
     items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
 
     def grows(key: str, item: int | None) -> bool:

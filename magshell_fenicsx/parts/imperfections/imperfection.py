@@ -1,4 +1,6 @@
-"""What all imperfections have in common: their sections, sizes with units, and what they bring to a problem."""
+"""What all imperfections have in common: their sections, sizes with units, and what they bring to a
+problem.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,7 +9,13 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
+from pydantic import (
+    BeforeValidator,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+)
 
 from magshell_fenicsx.input.section import Section, Sized, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
@@ -18,14 +26,17 @@ from magshell_fenicsx.shape.ground import At, Distance, Ground, located
 Array = NDArray[np.float64]
 Values = TypeVar("Values")
 KEYS = ("imperfections", "defect")
-CONTEXT = "of imperfections"  # key of the context of a validation: scale -> size in m, none without units
+CONTEXT = (
+    "of imperfections"  # key of the context of a validation: scale -> size in m, none without units
+)
 UNITS = {"h": "h", "width": "the unit of a dimple's width"}
 SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
 
 
 @dataclass(frozen=True)
 class Flaw:
-    """What one imperfection brings to a problem; places, lengths and w0 are over R, in the frame of the case.
+    """What one imperfection brings to a problem; places, lengths and w0 are over R, in the frame of
+    the case.
 
     Attributes
     ----------
@@ -44,8 +55,8 @@ class Flaw:
     account
         What it was made from, for people.
     sizes
-        Places (n, 3) -> element sizes (n,) that show it there, of one without a centre that varies more in some
-        places; None where they are alike.
+        Places (n, 3) -> element sizes (n,) that show it there, of one without a centre that varies
+        more in some places; None where they are alike.
     """
 
     deviation: Deviation
@@ -121,7 +132,9 @@ def half_width(width: float, R_over_h: float, nu: float) -> float:
 
 
 def over(scale: Literal["h", "width"]) -> BeforeValidator:
-    """A validator: a length with a unit -> a number over h, or in the unit of a dimple's width; or a number."""
+    """A validator: a length with a unit -> a number over h, or in the unit of a dimple's width; or
+    a number.
+    """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, str):
@@ -131,14 +144,19 @@ def over(scale: Literal["h", "width"]) -> BeforeValidator:
             return 1.0  # the shell is wrong: any number will do
         sizes = (info.context or {}).get(CONTEXT)
         if not sizes:
-            raise ValueError(f"has a unit: that needs lengths of the shell with units; a number is in {UNITS[scale]}")
+            raise ValueError(
+                f"has a unit: that needs lengths of the shell with units; a number is in {UNITS[scale]}"
+            )
         return exact / sizes[scale]
 
     return BeforeValidator(convert, json_schema_input_type=float | with_unit("millimetre"))
 
 
-def note_sizes(data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool) -> None:
-    """Note what the imperfections in plain data of a shell are over: the shell without them has these sizes.
+def note_sizes(
+    data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool
+) -> None:
+    """Note what the imperfections in plain data of a shell are over: the shell without them has
+    these sizes.
 
     A wrong shell has none: its own message says what is wrong.
     """
@@ -169,7 +187,9 @@ def _imperfections(data: dict[str, Any]) -> list[Any]:
 
 
 def _has_text(part: Any) -> bool:
-    """Whether a part of plain data has text that begins with a number, or the unit of random numbers."""
+    """Whether a part of plain data has text that begins with a number, or the unit of random
+    numbers.
+    """
     if isinstance(part, dict):
         return any(key == "unit" or _has_text(value) for key, value in part.items())
     if isinstance(part, list):
@@ -209,7 +229,9 @@ class ImperfectionSection(Section):
         return False
 
     def listed(self) -> "Mapping[str, ImperfectionSection]":
-        """What is built of it: itself, or others by their keys below its own, which begin with a dot."""
+        """What is built of it: itself, or others by their keys below its own, which begin with a
+        dot.
+        """
         return {"": self}
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
@@ -269,7 +291,9 @@ def _refuse_steep(depth: float, slope: float) -> None:
     if depth > 0.5:
         raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
     if slope > 2:
-        raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
+        raise ValueError(
+            f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2"
+        )
 
 
 @dataclass(frozen=True)
@@ -282,7 +306,9 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
         """See that the shell can have them."""
         shell = context.shell
         if getattr(shell, "defect", None) and shell.imperfections:
-            raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
+            raise ValueError(
+                "shell.imperfections: give these or defect; a dimple of the list is the same as defect"
+            )
         edge = None if shell.edge_polar is None else radians(shell.edge_polar)
         for key, section in self.given.items():
             try:

@@ -30,13 +30,16 @@ SHOWN = 1.2  # of sqrt(R h): elements that show a mode
 class ModesSection(FileKeys, ImperfectionSection):
     """The lowest modes of the perfect shell where it first becomes unstable under the case's loads.
 
-    A pressure goes on to there, whatever its target; under other loads without an instability they are those at the
-    end. Of each its displacement along the normal, inwards positive, over the largest one. Of several shells they are
-    the modes of all together, perfect, and each has its part: the largest one may be on another shell.
+    A pressure goes on to there, whatever its target; under other loads without an instability they
+    are those at the end. Of each its displacement along the normal, inwards positive, over the
+    largest one. Of several shells they are the modes of all together, perfect, and each has its
+    part: the largest one may be on another shell.
     """
 
     kind: Literal["modes"]
-    amplitudes: Annotated[list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)]
+    amplitudes: Annotated[
+        list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)
+    ]
     """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest [h]"""
     file: str | None = None
     """A mode file of a run (fields/mode_*.vtu), its path from the folder of the case, in place of computed modes"""
@@ -60,7 +63,9 @@ class ModesSection(FileKeys, ImperfectionSection):
 
     @property
     def shapes(self) -> tuple[Shape, ...] | None:
-        """The modes as functions of places over R, 1 where inwards largest; None until they are computed."""
+        """The modes as functions of places over R, 1 where inwards largest; None until they are
+        computed.
+        """
         return self._shapes
 
     @property
@@ -72,7 +77,8 @@ class ModesSection(FileKeys, ImperfectionSection):
         return self.file is None
 
     def become(self, modes: "Sequence[Mode]", name: str = "", place: Place | None = None) -> None:
-        """Take the modes of the perfect shell, or the parts of the shell `name` in those of several.
+        """Take the modes of the perfect shell, or the parts of the shell `name` in those of
+        several.
 
         Raises
         ------
@@ -86,7 +92,9 @@ class ModesSection(FileKeys, ImperfectionSection):
             return Placed(mode.parts[name], place) if place and name in mode.parts else None
 
         parts = [own(mode) for mode in modes[: len(self.amplitudes)]]
-        counted = [part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude]
+        counted = [
+            part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude
+        ]
         if counted and not any(counted):
             raise ValueError(
                 f"amplitudes: of the {len(parts)} lowest modes of all shells together those with an amplitude do not "
@@ -109,7 +117,10 @@ class ModesSection(FileKeys, ImperfectionSection):
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
         waves = [getattr(shape, "m", None) for shape in shapes]
         names = [f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(waves, 1)]
-        words = [f"{a:g} h of {self.file or name}" for a, name in zip(self.amplitudes, names, strict=False)]
+        words = [
+            f"{a:g} h of {self.file or name}"
+            for a, name in zip(self.amplitudes, names, strict=False)
+        ]
         account = ", ".join(words) or "modes that the run computes"
         return Flaw(Modes(shapes, amplitudes), SHOWN * sqrt(h), account=account)
 
@@ -141,7 +152,9 @@ class Round:
 
 @dataclass(frozen=True)
 class Mirrored:
-    """A mode on one side of a plane, and its image with a sign on the other: symmetric to the last digit."""
+    """A mode on one side of a plane, and its image with a sign on the other: symmetric to the last
+    digit.
+    """
 
     shape: Shape
     mirror: Mirror
@@ -191,11 +204,16 @@ def on_surface(places: Array, w: Array, cover: Array) -> "Scattered":
 
 
 def on_meridian(places: Array, f: Array, m: int) -> Round:
-    """A wave around e3 from these displacements (n,) at places (n, 3) of the meridian, with its parity across e3."""
+    """A wave around e3 from these displacements (n,) at places (n, 3) of the meridian, with its
+    parity across e3.
+    """
     from magshell_fenicsx.mesh.scattered import scattered
 
     if places[:, 0].min() < ON_AXIS:
-        places, f = np.vstack([places, places * [-1.0, 1.0, 1.0]]), np.concatenate([f, (-1) ** m * f])
+        places, f = (
+            np.vstack([places, places * [-1.0, 1.0, 1.0]]),
+            np.concatenate([f, (-1) ** m * f]),
+        )
     return Round(scattered(places, f, places, noise=0), m)
 
 
@@ -207,16 +225,24 @@ def _read(section: ModesSection, sample: Array, key: str) -> "Scattered":
         r0, w = (np.asarray(fields[name], dtype=float) for name in ("r0", "mode_w"))
     except Exception as e:  # VTK and pyvista raise many types
         said = getattr(e, "strerror", None) or e
-        raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {said}") from None
-    if r0.shape != (len(w), 3) or not (np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0):
+        raise CaseError(
+            f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {said}"
+        ) from None
+    if r0.shape != (len(w), 3) or not (
+        np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0
+    ):
         raise CaseError(f"{key}: the mode has no finite displacement")
     if scipy.spatial.cKDTree(r0).query(sample)[0].max() > BESIDE:
-        raise CaseError(f"{key}: is the mode of another shell: it does not reach all places of this one")
+        raise CaseError(
+            f"{key}: is the mode of another shell: it does not reach all places of this one"
+        )
     return on_surface(r0, over_largest(r0, w), sample)
 
 
 def over_largest(places: Array, w: Array) -> Array:
-    """Values over the largest one with its sign; of equally large ones that of the highest place, in any order."""
+    """Values over the largest one with its sign; of equally large ones that of the highest place,
+    in any order.
+    """
     size = np.abs(w)
     near = np.flatnonzero(size > (1 - EQUAL) * size.max())
     first = near[np.lexsort(places[near].round(6).T)[-1]]

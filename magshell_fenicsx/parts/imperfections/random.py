@@ -30,8 +30,8 @@ AT_ONCE = 4096  # places
 class RandomSection(ImperfectionSection):
     """A Gaussian random field of a given size and length of correlation, or random dimples.
 
-    The field has the covariance δ² exp(-d²/(2 ℓ²)) of two places at the straight distance d. It and the dimples
-    depend on the seed alone, not on mesh, machine or ranks.
+    The field has the covariance δ² exp(-d²/(2 ℓ²)) of two places at the straight distance d. It and
+    the dimples depend on the seed alone, not on mesh, machine or ranks.
     """
 
     kind: Literal["random"]
@@ -48,7 +48,9 @@ class RandomSection(ImperfectionSection):
 
     @model_validator(mode="after")
     def _one_way(self, info: ValidationInfo) -> Self:
-        if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (self.dimples is None):
+        if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (
+            self.dimples is None
+        ):
             raise ValueError("give amplitude and length of a random field, or dimples")
         if self.dimples:
             self._sizes = sizes_noted(info)
@@ -59,7 +61,11 @@ class RandomSection(ImperfectionSection):
         return f"random field of {self.amplitude:g} h, seed {self.seed}"
 
     def listed(self) -> Mapping[str, ImperfectionSection]:
-        return {f".{key}": dimple for key, dimple in self.drawn.items()} if self.dimples else {"": self}
+        return (
+            {f".{key}": dimple for key, dimple in self.drawn.items()}
+            if self.dimples
+            else {"": self}
+        )
 
     @cached_property
     def drawn(self) -> Mapping[str, DimpleSection | GaussianSection]:
@@ -72,7 +78,9 @@ class RandomSection(ImperfectionSection):
             sections = [kind.model_validate(item, context=dict(self._sizes)) for item in items]
         except ValidationError as e:
             first = e.errors()[0]
-            raise ValueError(f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}") from None
+            raise ValueError(
+                f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}"
+            ) from None
         return {f"dimples.{i}": each for i, each in enumerate(sections)}
 
     def flaw(self, ground: Ground, key: str) -> Flaw:
@@ -87,8 +95,8 @@ class RandomSection(ImperfectionSection):
 class Waves:
     """w0(x) = delta sqrt(2/N) sum_j cos(k_j . x/length + phase_j), k_j normal, phase_j uniform.
 
-    The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)) (Shinozuka and Deodatis 1996). The
-    bits of PCG64 are the same on every machine and in every version of NumPy.
+    The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)) (Shinozuka and
+    Deodatis 1996). The bits of PCG64 are the same on every machine and in every version of NumPy.
     """
 
     delta: float

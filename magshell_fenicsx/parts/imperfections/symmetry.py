@@ -1,4 +1,6 @@
-"""The symmetry that imperfections leave, by their values; and where they are in the chart, for its mesh."""
+"""The symmetry that imperfections leave, by their values; and where they are in the chart, for its
+mesh.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ from magshell_fenicsx.shape.turning import ANGLES
 Array = NDArray[np.float64]
 SAME = 1e-9  # of the largest w0
 PARTS = (0.2, 0.5, 0.8)  # of the reach, at which a local imperfection is compared
-IMAGE = 1e-12  # places, depths and widths that differ by less are equal: of w0 that is far below SAME
+IMAGE = (
+    1e-12  # places, depths and widths that differ by less are equal: of w0 that is far below SAME
+)
 FIRST = 3  # imperfections without an image that are looked at before all places are
 CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
 STEPS, ROUNDS = 40, 12
@@ -147,7 +151,9 @@ def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
         reason = "an imperfection is off the axis"
     elif drawn.span:
         places = drawn.span.between()
-        turned = [np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]]
+        turned = [
+            np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
+        ]
         if not all(_same(turned[0], w0) for w0 in turned):
             reason = "an imperfection differs around e3"
     if not drawn.round:
@@ -158,9 +164,15 @@ def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
 
 
 def _between(centres: Sequence[Array]) -> tuple[float, ...]:
-    """Azimuths (rad) of the planes through e3 that map the first place to itself or to one at the same distance."""
+    """Azimuths (rad) of the planes through e3 that map the first place to itself or to one at the
+    same distance.
+    """
     first, *others = centres
-    alike = [x for x in others if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS and abs(x[2] - first[2]) < AXIS]
+    alike = [
+        x
+        for x in others
+        if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS and abs(x[2] - first[2]) < AXIS
+    ]
     return tuple((atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *alike))
 
 
@@ -173,7 +185,9 @@ def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
         places.append(flaw.centre[None])
         chart = drawn.inverse(flaw.centre)
         if len(chart) == 2:
-            places += [drawn.perfect(contour(key, flaw, drawn, 0.0, chart, part)[::7]) for part in PARTS]
+            places += [
+                drawn.perfect(contour(key, flaw, drawn, 0.0, chart, part)[::7]) for part in PARTS
+            ]
     return np.concatenate(places)
 
 
@@ -194,7 +208,8 @@ class Spot:
     circle
         Whether its outline is a circle around the chart's origin.
     rim
-        Points (n, 2) of the closed curve on which the curvature jumps; None where it does not, and of a circle.
+        Points (n, 2) of the closed curve on which the curvature jumps; None where it does not, and
+        of a circle.
     """
 
     centre: Array
@@ -242,13 +257,17 @@ def different(local: Iterable[Spot]) -> tuple[Array, ...]:
     kept: list[Array] = []
     for spot in local:
         rim = spot.rim
-        if rim is not None and all(np.abs(rim - other).max() > SAME_RIM * spot.size for other in kept):
+        if rim is not None and all(
+            np.abs(rim - other).max() > SAME_RIM * spot.size for other in kept
+        ):
             kept.append(rim)
     return tuple(kept)
 
 
 def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, part: float) -> Array:
-    """Points (n, 2) of the chart at a part of the reach of an imperfection: the first on each ray from its centre."""
+    """Points (n, 2) of the chart at a part of the reach of an imperfection: the first on each ray
+    from its centre.
+    """
     assert flaw.distance
     distance, Q, wanted = flaw.distance, rotation(turn), part * flaw.reach
     angles = np.arange(CORNERS) * 2 * np.pi / CORNERS

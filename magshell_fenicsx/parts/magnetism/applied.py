@@ -1,8 +1,10 @@
-"""An applied flux density that is known by its values: its Taylor polynomial at the present place of each point.
+"""An applied flux density that is known by its values: its Taylor polynomial at the present place
+of each point.
 
-The polynomial of second order has the first and second derivatives of the field itself, and so have the energies that
-take it: the forms and kernels are the same for every field. A shell that has passed through a magnet between two states
-is noticed, however thin that is. The amplitudes of fields that are driven are free parameters of a system.
+The polynomial of second order has the first and second derivatives of the field itself, and so have
+the energies that take it: the forms and kernels are the same for every field. A shell that has
+passed through a magnet between two states is noticed, however thin that is. The amplitudes of
+fields that are driven are free parameters of a system.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,10 +29,11 @@ HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the pla
 
 
 def crossing(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
-    """A place (3,) inside a body on the straight ways from some places (n, 3) to others; None if there is none.
+    """A place (3,) inside a body on the straight ways from some places (n, 3) to others; None if
+    there is none.
 
-    A distance changes by at most the length of a way. So no place of a way is inside if the distances at both ends
-    add up to more than its length; the other ways are halved.
+    A distance changes by at most the length of a way. So no place of a way is inside if the
+    distances at both ends add up to more than its length; the other ways are halved.
     """
     low, high = distance(before), distance(after)
     for _ in range(HALVINGS):
@@ -77,7 +80,12 @@ class AppliedField:
     """
 
     def __init__(
-        self, of: FieldInSpace, r0: fem.Function, u: fem.Function, degree: int, driven: Sequence[Driven] = ()
+        self,
+        of: FieldInSpace,
+        r0: fem.Function,
+        u: fem.Function,
+        degree: int,
+        driven: Sequence[Driven] = (),
     ) -> None:
         V = u.function_space
         self._degree = degree
@@ -95,7 +103,9 @@ class AppliedField:
         differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
         self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
         refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
-        self.polynomial.follow(self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values()))
+        self.polynomial.follow(
+            self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values())
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,10 +127,13 @@ class AppliedField:
         Parameters
         ----------
         moved
-            Whether they are about the present places; else they are changes of the polynomials there.
+            Whether they are about the present places; else they are changes of the polynomials
+            there.
         """
         field = PointField(self._u.function_space.mesh, self._degree, SIZE)
-        field.follow(lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),))
+        field.follow(
+            lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),)
+        )
         return field
 
     def _slopes(self, name: str, other: str, *, moved: bool) -> Array:
@@ -140,12 +153,21 @@ class AppliedField:
         """The present places (n, 3) of the quadrature points."""
         return (self._r0.renew() + self._moved.renew()).reshape(-1, 3)
 
-    def passed(self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]) -> str:
-        """Through what a point has moved between two states, from their places and amplitudes; "" if through none."""
-        still: list[tuple[FieldInSpace, Driven]] = [(part, Driven(part)) for part in getattr(self._of, "parts", [])]
+    def passed(
+        self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]
+    ) -> str:
+        """Through what a point has moved between two states, from their places and amplitudes; ""
+        if through none.
+        """
+        still: list[tuple[FieldInSpace, Driven]] = [
+            (part, Driven(part)) for part in getattr(self._of, "parts", [])
+        ]
         for of, driven in [*still, *((each.of, each) for each in self._driven)]:
             if distance := getattr(of, "distance", None):
-                ways = [(x - t) @ Q for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))]
+                ways = [
+                    (x - t) @ Q
+                    for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))
+                ]
                 if crossing(distance, *ways) is not None:
                     said = getattr(of, "nowhere", "is inside a source")
                     return f"a point of the shell {said} between two points of the path"
@@ -164,7 +186,9 @@ class AppliedField:
         for of, B in [*still, *((each.of, each.at(x[None], self.mu).B) for each in self._driven)]:
             if not np.isfinite(B).all():
                 said = getattr(of, "nowhere", "is where magnetic.applied has no finite value")
-                return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
+                return (
+                    f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
+                )
         return ""
 
 
@@ -175,7 +199,8 @@ class Amplitude:
     Attributes
     ----------
     terms
-        The energies of the field. Those with an amplitude are linear in it, as in the field; what is soft is quadratic.
+        The energies of the field. Those with an amplitude are linear in it, as in the field; what
+        is soft is quadratic.
     """
 
     known: AppliedField
@@ -195,10 +220,14 @@ class Amplitude:
     def slopes(self) -> list[FormTerm]:
         """dPi/dmu: of what is linear in the field the energy in dB/dmu."""
         linear = [self._instead(t, self.known.slope(self.name)) for t in self._linear]
-        return linear + [self._along(t, self.known.slope(self.name, moved=False)) for t in self._quadratic]
+        return linear + [
+            self._along(t, self.known.slope(self.name, moved=False)) for t in self._quadratic
+        ]
 
     def bends(self, q: Any) -> Sequence[Derivative]:
-        """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its own."""
+        """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its
+        own.
+        """
         if not isinstance(q, Amplitude):
             if hasattr(q, "bends"):
                 derivatives: Sequence[Derivative] = q.bends(self)
@@ -209,7 +238,8 @@ class Amplitude:
             return []
         linear = [self._instead(t, self.known.slope(self.name, q.name)) for t in self._linear]
         both, one, other = (
-            self.known.slope(*names, moved=False) for names in ((self.name, q.name), (self.name,), (q.name,))
+            self.known.slope(*names, moved=False)
+            for names in ((self.name, q.name), (self.name,), (q.name,))
         )
         by_both = [self._along(t, both) for t in self._quadratic]
         return linear + by_both + [self._along(self._along(t, one), other) for t in self._quadratic]
@@ -240,7 +270,11 @@ def field_parameters(
     """The amplitudes of driven fields, by name; collective."""
     parameters = {}
     for field in fields:
-        own = [t for t in terms if isinstance(t, FormTerm) and field.polynomial in t.form.coefficients()]
+        own = [
+            t
+            for t in terms
+            if isinstance(t, FormTerm) and field.polynomial in t.form.coefficients()
+        ]
         for name in field.names:
             p = Amplitude(field, name, own, u, log)
             slopes = p.slopes()

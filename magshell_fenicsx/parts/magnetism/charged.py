@@ -1,4 +1,6 @@
-"""A magnetised shell at points of its cells, with coordinates (a, b) in [0, 1]² that triangles and rings share."""
+"""A magnetised shell at points of its cells, with coordinates (a, b) in [0, 1]² that triangles and
+rings share.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,13 +17,14 @@ STEP = 1e-30  # of imaginary changes
 
 @dataclass
 class Nodal:
-    """Derivatives by the displacement and by the remanence at the nodes of cells, (cells, nodes, 3) each.
+    """Derivatives by the displacement and by the remanence at the nodes of cells, (cells, nodes, 3)
+    each.
 
     Attributes
     ----------
     by_place, by_thickness
-        The same by the undeformed place and (cells, nodes) by what multiplies the thickness, at nodes of their
-        elements; None if nobody asks for them.
+        The same by the undeformed place and (cells, nodes) by what multiplies the thickness, at
+        nodes of their elements; None if nobody asks for them.
     """
 
     by_u: Array
@@ -51,7 +54,8 @@ class Shape:
     swept
         Whether the cells are those of a meridian.
     thins
-        1 where the thickness follows from the area, so that the volume stays; of each cell (cells, 1), or of all.
+        1 where the thickness follows from the area, so that the volume stays; of each cell (cells,
+        1), or of all.
     """
 
     element: Any
@@ -65,9 +69,11 @@ class Shape:
     thins: Array | float = 0
 
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
-        """Places on the reference cell of coordinates (n, m, 2), their derivatives (n, m, 2, d), and azimuths (n, m).
+        """Places on the reference cell of coordinates (n, m, 2), their derivatives (n, m, 2, d),
+        and azimuths (n, m).
 
-        A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b over a turn, or a part of it.
+        A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b over a turn,
+        or a part of it.
         """
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
@@ -77,7 +83,9 @@ class Shape:
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:
-        """The thickness over R and its derivatives by X (.., n, m) at places (n, m, d) of reference cells."""
+        """The thickness over R and its derivatives by X (.., n, m) at places (n, m, d) of reference
+        cells.
+        """
         if self.thick is None:
             thickness = np.zeros((3, *X.shape[:2]))
             thickness[0] = self.h
@@ -94,7 +102,9 @@ class Shape:
         return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=thick)
 
     def back_of_thickness(self, cells: Ints, X: Array, on: Array, into: Nodal) -> None:
-        """Add what thicknesses (n, m) in cells (n,) have at places X (m, d) of their reference cell."""
+        """Add what thicknesses (n, m) in cells (n,) have at places X (m, d) of their reference
+        cell.
+        """
         if self.thick and into.by_thickness is not None:
             T = self.thick[0].tabulate(0, X)[0, :, :, 0]
             np.add.at(into.by_thickness, cells, self.h * on @ T)
@@ -110,12 +120,15 @@ def turned(v: Array, angle: Array, way: float = 1.0) -> Array:
     """Vectors (n, m, ..., 3) turned about e3 by angles (n, m)."""
     c, s = np.cos(angle), way * np.sin(angle)
     c, s = (each.reshape(*angle.shape, *[1] * (v.ndim - 3)) for each in (c, s))
-    return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1], v[..., 2]], axis=-1)
+    return np.stack(
+        [c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1], v[..., 2]], axis=-1
+    )
 
 
 @dataclass(frozen=True)
 class Jets:
-    """A shell at points of cells: jets by (a, b), those of r0 (6, n, m, 3), of r (3, n, m, 3), remanence and thickness.
+    """A shell at points of cells: jets by (a, b), those of r0 (6, n, m, 3), of r (3, n, m, 3),
+    remanence and thickness.
 
     Attributes
     ----------
@@ -138,7 +151,9 @@ class Jets:
 
     @classmethod
     def of(cls, shape: Shape, cells: Ints, ab: Array, turn: Array | None = None) -> "Jets":
-        """At coordinates (n, m, 2) in cells (n,); azimuths of a ring are b times `turn`, by default a whole one."""
+        """At coordinates (n, m, 2) in cells (n,); azimuths of a ring are b times `turn`, by default
+        a whole one.
+        """
         X, slopes, b = shape.reference(ab)
         angle = 2 * np.pi * b
         T, TB = tables(shape.element, X, 2), tables(shape.of_remanence, X, 1)
@@ -162,7 +177,9 @@ class Jets:
         return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T, TB, angle, ab)
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
-        """dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at a height over the thickness."""
+        """dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at a height over the
+        thickness.
+        """
         _, a1, a2, _a11, _a12, _a22 = self.r0
         n0, (n1, n2) = _normals(self.r0)
         t, t1, t2 = (each[..., None] for each in self.t)
@@ -184,10 +201,14 @@ class Jets:
 
     def place(self, eta: float) -> Array:
         """(n, m, 3) of the deformed shell."""
-        return np.asarray(self.r[0] + eta * self.thickness[..., None] * unit(np.cross(self.r[1], self.r[2])))
+        return np.asarray(
+            self.r[0] + eta * self.thickness[..., None] * unit(np.cross(self.r[1], self.r[2]))
+        )
 
     def back(self, into: Nodal, on_x: Array, on_n: Array, on_B: Array) -> None:
-        """Add dJ/du and dJ/dB at nodes, from dJ/dr and dJ/dn (n, m, 3) and dJ/d(B, B_a, B_b) (3, n, m, 3)."""
+        """Add dJ/du and dJ/dB at nodes, from dJ/dr and dJ/dn (n, m, 3) and dJ/d(B, B_a, B_b) (3, n,
+        m, 3).
+        """
         m = np.cross(self.r[1], self.r[2])
         size = np.linalg.norm(m, axis=-1, keepdims=True)
         n = m / size
@@ -195,7 +216,9 @@ class Jets:
         across = (on_n - along * np.sum(on_n * n, axis=-1, keepdims=True) * n) / size  # dJ/dm
         on = np.stack([on_x, np.cross(self.r[2], across), np.cross(across, self.r[1])])
         if self.shape.swept:
-            on, on_B = (np.stack([turned(each, self.angle, -1.0) for each in part]) for part in (on, on_B))
+            on, on_B = (
+                np.stack([turned(each, self.angle, -1.0) for each in part]) for part in (on, on_B)
+            )
             ring = 2 * np.pi
             flat = np.stack([on[0], on[1]])[..., [0, 2]]  # of f and f_s
             flat[0][..., 0] += ring * on[2][..., 1]  # f_theta = (0, U, 0)
@@ -211,7 +234,8 @@ class Jets:
         np.add.at(into.by_remanence, self.cells, by_B)
 
     def back_of_undeformed(self, into: Nodal, of: "Callable[[Jets], Array]", on: Array) -> None:
-        """Add what numbers (n, m, l) of the jets of r0 and of the thickness have, times `on`; of triangles.
+        """Add what numbers (n, m, l) of the jets of r0 and of the thickness have, times `on`; of
+        triangles.
 
         Their derivatives at each point are those along an imaginary change, exact to rounding.
         """
@@ -220,7 +244,9 @@ class Jets:
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
 
         def rate(**moved: Any) -> Array:
-            return np.asarray(np.sum(on * of(replace(self, **moved)).imag, axis=-1) / STEP, dtype=np.float64)
+            return np.asarray(
+                np.sum(on * of(replace(self, **moved)).imag, axis=-1) / STEP, dtype=np.float64
+            )
 
         for d, i in product(range(1, 6), range(3)):
             r0 = self.r0.astype(np.complex128)
@@ -234,7 +260,9 @@ class Jets:
         if self.shape.thick:
             X, slopes, _ = self.shape.reference(self.ab)
             T = _chain(tables(self.shape.thick[0], X, 1), slopes, self.ab)
-            np.add.at(into.by_thickness, self.cells, self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t))
+            np.add.at(
+                into.by_thickness, self.cells, self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t)
+            )
 
 
 def unit(m: Array) -> Array:
@@ -263,7 +291,9 @@ def _ring(f: Array, ring: float) -> Array:
 
 
 def _chain(T: Array, slopes: Array, ab: Array) -> Array:
-    """Derivatives by (a, b) of shape functions, from those by the reference coordinates X = a, Y = (1 - a) b."""
+    """Derivatives by (a, b) of shape functions, from those by the reference coordinates X = a, Y =
+    (1 - a) b.
+    """
     value, first = T[0], np.einsum("nmad,dnmk->anmk", slopes, T[1:3])
     if len(T) == 3:
         return np.stack([value, *first])

@@ -1,14 +1,17 @@
-"""The field of a magnetised shell outside it, from the magnetic charges on its faces, edges and in it.
+"""The field of a magnetised shell outside it, from the magnetic charges on its faces, edges and in
+it.
 
-A remanence Br that moves as F Br/J with the material has, by Nanson and Piola, charges that stay with the material:
-Br.N dA0 on its faces, -Div Br dV0 inside. So they are found on the undeformed shell, with its thickness and its
-curvature, and seen at the places x = r + zeta n of the deformed one:
+A remanence Br that moves as F Br/J with the material has, by Nanson and Piola, charges that stay
+with the material: Br.N dA0 on its faces, -Div Br dV0 inside. So they are found on the undeformed
+shell, with its thickness and its curvature, and seen at the places x = r + zeta n of the deformed
+one:
 
     B(x) = sum of q (x - x_q)/(4 pi |x - x_q|³).
 
-What moves otherwise (a remanence that turns and does not stretch, what a field induces) is first taken back to the
-undeformed shell by F. Integrals are Gauss's rules on boxes of coordinates, which are halved until each is far enough
-from the place: exact at any distance, as there is nothing else in it but the thickness as it is.
+What moves otherwise (a remanence that turns and does not stretch, what a field induces) is first
+taken back to the undeformed shell by F. Integrals are Gauss's rules on boxes of coordinates, which
+are halved until each is far enough from the place: exact at any distance, as there is nothing else
+in it but the thickness as it is.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,16 +31,27 @@ POINTS, LAYERS = 6, 6  # of Gauss's rules in a box, and of the charges through t
 FAR, MOST = 2.5, 40  # radii of a box that a place is away from it, and halvings at most
 CHUNK, PAIRS = 40_000, 200_000  # points that are found at once, and pairs of a charge and a place
 SECTORS = 8  # of a meridian's ring
-AROUND, TINY, SMALL = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 1e-6, 1e-4  # corners of a box, and what has no area
+AROUND, TINY, SMALL = (
+    np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]),
+    1e-6,
+    1e-4,
+)  # corners of a box, and what has no area
 SIDE = 9
-GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, SIDE)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # of a box
+GRID = np.stack(np.meshgrid(*[np.linspace(0, 1, SIDE)] * 2, indexing="ij"), axis=-1).reshape(
+    -1, 2
+)  # of a box
 NEWTON, BESIDE = 15, 1e-6  # steps to the foot of a place in a box, and over R
 INSIDE = 1e-3  # of a box, as at a corner it may have no normal
-SEEN = {  # of its square or cube: the middle, middles of opposite sides one after the other, corners
+# of its square or cube: the middle, middles of opposite sides one after the other, corners
+SEEN = {
     d: np.array(
         [
             np.full(d, 0.5),
-            *(np.where(np.arange(d) == along, end, 0.5) for along in range(d) for end in (0.0, 1.0)),
+            *(
+                np.where(np.arange(d) == along, end, 0.5)
+                for along in range(d)
+                for end in (0.0, 1.0)
+            ),
             *product((0.0, 1.0), repeat=d),
         ]
     )
@@ -45,7 +59,9 @@ SEEN = {  # of its square or cube: the middle, middles of opposite sides one aft
 }
 
 
-Layer = tuple[Any, tuple[Array, Array, Array]]  # a height, and what B, B_a and B_b are multiplied by
+Layer = tuple[
+    Any, tuple[Array, Array, Array]
+]  # a height, and what B, B_a and B_b are multiplied by
 
 
 class TooNear(ValueError):
@@ -117,7 +133,8 @@ class Found:
     q
         (n, m, layers) the charges per (a, b), without the weights of layers that are in `x`.
     back
-        From dJ/dx (n, m, layers, 3) and dJ/dq to what it adds to dJ/d(nodal u) and dJ/d(nodal remanence), see `Family`.
+        From dJ/dx (n, m, layers, 3) and dJ/dq to what it adds to dJ/d(nodal u) and dJ/d(nodal
+        remanence), see `Family`.
     """
 
     x: Array
@@ -126,7 +143,9 @@ class Found:
 
 
 class Family:
-    """Elements with coordinates (a, b), or (a, b, c) where they are solid, of which charges can be found."""
+    """Elements with coordinates (a, b), or (a, b, c) where they are solid, of which charges can be
+    found.
+    """
 
     count: int
     across: ClassVar[int] = 2  # how many coordinates there are
@@ -140,7 +159,8 @@ class Family:
         raise NotImplementedError
 
     def near(self, places: Array) -> Iterator[tuple[Boxes, Ints, Ints]]:
-        """Boxes, and pairs of the number of one of them and of the place from which it is seen; far enough.
+        """Boxes, and pairs of the number of one of them and of the place from which it is seen; far
+        enough.
 
         Each box is found once for all places.
 
@@ -200,7 +220,9 @@ class Faces(Family):
         return np.stack([at.place(0.5), at.place(-0.5)], axis=2)
 
     def holds(self, places: Array) -> NDArray[np.bool_]:
-        """Which of places (n, 3) are in the shell: the foot on the mid-surface is within half of the thickness."""
+        """Which of places (n, 3) are in the shell: the foot on the mid-surface is within half of
+        the thickness.
+        """
         from scipy.spatial import cKDTree  # takes long to import
 
         held = np.zeros(len(places), dtype=bool)
@@ -218,14 +240,20 @@ class Faces(Family):
         away = np.linalg.norm(places[of] - grid.r[0][near, point], axis=-1)
         order = np.lexsort((away, near, of))
         order = order[away[order] <= reach[near[order]]]
-        _, first = np.unique(of[order] * self.count + near[order], return_index=True)  # the nearest in each box
+        _, first = np.unique(
+            of[order] * self.count + near[order], return_index=True
+        )  # the nearest in each box
         of, near, point = (each[order][first] for each in (of, near, point))
         if len(of):
-            held[of[self._feet_within(boxes[near], start[point][:, None], places[of][:, None])]] = True
+            held[of[self._feet_within(boxes[near], start[point][:, None], places[of][:, None])]] = (
+                True
+            )
         return held
 
     def _feet_within(self, boxes: Boxes, ab: Array, x: Array) -> NDArray[np.bool_]:
-        """Whether places (n, 1, 3) have a foot in a box within half of the thickness; Newton's method from `ab`."""
+        """Whether places (n, 1, 3) have a foot in a box within half of the thickness; Newton's
+        method from `ab`.
+        """
         for _ in range(NEWTON):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
@@ -266,13 +294,19 @@ class Sides(Family):
         self.count = len(self._cells)
 
     def _coordinates(self, boxes: Boxes, x: Array) -> tuple[Array, Array, Array]:
-        """Coordinates (n, m, 2) of the surface, their slopes along the edge (n, 2), and heights (n, m)."""
+        """Coordinates (n, m, 2) of the surface, their slopes along the edge (n, 2), and heights (n,
+        m).
+        """
         s, eta = np.moveaxis(boxes.points(x), -1, 0)
         edge = self._edges[boxes.of][:, None]
         if self.shape.swept:
             b = (self._sector[boxes.of][:, None] + s) / self._parts
             along = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
-            return np.stack([np.where(edge == 1, 1.0, 0.0) + 0 * s, b], axis=-1), along[:, 0], eta - 0.5
+            return (
+                np.stack([np.where(edge == 1, 1.0, 0.0) + 0 * s, b], axis=-1),
+                along[:, 0],
+                eta - 0.5,
+            )
         # around the triangle with the surface on the left: b = 1 backwards, a = 0 backwards, b = 0
         a = np.where(edge == 0, 1 - s, np.where(edge == 2, s, 0.0))
         b = np.where(edge == 0, 1.0, np.where(edge == 1, 1 - s, 0.0))
@@ -290,7 +324,11 @@ class Sides(Family):
 
     def at(self, boxes: Boxes, x: Array, weights: Array, into: Nodal | None = None) -> Found:
         at, along, eta = self._jets(boxes, x)
-        area = np.prod(boxes.size, axis=1)[:, None] * weights / (self._parts if self.shape.swept else 1)
+        area = (
+            np.prod(boxes.size, axis=1)[:, None]
+            * weights
+            / (self._parts if self.shape.swept else 1)
+        )
 
         def layers(at: Jets) -> list[Layer]:
             G1, G2, G3 = at.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
@@ -319,7 +357,10 @@ def _found(at: Jets, layers_of: Callable[[Jets], list[Layer]], into: Nodal | Non
     x = np.stack([at.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
 
     def charges(layers: list[Layer]) -> Array:
-        return np.stack([sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers], axis=2)
+        return np.stack(
+            [sum(np.sum(c * b, axis=-1) for c, b in zip(C, at.B, strict=True)) for _, C in layers],
+            axis=2,
+        )
 
     q = charges(layers)
     if into is None:
@@ -327,7 +368,9 @@ def _found(at: Jets, layers_of: Callable[[Jets], list[Layer]], into: Nodal | Non
 
     def back(on_x: Array, on_q: Array) -> None:
         heights = np.stack([eta * thickness + 0 * at.r[0][..., :1] for eta, _ in layers], axis=2)
-        by_B = [sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)]
+        by_B = [
+            sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)
+        ]
         at.back(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
         at.back_of_undeformed(into, lambda other: charges(layers_of(other)), on_q)
 
@@ -343,7 +386,10 @@ def field(families: Sequence[Family], places: Array) -> Array:
             try:
                 for boxes, which, where in family.near(places[some]):
                     used, which = np.unique(which, return_inverse=True)
-                    at = [family.at(part, rule, weights) for part in _chunks(boxes[used], len(weights))]
+                    at = [
+                        family.at(part, rule, weights)
+                        for part in _chunks(boxes[used], len(weights))
+                    ]
                     x = np.concatenate([each.x for each in at]).reshape(len(used), -1, 3)
                     q = np.concatenate([each.q for each in at]).reshape(len(used), -1)
                     _add_field(B[some], where, places[some], x, q, which)
@@ -406,7 +452,9 @@ def moment(families: Sequence[Family]) -> Array:
 def cube(n: int, across: int = 3) -> tuple[Array, Array]:
     """Gauss's rule on the unit cube, or the square."""
     x, w = gauss(n)
-    points, weights = (np.stack(np.meshgrid(*[each] * across, indexing="ij"), axis=-1) for each in (x, w))
+    points, weights = (
+        np.stack(np.meshgrid(*[each] * across, indexing="ij"), axis=-1) for each in (x, w)
+    )
     return points.reshape(-1, across), weights.prod(axis=-1).ravel()
 
 
@@ -423,8 +471,12 @@ def _parts(count: int, each: int) -> Iterator[slice]:
 
 
 def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
-    """Flat triangles, corners (n, 3, 3), with the charges (n,) of the elements divided into parts² each."""
-    low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    """Flat triangles, corners (n, 3, 3), with the charges (n,) of the elements divided into parts²
+    each.
+    """
+    low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     count = len(low)
     boxes = Boxes(
         np.repeat(np.arange(family.count), count),
@@ -438,7 +490,9 @@ def triangles(family: Family, parts: int) -> list[tuple[Array, Array]]:
         q = family.at(part, rule, weights).q.sum(axis=1).ravel()
         quads = np.moveaxis(x, 1, 2).reshape(-1, 4, 3)
         both = quads[:, [[0, 1, 2], [0, 2, 3]]]
-        area = np.linalg.norm(np.cross(both[:, :, 1] - both[:, :, 0], both[:, :, 2] - both[:, :, 0]), axis=-1)
+        area = np.linalg.norm(
+            np.cross(both[:, :, 1] - both[:, :, 0], both[:, :, 2] - both[:, :, 0]), axis=-1
+        )
         share = area / area.sum(axis=1, keepdims=True)
         kept = (share > SMALL).ravel()
         flat.append((both.reshape(-1, 3, 3)[kept], (share * q[:, None]).ravel()[kept]))

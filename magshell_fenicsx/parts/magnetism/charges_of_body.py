@@ -1,7 +1,8 @@
 """The charges of a magnetised solid: on faces of its cells, and inside where the remanence varies.
 
-As those of a shell (see `charges`) they stay with the material: Br.N dA0 on faces, -Div Br dV0 inside. Here both are
-exact for the mesh, whose cells are mapped from a cube; between cells only a jump of the remanence leaves a charge.
+As those of a shell (see `charges`) they stay with the material: Br.N dA0 on faces, -Div Br dV0
+inside. Here both are exact for the mesh, whose cells are mapped from a cube; between cells only a
+jump of the remanence leaves a charge.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.charged import Nodal, tables
-from magshell_fenicsx.parts.magnetism.charges import BESIDE, CHUNK, LAYERS, NEWTON, Boxes, Family, Found, gauss
+from magshell_fenicsx.parts.magnetism.charges import (
+    BESIDE,
+    CHUNK,
+    LAYERS,
+    NEWTON,
+    Boxes,
+    Family,
+    Found,
+    gauss,
+)
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -23,9 +33,16 @@ BEYOND, EDGE = 0.3, 1e-9  # how far Newton's method may leave the cube, and what
 BULGE = 1.1  # of the radius of a cell's nodes: no place of it is farther from its middle
 CORNERS = basix.geometry(basix.CellType.hexahedron)
 AROUND = np.array(basix.topology(basix.CellType.hexahedron)[2])  # (6, 4) the corners of each face
-STARTS, ENDS = CORNERS[AROUND[:, 0]], CORNERS[AROUND[:, 1:3]] - CORNERS[AROUND[:, :1]]  # of its coordinates (a, b)
+STARTS, ENDS = (
+    CORNERS[AROUND[:, 0]],
+    CORNERS[AROUND[:, 1:3]] - CORNERS[AROUND[:, :1]],
+)  # of its coordinates (a, b)
 OUTWARD = np.sign(
-    np.sum(np.cross(ENDS[:, 0], ENDS[:, 1]) * basix.cell.facet_outward_normals(basix.CellType.hexahedron), axis=1)
+    np.sum(
+        np.cross(ENDS[:, 0], ENDS[:, 1])
+        * basix.cell.facet_outward_normals(basix.CellType.hexahedron),
+        axis=1,
+    )
 )
 
 
@@ -70,11 +87,15 @@ class Body:
         return held
 
     def _within(self, nodes: Array, x: Array) -> NDArray[np.bool_]:
-        """Whether places (n, 3) are in cells with nodes (n, k, 3), each in its own; Newton's method."""
+        """Whether places (n, 3) are in cells with nodes (n, k, 3), each in its own; Newton's
+        method.
+        """
         nearest = np.linalg.norm(nodes - x[:, None], axis=-1).argmin(axis=1)
         at = self.element.points[nearest]
         for _ in range(NEWTON):
-            value, *by = np.einsum("dnk,nki->dni", tables(self.element, at[:, None], 1)[:, :, 0], nodes)
+            value, *by = np.einsum(
+                "dnk,nki->dni", tables(self.element, at[:, None], 1)[:, :, 0], nodes
+            )
             step = np.linalg.pinv(np.stack(by, axis=-1)) @ (x - value)[..., None]
             at = np.clip(at + step[..., 0], -BEYOND, 1 + BEYOND)
         value = np.einsum("nk,nki->ni", tables(self.element, at[:, None], 0)[0, :, 0], nodes)
@@ -99,7 +120,9 @@ class OfBody(Family):
         raise NotImplementedError
 
     def charged(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """What the remanence and its derivatives by X are multiplied by, (4, n, m, 3), from dX (3, n, m, 3)."""
+        """What the remanence and its derivatives by X are multiplied by, (4, n, m, 3), from dX (3,
+        n, m, 3).
+        """
         raise NotImplementedError
 
     def middle(self, boxes: Boxes, x: Array) -> Array:
@@ -108,7 +131,9 @@ class OfBody(Family):
     def places(self, boxes: Boxes, at: Array) -> Array:
         """(n, m, 3) of the deformed body."""
         cells = self.cells[boxes.of]
-        return np.asarray(np.einsum("nmk,nki->nmi", tables(self.shape.element, at, 0)[0], self._nodes[cells]))
+        return np.asarray(
+            np.einsum("nmk,nki->nmi", tables(self.shape.element, at, 0)[0], self._nodes[cells])
+        )
 
     @cached_property
     def _nodes(self) -> Array:
@@ -165,7 +190,9 @@ class Inside(OfBody):
 
 
 class Layers(Family):
-    """The charges inside as layers across the third coordinate of cells, which can be drawn as triangles."""
+    """The charges inside as layers across the third coordinate of cells, which can be drawn as
+    triangles.
+    """
 
     def __init__(self, inside: Inside) -> None:
         self._inside, self.count, self.shape = inside, inside.count, inside.shape
@@ -177,7 +204,9 @@ class Layers(Family):
         points = np.concatenate([np.column_stack([x, np.full(len(x), c)]) for c in heights])
         found = self._inside.at(solid, points, np.concatenate([w * weights for w in through]))
         across = (len(boxes.of), LAYERS, len(x))
-        return Found(found.x.reshape(*across, 3).swapaxes(1, 2), found.q.reshape(across).swapaxes(1, 2))
+        return Found(
+            found.x.reshape(*across, 3).swapaxes(1, 2), found.q.reshape(across).swapaxes(1, 2)
+        )
 
 
 def flat(families: Sequence[Family]) -> list[Family]:

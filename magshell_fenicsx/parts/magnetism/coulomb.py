@@ -1,13 +1,15 @@
-"""The energy of magnetised parts in each other's field: pairs of charges, their forces and their stiffness.
+"""The energy of magnetised parts in each other's field: pairs of charges, their forces and their
+stiffness.
 
-The charges of `charges` stay with the material, so the energy of parts A and B is, over Br² R³/(4 pi mu_0),
+The charges of `charges` stay with the material, so the energy of parts A and B is, over Br² R³/(4
+pi mu_0),
 
     W = sum of q_i q_j/|x_i - x_j|, i in A, j in B,    x = r + zeta n,
 
-and that of a part in its own field half of this, with both in A: functions of the displacement by the places alone.
-Forces and stiffness are their derivatives, exact for the rule. Cells far from each other act by multipoles (`far`).
-Each other pair of cells has a Gauss rule whose error is below `PRECISION` at their distance (`rate`), the same for
-both; for those that touch see `near`.
+and that of a part in its own field half of this, with both in A: functions of the displacement by
+the places alone. Forces and stiffness are their derivatives, exact for the rule. Cells far from
+each other act by multipoles (`far`). Each other pair of cells has a Gauss rule whose error is below
+`PRECISION` at their distance (`rate`), the same for both; for those that touch see `near`.
 """
 
 from itertools import product
@@ -35,7 +37,8 @@ GROWN = 1.25  # the radius of a cell counts as a power of this times that of the
 PRECISION = 1e-5  # of a pair of cells at their distance
 BEYOND = 50  # degree of a rule for which cells are too wide: there is no number with that of 30
 ABOVE = 0.5  # of the radius of a cell: what is so near to its middle is above or below it
-FLAT = 0.3  # sine of the angle up to which a cell is beside another: the pole is then beyond the ellipse's end
+# sine of the angle up to which a cell is beside another: the pole is then beyond the ellipse's end
+FLAT = 0.3
 ROUNDED = 9  # digits in which areas of parts are compared
 SPACE = 1e-3  # of cells that touch, over their size
 
@@ -43,8 +46,9 @@ SPACE = 1e-3  # of cells that touch, over their size
 def rate(number: int) -> float:
     """The distance over the size of cells from which a rule of a degree reaches `PRECISION`.
 
-    The error of Gauss's rule of degree n falls as rho^-(n + 1), with the sum of half axes rho of the largest ellipse
-    around the cell in which the integrand has no pole (Trefethen, Approximation Theory, theorem 19.3).
+    The error of Gauss's rule of degree n falls as rho^-(n + 1), with the sum of half axes rho of
+    the largest ellipse around the cell in which the integrand has no pole (Trefethen, Approximation
+    Theory, theorem 19.3).
     """
     return float(np.sinh(log(1 / PRECISION) / (number + 1)) / 2)
 
@@ -57,11 +61,21 @@ class Kind:
     """The faces of all cells, or their edges with one local number that are charged."""
 
     def __init__(
-        self, shape: Shape, cells: Ints, copies: Copies, edge: int | None = None, *, may: bool = False
+        self,
+        shape: Shape,
+        cells: Ints,
+        copies: Copies,
+        edge: int | None = None,
+        *,
+        may: bool = False,
     ) -> None:
         self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
         self.faces = edge is None
-        self.family = Faces(shape, cells, may=may) if edge is None else Sides(shape, cells, np.full(len(cells), edge))
+        self.family = (
+            Faces(shape, cells, may=may)
+            if edge is None
+            else Sides(shape, cells, np.full(len(cells), edge))
+        )
         count = len(copies.images)
         self.cells = np.concatenate([cells + copy * len(shape.r0) for copy in range(count)])
         self.number = np.full(count * len(shape.r0), -1)
@@ -91,12 +105,16 @@ class Kind:
 
     def _side(self, which: int) -> Points:
         s, eta, points, weights = self._on_side(which)
-        q = self.family.at(Boxes.whole(self.family.count), points, weights).q.reshape(-1, len(s), len(eta))
+        q = self.family.at(Boxes.whole(self.family.count), points, weights).q.reshape(
+            -1, len(s), len(eta)
+        )
         return self._made(self._along(s), eta - 0.5, q)
 
     def _along(self, s: Array) -> Array:
         """Points of the reference triangle on the edge."""
-        return [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][self._edge or 0]
+        return [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][
+            self._edge or 0
+        ]
 
     def _on_side(self, which: int) -> tuple[Array, Array, Array, Array]:
         """Coordinates along the edge and through the thickness, all pairs of these, and weights."""
@@ -106,9 +124,13 @@ class Kind:
         return s, eta, points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
 
     def back(self, which: int, on_q: Array, into: Nodal) -> None:
-        """From derivatives by the charges of a rule, those by what `into` has: all that they follow from."""
+        """From derivatives by the charges of a rule, those by what `into` has: all that they follow
+        from.
+        """
         count, boxes = len(self._copies.images), Boxes.whole(self.family.count)
-        on = np.einsum("c,c...->...", self._copies.charges, on_q.reshape(count, -1, *on_q.shape[1:]))
+        on = np.einsum(
+            "c,c...->...", self._copies.charges, on_q.reshape(count, -1, *on_q.shape[1:])
+        )
         at = self._on_face(which)[1:] if self._edge is None else self._on_side(which)[2:]
         made = self.family.at(boxes, *at, into)
         assert made.back
@@ -117,12 +139,18 @@ class Kind:
     def back_of_heights(self, which: int, on: Array, into: Nodal) -> None:
         """From derivatives by the heights of the charges of a rule, those by the thickness."""
         X = self._on_face(which)[0] if self._edge is None else self._along(self._on_side(which)[0])
-        on_t = np.sum(self.rule(which).heights * on, axis=-1).reshape(len(self._copies.up), -1, len(X))
-        self._shape.back_of_thickness(self._modelled, X, np.einsum("c,cnm->nm", self._copies.up, on_t), into)
+        on_t = np.sum(self.rule(which).heights * on, axis=-1).reshape(
+            len(self._copies.up), -1, len(X)
+        )
+        self._shape.back_of_thickness(
+            self._modelled, X, np.einsum("c,cnm->nm", self._copies.up, on_t), into
+        )
 
     def _made(self, X: Array, eta: Array, q: Array) -> Points:
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
-        t = self._shape.thickness(self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape)))[0]
+        t = self._shape.thickness(
+            self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape))
+        )[0]
         t = np.concatenate([side * t for side in self._copies.up])
         q = np.concatenate([factor * q for factor in self._copies.charges])
         return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t, q)
@@ -159,9 +187,17 @@ class Charged:
     ) -> None:
         self._pairs, self._h, self._near, self._shape = Pairs(comm), shape.h, near, shape
         kinds = [Kind(shape, np.arange(len(shape.r0)), copies, may=may)]
-        kinds += [Kind(shape, cells[edges == edge], copies, edge) for edge in range(3) if (edges == edge).any()]
+        kinds += [
+            Kind(shape, cells[edges == edge], copies, edge)
+            for edge in range(3)
+            if (edges == edge).any()
+        ]
         sizes = [kind.charged(0) for kind in kinds]
-        self._kinds = [kind for kind, size in zip(kinds, sizes, strict=True) if may or size > NOTHING * max(sizes)]
+        self._kinds = [
+            kind
+            for kind, size in zip(kinds, sizes, strict=True)
+            if may or size > NOTHING * max(sizes)
+        ]
         self._others = np.asarray(parts[:, None] != parts)  # pairs of different parts
         self._apart = self._others.astype(np.uint8)
         for cell, others in enumerate(near.touching if near else ()):
@@ -172,7 +208,9 @@ class Charged:
         sizes_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), len(copies.images)))
         number = np.tile(np.arange(len(shape.r0)), len(copies.images))
         order = np.empty(len(parts), dtype=np.intp)
-        order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(ROUNDED)])] = np.arange(len(parts))
+        order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(ROUNDED)])] = (
+            np.arange(len(parts))
+        )
         self._close = Close(shape, kinds[0].family, copies, parts, order, comm)
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
@@ -181,7 +219,8 @@ class Charged:
         self._boxes: tuple[Ints, Far, NDArray[np.bool_]] | None = None
 
     def rules(self, nodes: Array, own: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-        """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that has none here.
+        """(own, copies * cells) the number in `DEGREES` of the rule of each pair; -1 of a pair that
+        has none here.
 
         And the pairs whose faces are close: they have a rule of their own.
 
@@ -194,21 +233,28 @@ class Charged:
         apart = self._apart[own.start : own.stop] & self.boxes(nodes, own)[1]
         close = self._close.of(nodes, own, apart & self._others[own.start : own.stop])
         apart &= ~close
-        rules = self._pairs.rules(nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst)
+        rules = self._pairs.rules(
+            nodes, own, apart, least, h=self._h, space=SPACE, above=ABOVE, flat=FLAT, worst=worst
+        )
         if rules is None:
             raise Touching
         rules[close] = len(DEGREES) - 1
         return rules, close
 
     def boxes(self, nodes: Array, own: range) -> tuple[Far, NDArray[np.bool_]]:
-        """Cells far from each other by boxes, and the pairs (own, copies * cells) that are too near for that.
+        """Cells far from each other by boxes, and the pairs (own, copies * cells) that are too near
+        for that.
 
         They follow from where the cells are, not from where they have been.
         """
         near = self._near is not None
-        self._octree = self._octree or Octree(self._places, self._parts, self._groups, own, itself=near)
+        self._octree = self._octree or Octree(
+            self._places, self._parts, self._groups, own, itself=near
+        )
         places, radii = _balls(nodes)
-        grown = np.maximum(0, np.ceil(np.log(radii / self._radii) / np.log(GROWN) - 0.5)).astype(np.int64)
+        grown = np.maximum(0, np.ceil(np.log(radii / self._radii) / np.log(GROWN) - 0.5)).astype(
+            np.int64
+        )
         key = np.column_stack([self._octree.moved(places), grown])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
             tree = self._octree.tree(key[:, :3], self._radii * GROWN ** key[:, 3] + self._h / 2)
@@ -216,8 +262,11 @@ class Charged:
             self._boxes = key, Far(tree, kinds, own, self._pairs), tree.near
         return self._boxes[1:]
 
-    def evaluate(self, nodes: Array, own: range, stiffness: Stiffness | None = None) -> tuple[float, Array]:
-        """The energy of the pairs that own cells are in, each half, and its gradient (own, k, 3) by their nodes.
+    def evaluate(
+        self, nodes: Array, own: range, stiffness: Stiffness | None = None
+    ) -> tuple[float, Array]:
+        """The energy of the pairs that own cells are in, each half, and its gradient (own, k, 3) by
+        their nodes.
 
         Parameters
         ----------
@@ -246,9 +295,14 @@ class Charged:
                 charged = (one_row >= 0) & (other_row >= 0)
                 if one.faces and other.faces:
                     charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
-                left, right = (one.rule(int(number)), one_row[charged]), (other.rule(int(number)), other_row[charged])
+                left, right = (
+                    (one.rule(int(number)), one_row[charged]),
+                    (other.rule(int(number)), other_row[charged]),
+                )
                 count = int(charged.sum())
-                energy += share * self._pairs.add(nodes, cells[charged], count, left, right, gradient, stiffness)
+                energy += share * self._pairs.add(
+                    nodes, cells[charged], count, left, right, gradient, stiffness
+                )
         for number, kind in product({FAR, *np.unique(which)}, self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._near:
@@ -261,11 +315,14 @@ class Charged:
             stiffness.finish()
         return energy, gradient[own.start : own.stop]
 
-    def by_fields(self, nodes: Array, rates: Array, own: range, weights: Weights, *, of_shape: bool = False) -> Nodal:
-        """Derivatives of a part of the energy and of its rate along `rates` by the remanence and, if `of_shape`,
-        by the undeformed place and the thickness, where the deformed nodes stay.
+    def by_fields(
+        self, nodes: Array, rates: Array, own: range, weights: Weights, *, of_shape: bool = False
+    ) -> Nodal:
+        """Derivatives of a part of the energy and of its rate along `rates` by the remanence and,
+        if `of_shape`, by the undeformed place and the thickness, where the deformed nodes stay.
 
-        The energy is that of `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
+        The energy is that of `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of
+        the nodes.
 
         Raises
         ------
@@ -274,7 +331,10 @@ class Charged:
         """
         (rules, close), moved = self.rules(nodes, own), nodes + STEP * 1j * rates
         into = self._shape.nothing(of_shape=of_shape)
-        far, cells_far = self.boxes(nodes, own)[0], [(kind.cells, kind.rule(FAR)) for kind in self._kinds]
+        far, cells_far = (
+            self.boxes(nodes, own)[0],
+            [(kind.cells, kind.rule(FAR)) for kind in self._kinds],
+        )
         on_far = far.by_charges(nodes, moved, cells_far, weights, heights=of_shape)
         for kind, (on_q, *on_heights) in zip(self._kinds, on_far, strict=True):
             kind.back(FAR, on_q, into)
@@ -289,10 +349,19 @@ class Charged:
                 charged = (one_row >= 0) & (other_row >= 0)
                 if one.faces and other.faces:
                     charged &= ~close[cells[:, 0] - own.start, cells[:, 1]]
-                left, right = (one.rule(number), one_row[charged]), (other.rule(number), other_row[charged])
-                one.back(number, add(moved, cells[charged], left, right, weights)[0], into)  # the other order is there
+                left, right = (
+                    (one.rule(number), one_row[charged]),
+                    (other.rule(number), other_row[charged]),
+                )
+                one.back(
+                    number, add(moved, cells[charged], left, right, weights)[0], into
+                )  # the other order is there
                 if of_shape:
-                    one.back_of_heights(number, add(moved, cells[charged], left, right, weights, heights=True)[0], into)
+                    one.back_of_heights(
+                        number,
+                        add(moved, cells[charged], left, right, weights, heights=True)[0],
+                        into,
+                    )
         if self._near:
             self._near.by_fields(moved, weights, into)
         if close.any() and self._kinds[0].faces:
@@ -302,7 +371,9 @@ class Charged:
 
 def _areas(r0: Array) -> Array:
     """(cells,) of flat triangles."""
-    return np.asarray(np.linalg.norm(np.cross(r0[:, 1] - r0[:, 0], r0[:, 2] - r0[:, 0]), axis=-1) / 2)
+    return np.asarray(
+        np.linalg.norm(np.cross(r0[:, 1] - r0[:, 0], r0[:, 2] - r0[:, 0]), axis=-1) / 2
+    )
 
 
 def _balls(nodes: Array) -> tuple[Array, Array]:

@@ -16,16 +16,24 @@ Array = NDArray[np.float64]
 FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
 
 
-def directions(programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float) -> Array:
-    """Unit vectors (steps + 1, 3) of the field before each step and after the last, in a turned frame."""
+def directions(
+    programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float
+) -> Array:
+    """Unit vectors (steps + 1, 3) of the field before each step and after the last, in a turned
+    frame.
+    """
     vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
-        vectors.append(step.load.to.vector(turn) if isinstance(step.load, RotationSection) else vectors[-1])
+        vectors.append(
+            step.load.to.vector(turn) if isinstance(step.load, RotationSection) else vectors[-1]
+        )
     return np.array(vectors)
 
 
 def components(direction: Array, field: Magnetisation | None) -> Array:
-    """A direction by the amplitudes of `FIELD`; a field in space has one amplitude in each direction."""
+    """A direction by the amplitudes of `FIELD`; a field in space has one amplitude in each
+    direction.
+    """
     return np.ones(1) if field is None or field.in_space else np.array(field.axes) @ direction
 
 
@@ -49,7 +57,11 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
     away = rest / np.linalg.norm(rest)
 
     def curve(b: float, a: float) -> Curve:
-        return lambda t: (b * cos(t) + a * sin(t), a * cos(t) - b * sin(t), -b * cos(t) - a * sin(t))
+        return lambda t: (
+            b * cos(t) + a * sin(t),
+            a * cos(t) - b * sin(t),
+            -b * cos(t) - a * sin(t),
+        )
 
     parts = zip(FIELD, size * before, size * away, strict=False)
     return {name: curve(float(b), float(a)) for name, b, a in parts}
@@ -61,13 +73,17 @@ def as_a_whole(name: str, total: float) -> dict[str, Curve]:
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:
-    """The magnitude of the field with the sign of the case's field, or with its own where it has not turned."""
+    """The magnitude of the field with the sign of the case's field, or with its own where it has
+    not turned.
+    """
     first, across, third = (mu.get(name, 0.0) for name in FIELD)
     return copysign(hypot(first, across, third), sense) if across or third else first
 
 
 def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: float = 1.0) -> float:
-    """The angle between the field and its first direction (degrees); `sense` is the sign of the case's field."""
+    """The angle between the field and its first direction (degrees); `sense` is the sign of the
+    case's field.
+    """
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
         now = carried(field.turns, mu)[0] @ first

@@ -1,7 +1,8 @@
 """A field that rigid motions carry and factors multiply, with its derivatives by their amplitudes.
 
-A motion with the velocity w(x) = A x + v carries a field B along: dB/dmu = A B - G w, with the gradient G of B. Its own
-gradient needs the second derivatives H of B. So place and angle of a source need no derivatives but those of the field.
+A motion with the velocity w(x) = A x + v carries a field B along: dB/dmu = A B - G w, with the
+gradient G of B. Its own gradient needs the second derivatives H of B. So place and angle of a
+source need no derivatives but those of the field.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,8 @@ from magshell_fenicsx.assembly.motion import Motion, moved
 
 Array = NDArray[np.float64]
 Velocity = tuple[Array, Array]  # A, v of w(x) = A x + v
-# places (n, 3) over R -> B (n, 3), dB_i/dx_j (n, 3, 3), d2B_i/dx_j dx_k (n, 3, 3, 3), over the field's magnitude
+# places (n, 3) over R -> B (n, 3), dB_i/dx_j (n, 3, 3), d2B_i/dx_j dx_k (n, 3, 3, 3), over the
+# field's magnitude
 FieldInSpace = Callable[[Array], tuple[Array, Array, Array]]
 
 
@@ -96,13 +98,19 @@ class Here:
         if len(set(by)) < len(by):
             return 0.0  # each is linear
         changes = self.driven.factors.items()
-        return float(np.prod([change if name in by else 1 + change * self.mu[name] for name, change in changes]))
+        return float(
+            np.prod(
+                [change if name in by else 1 + change * self.mu[name] for name, change in changes]
+            )
+        )
 
     def _along(self, name: str) -> tuple[Array, Array]:
         A, v = self._velocity(name)
         w = self.x @ A.T + v
         C = self.B @ A.T - np.einsum("nij,nj->ni", self.G, w)
-        slope = np.einsum("ij,njk->nik", A, self.G) - np.einsum("nijk,nj->nik", self.H, w) - self.G @ A
+        slope = (
+            np.einsum("ij,njk->nik", A, self.G) - np.einsum("nijk,nj->nik", self.H, w) - self.G @ A
+        )
         return C, slope
 
     def _velocity(self, name: str) -> Velocity:

@@ -1,9 +1,11 @@
-"""The energy of charges far from each other, by multipoles of boxes of cells (the fast multipole method).
+"""The energy of charges far from each other, by multipoles of boxes of cells (the fast multipole
+method).
 
-The moments M of the charges in a box about its middle, which does not move, are polynomials of their places, and the
-energy is a quadratic form of them, E = sum of M_A . G_AB M_B/2 over boxes far from each other, with constant G. So
-forces and stiffness are its derivatives, without any sum over pairs of charges: those by the moments are L = G M, and
-D = dM/du^T G dM/du + L . d2M/du2. Moments go up to larger boxes and L comes down, so the cost grows like n.
+The moments M of the charges in a box about its middle, which does not move, are polynomials of
+their places, and the energy is a quadratic form of them, E = sum of M_A . G_AB M_B/2 over boxes far
+from each other, with constant G. So forces and stiffness are its derivatives, without any sum over
+pairs of charges: those by the moments are L = G M, and D = dM/du^T G dM/du + L . d2M/du2. Moments
+go up to larger boxes and L comes down, so the cost grows like n.
 """
 
 from collections.abc import Iterator, Sequence
@@ -52,7 +54,8 @@ class Placed:
     Attributes
     ----------
     Y
-        (COUNT, charges) harmonics about the middles of their boxes, over their width; in the order of boxes.
+        (COUNT, charges) harmonics about the middles of their boxes, over their width; in the order
+        of boxes.
     surfaces
         Of each kind.
     heights
@@ -75,10 +78,14 @@ class Far:
         The cells of this rank.
     """
 
-    def __init__(self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own: range, pairs: Pairs) -> None:
+    def __init__(
+        self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own: range, pairs: Pairs
+    ) -> None:
         self._tree, self._kinds, self._pairs, self._leaf = tree, kinds, pairs, tree.levels[-1]
         self._own = [(cells >= own.start) & (cells < own.stop) for cells, _ in kinds]
-        box = np.concatenate([self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds])
+        box = np.concatenate(
+            [self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds]
+        )
         self._order = np.argsort(box, kind="stable")
         self._filled, self._first = np.unique(box[self._order], return_index=True)
         self._middle = self._leaf.middle[box[self._order]]
@@ -91,15 +98,23 @@ class Far:
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
         both = zip(surfaces, heights, strict=True)
         x = [(s.r[:, :, None] + z[..., None] * s.n[:, :, None]).reshape(-1, 3) for s, z in both]
-        return Placed(harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width), surfaces, heights)
+        return Placed(
+            harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width),
+            surfaces,
+            heights,
+        )
 
     def add(self, at: Placed, *, bent: bool) -> float:
-        """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go to points' sums."""
+        """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go
+        to points' sums.
+        """
         N, L = derivatives(), self.onto(self._summed(self._q * at.Y))[..., 0]
         slopes = [*N, *(N[i] @ N[j] for i, j in SECOND)] if bent else N
         of_box = np.stack([L, *(L @ each for each in slopes)], axis=-1)
         values = np.empty((len(self._q), of_box.shape[-1]))
-        for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
+        for box, first, end in zip(
+            self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
+        ):
             values[self._order[first:end]] = at.Y[:, first:end].T @ of_box[box]
         values *= self._leaf.width ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
         energy, start = 0.0, 0
@@ -122,7 +137,8 @@ class Far:
         *,
         heights: bool = False,
     ) -> list[list[Array]]:
-        """Derivatives of the energy of all, and of its rate, by the charges, of own cells: of each kind, like `q`.
+        """Derivatives of the energy of all, and of its rate, by the charges, of own cells: of each
+        kind, like `q`.
 
         Beside each, if asked for, those by the `heights` of the charges over the mid-surface.
 
@@ -151,13 +167,20 @@ class Far:
         found = list[list[Array]]()
         for factor, values, rates in wanted:
             by = np.empty(len(self._q))
-            for box, first, end in zip(self._filled, self._first, [*self._first[1:], len(self._q)], strict=True):
+            for box, first, end in zip(
+                self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
+            ):
                 y, dy = values[:, first:end], rates[:, first:end]
                 of = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
                 by[self._order[first:end]] = of / width
             by[self._order] *= factor
             each = zip(np.split(by, split), kinds, self._own, strict=True)
-            found.append([part.reshape(points.q.shape) * own[:, None, None] for part, (_, points), own in each])
+            found.append(
+                [
+                    part.reshape(points.q.shape) * own[:, None, None]
+                    for part, (_, points), own in each
+                ]
+            )
         return [list(each) for each in zip(*found, strict=True)]
 
     def _summed(self, values: Array) -> Array:
@@ -181,16 +204,22 @@ class Far:
                 for Z, boxes in self._octants[k]:
                     down[boxes] = _times(Z.T, L[level.parent[boxes]]) / 2  # over half the width
                 L = down
-            self._pairs.translate(level.one, level.other, level.offset, ends(), self._tree.G, of_level, L)
+            self._pairs.translate(
+                level.one, level.other, level.offset, ends(), self._tree.G, of_level, L
+            )
         return L
 
     def beside(self, own: range) -> NDArray[np.bool_]:
-        """(own, cells) whether two cells are in one box of the finest level, or in boxes that touch."""
+        """(own, cells) whether two cells are in one box of the finest level, or in boxes that
+        touch.
+        """
         at = self._leaf.keys[self._leaf.of_cell, 2:]
         return np.asarray(np.abs(at[own.start : own.stop, None] - at).max(axis=-1) <= 1)
 
     def between(self, moments: Array) -> tuple[Ints, Array]:
-        """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n) have."""
+        """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n)
+        have.
+        """
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
         np.add.at(M, self._leaf.of_cell, moments)
         return self._leaf.of_cell, np.asarray(self.onto(M) / self._leaf.width, dtype=np.float64)
@@ -209,7 +238,9 @@ class Far:
             turned = np.einsum("rpl,irpla->irpa", z, each, optimize=True)
             for d in range(2):
                 along = np.einsum("rpi,irpa->rpa", surface.up[d], turned, optimize=True)
-                B[cells] -= np.einsum("pk,rpi,rpa->raki", T[:, 1 + d], surface.n, along, optimize=True)
+                B[cells] -= np.einsum(
+                    "pk,rpi,rpa->raki", T[:, 1 + d], surface.n, along, optimize=True
+                )
         return B.reshape(len(B), COUNT, 3 * k)
 
 
@@ -240,8 +271,12 @@ class Cells:
     def of_copies(self, v: Array, sign: float) -> Array:
         """Changes (3 nodes, n) as those of the nodes of all copies' cells (copies * cells, 3 k, n)."""
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
-        each = [sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)]
-        return np.concatenate([x[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n) for x in each])
+        each = [
+            sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)
+        ]
+        return np.concatenate(
+            [x[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n) for x in each]
+        )
 
     def summed(self, f: Array) -> Array:
         """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
@@ -290,12 +325,16 @@ class ActingOnEachOther:
         """See `assembly.whole.Acting`."""
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
         of_cell, onto = self.far.between(_each(self.B, self.cells.of_copies(v, self.sign)))
-        return self.scale * self.cells.summed(_each(self.B[own_cells].transpose(0, 2, 1), onto[of_cell[own_cells]]))
+        return self.scale * self.cells.summed(
+            _each(self.B[own_cells].transpose(0, 2, 1), onto[of_cell[own_cells]])
+        )
 
 
 def _each(B: Array, v: Array) -> Array:
     """Products of matrices (cells, m, n) with columns (cells, n, columns)."""
-    return np.asarray(np.einsum("cmn,cn->cm", B, v[..., 0])[..., None] if v.shape[-1] == 1 else B @ v)
+    return np.asarray(
+        np.einsum("cmn,cn->cm", B, v[..., 0])[..., None] if v.shape[-1] == 1 else B @ v
+    )
 
 
 def _times(Z: Array, M: Array) -> Array:

@@ -1,4 +1,6 @@
-"""Maps of the magnetic field: grids on planes and in boxes, on which it is computed at each point of a path."""
+"""Maps of the magnetic field: grids on planes and in boxes, on which it is computed at each point
+of a path.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +14,11 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.section import Lengths, Section
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
-from magshell_fenicsx.parts.magnetism.sensors import refuse_unfit_reading, refuse_unknown_field, units
+from magshell_fenicsx.parts.magnetism.sensors import (
+    refuse_unfit_reading,
+    refuse_unknown_field,
+    units,
+)
 from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.parts.seen import MapGrid, Seen, Sight
 from magshell_fenicsx.shape.ground import Coordinates
@@ -28,7 +34,8 @@ SQUARE = 1e-9  # cosine of the angle between sides
 
 
 class FieldMapSection(Section):
-    """A grid on which the field is computed, at every point of the path: fields/map_NAME.pvd for ParaView, and drawn.
+    """A grid on which the field is computed, at every point of the path: fields/map_NAME.pvd for
+    ParaView, and drawn.
 
     It is a rectangle with two sides, or a box with three. In the shell it has no values.
     """
@@ -37,7 +44,9 @@ class FieldMapSection(Section):
     """Where the sides begin [the shell's length; over R if that has no unit]"""
     sides: Annotated[list[Lengths], Field(min_length=2, max_length=3)]
     """Vectors along the sides, perpendicular to each other [the shell's length; over R if that has no unit]"""
-    points: list[Annotated[int, Field(ge=2, le=10_000)]] = Field(default=[41, 41], min_length=2, max_length=3)
+    points: list[Annotated[int, Field(ge=2, le=10_000)]] = Field(
+        default=[41, 41], min_length=2, max_length=3
+    )
     """How many along each side, its ends included"""
     field: Literal["own", "total"] = "own"
     """The field of the magnetised shell alone, or with the applied one"""
@@ -92,10 +101,23 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
     own, R = units(context), context.shell.reference
     unit = unit_of_readings(context)
     grids = [
-        (each, MapGrid(name, np.array(each.corner) / R, np.array(each.sides) / R, tuple(each.points), unit, each.field))
+        (
+            each,
+            MapGrid(
+                name,
+                np.array(each.corner) / R,
+                np.array(each.sides) / R,
+                tuple(each.points),
+                unit,
+                each.field,
+            ),
+        )
         for name, each in given.items()
     ]
-    return tuple(FieldMap(grid, grid.places @ rotation(turn).T, each.field == "total", *own) for each, grid in grids)
+    return tuple(
+        FieldMap(grid, grid.places @ rotation(turn).T, each.field == "total", *own)
+        for each, grid in grids
+    )
 
 
 def unit_of_readings(context: Context) -> str:
@@ -141,12 +163,16 @@ class FieldMapsSeen(Seen):
         return [each.grid.name for each in loads.field_maps]
 
     def on_grids(self, sight: Sight, state: "State") -> list[MapGrid]:
-        from magshell_fenicsx.parts.magnetism.readings import field_at  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.readings import (
+            field_at,
+        )  # the solver takes long to import
 
         return [
             replace(
                 each.grid,
-                values=field_at(sight, state, each.places, each.own, each.applied if each.total else 0.0),
+                values=field_at(
+                    sight, state, each.places, each.own, each.applied if each.total else 0.0
+                ),
             )
             for each in sight.loads.field_maps
         ]

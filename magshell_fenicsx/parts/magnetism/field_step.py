@@ -27,8 +27,8 @@ SAME = 1e-9  # cosine of directions: rounding
 class FieldSection(FactorStep):
     """The field itself is the load: lambda_m from zero, with its instabilities located.
 
-    `until: target` ends at the field of `magnetic` or its `factor`, the others go on in its direction. By default the
-    path is followed by arc length, through folds of lambda_m.
+    `until: target` ends at the field of `magnetic` or its `factor`, the others go on in its
+    direction. By default the path is followed by arc length, through folds of lambda_m.
     """
 
     amplitude: ClassVar[str] = "lambda_m"
@@ -53,7 +53,9 @@ class FieldSection(FactorStep):
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
     def curves(self, here: Here) -> tuple[Curves, float] | None:
-        from magshell_fenicsx.parts.magnetism.direction import straight  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.direction import (
+            straight,
+        )  # the solver takes long to import
 
         direction, value = self._along(here)
         return (straight(direction), value) if direction[1:].any() else None
@@ -63,7 +65,9 @@ class FieldSection(FactorStep):
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
         field = here.loads.magnetic
-        direction = components(directions(here.context.steps, field, here.turn)[here.step.number - 1], field)
+        direction = components(
+            directions(here.context.steps, field, here.turn)[here.step.number - 1], field
+        )
         return direction, float(direction @ field_at(here.mu))
 
     def now(self, here: Here) -> Now:
@@ -76,7 +80,9 @@ class FieldSection(FactorStep):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not strength(context):
-            raise ValueError(f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+            raise ValueError(
+                f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction"
+            )
 
     def unstable_alone(self, value: float, course: Course, what: str) -> str:
         return (
@@ -88,8 +94,9 @@ class FieldSection(FactorStep):
 class RotationSection(Step):
     """The applied field, at its magnitude, turns on the shortest way to another direction.
 
-    The requested points are equal angles apart; the field keeps its magnitude. A gradient, formulas and sources turn
-    with it, about the origin; the direction of formulas, and of sources that are the whole field, is e3 at first.
+    The requested points are equal angles apart; the field keeps its magnitude. A gradient, formulas
+    and sources turn with it, about the origin; the direction of formulas, and of sources that are
+    the whole field, is e3 at first.
     """
 
     amplitude: ClassVar[str] = ANGLE
@@ -103,10 +110,14 @@ class RotationSection(Step):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         before = direction_before(step.number, context)
         if before is None or not strength(context):
-            raise ValueError(f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
+            raise ValueError(
+                f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero"
+            )
         driven = context.driven_before(step.number)
         if context.whole and FieldSection.amplitude not in driven:
-            raise ValueError(f"{step.key}.kind: rotation needs a field: a step of kind: field before it")
+            raise ValueError(
+                f"{step.key}.kind: rotation needs a field: a step of kind: field before it"
+            )
         if abs(before @ self.to.vector()) > 1 - SAME:
             where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
             raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
@@ -118,7 +129,9 @@ class RotationSection(Step):
         return {name} | {other for other in mu if other.startswith("lambda_")}
 
     def course(self, here: Here) -> Course:
-        from magshell_fenicsx.parts.magnetism import direction as of  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism import (
+            direction as of,
+        )  # the solver takes long to import
 
         field, number = here.loads.magnetic, here.step.number
         ends = of.directions(here.context.steps, field, here.turn)[number - 1 : number + 1]
@@ -134,11 +147,15 @@ class RotationSection(Step):
             return f"the turning field makes the shell unstable at {angle:.4g} degrees: {what}"
 
         whole = field and field.turns
-        curves = of.as_a_whole(turn_name(here.step), total) if whole else of.circle(size, before, after)
+        curves = (
+            of.as_a_whole(turn_name(here.step), total) if whole else of.circle(size, before, after)
+        )
         return Course(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
 
     def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead:
-        from magshell_fenicsx.parts.magnetism.direction import directions  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.direction import (
+            directions,
+        )  # the solver takes long to import
 
         all_directions = directions(context.steps, loads.magnetic, turn)
         first, before, after = (all_directions[i] for i in (0, step.number - 1, step.number))
@@ -147,13 +164,17 @@ class RotationSection(Step):
 
 
 def turn_name(step: ProgrammeStep) -> str:
-    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a space."""
+    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a
+    space.
+    """
     return f"{step.name} {step.number}"
 
 
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
     """The unit vector (3,) of the field where a step begins; None without a field."""
-    turned = [step.load.to for step in context.before(number) if isinstance(step.load, RotationSection)]
+    turned = [
+        step.load.to for step in context.before(number) if isinstance(step.load, RotationSection)
+    ]
     if turned:
         return turned[-1].vector()
     magnetic = context.of(MagneticSection)

@@ -30,14 +30,19 @@ MU_0 = 4e-7 * pi  # T m/A
 SOURCES = 1e-9  # of the field's derivatives: rounding
 LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
 MOST_SOFT = 1e6  # of a susceptibility
-SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
+SMALLEST_FIELD, LARGEST_FIELD = (
+    1e-12,
+    10.0,
+)  # of lambda_m: rounding, and a thousand times what destabilises a shell
 ANGLE = "angle"  # amplitude of a step that turns the field
 
 
 class AppliedSection(Direction):
-    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or by formula.
+    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or
+    by formula.
 
-    The unit vector b has the direction of polar and azimuth, r is the deformed place. The fields of sources are added.
+    The unit vector b has the direction of polar and azimuth, r is the deformed place. The fields of
+    sources are added.
     """
 
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
@@ -60,7 +65,9 @@ class AppliedSection(Direction):
     def _beside_sources(self) -> Self:
         others = {"polar", "azimuth", "uniform", "gradient", "components"} & self.model_fields_set
         if self.sources and self.flux_density is None and others:
-            raise ValueError(f"{', '.join(sorted(others))}: of a field beside the sources: give its flux_density too")
+            raise ValueError(
+                f"{', '.join(sorted(others))}: of a field beside the sources: give its flux_density too"
+            )
         names = [source.name for source in self.sources or [] if source.name is not None]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(f"sources: {twice}: two of them have this name")
@@ -68,8 +75,12 @@ class AppliedSection(Direction):
 
     @model_validator(mode="after")
     def _square(self) -> Self:
-        if self.components and (others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set):
-            raise ValueError(f"components are the whole field: leave out {', '.join(sorted(others))}")
+        if self.components and (
+            others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set
+        ):
+            raise ValueError(
+                f"components are the whole field: leave out {', '.join(sorted(others))}"
+            )
         if self.gradient and any(len(row) != 3 for row in self.gradient):
             raise ValueError("gradient is three rows of three numbers")
         if self.uniform == 0 and not self.gradient:
@@ -100,20 +111,28 @@ def _of_places(value: Any) -> Any:
         raise ValueError("a mapping names at least one patch")
     else:
         for each in value.values() if isinstance(value, dict) else [value]:
-            if isinstance(each, bool) or not isinstance(each, int | float) or not 0 <= each <= MOST_SOFT:
-                raise ValueError(f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, z")
+            if (
+                isinstance(each, bool)
+                or not isinstance(each, int | float)
+                or not 0 <= each <= MOST_SOFT
+            ):
+                raise ValueError(
+                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, z"
+                )
     return value
 
 
 Susceptibility = Annotated[
-    float | str | dict[str, float], BeforeValidator(_of_places, json_schema_input_type=float | str | dict[str, float])
+    float | str | dict[str, float],
+    BeforeValidator(_of_places, json_schema_input_type=float | str | dict[str, float]),
 ]
 
 
 class MagneticSection(Section, Ability):
     """lambda_m, or both flux densities (and shell.youngs_modulus).
 
-    A shell with a susceptibility and without `remanent` is soft alone: λ_m = |B^a|/√(μ0 E), or applied.flux_density.
+    A shell with a susceptibility and without `remanent` is soft alone: λ_m = |B^a|/√(μ0 E), or
+    applied.flux_density.
 
     Energies: full, exact; first, torque and second are the paper's expansions in the displacement;
     second_consistent has the couple too that they leave out. See docs/theory.md.
@@ -145,21 +164,31 @@ class MagneticSection(Section, Ability):
     @classmethod
     def _soft_alone(cls, data: Any) -> Any:
         """Without the key a soft shell has no remanence, and another one that along e3."""
-        if isinstance(data, dict) and data.get("susceptibility") is not None and "remanent" not in data:
+        if (
+            isinstance(data, dict)
+            and data.get("susceptibility") is not None
+            and "remanent" not in data
+        ):
             return {**data, "remanent": None}
         return data
 
     @model_validator(mode="after")
     def _what_is_soft(self) -> Self:
         if self.remanent is None and self.susceptibility is None:
-            raise ValueError("remanent: none is of a shell with a susceptibility: give that, or leave remanent out")
-        if self.saturation is not None and (self.susceptibility is None or self.lambda_m is not None):
+            raise ValueError(
+                "remanent: none is of a shell with a susceptibility: give that, or leave remanent out"
+            )
+        if self.saturation is not None and (
+            self.susceptibility is None or self.lambda_m is not None
+        ):
             raise ValueError(
                 "saturation: is of a shell with a susceptibility in a field in tesla: give susceptibility and "
                 "applied.flux_density (or sources), without lambda_m"
             )
         if self.susceptibility is not None and self.energy != "full":
-            raise ValueError(f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs full")
+            raise ValueError(
+                f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs full"
+            )
         if self.susceptibility is not None and self.remanent and self.lambda_m is not None:
             raise ValueError(
                 "susceptibility: beside a remanence lambda_m does not say how strong the field is: give "
@@ -192,15 +221,23 @@ class MagneticSection(Section, Ability):
             return self
         densities = [self.remanent.flux_density, self.applied.reference]
         if self.lambda_m is not None and self.applied.sources:
-            raise ValueError("sources are in tesla: give remanent.flux_density in place of lambda_m")
+            raise ValueError(
+                "sources are in tesla: give remanent.flux_density in place of lambda_m"
+            )
         if self.lambda_m is not None and densities != [None, None]:
-            raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
+            raise ValueError(
+                "give lambda_m, or the flux densities of remanent and applied, not both"
+            )
         if self.model_fields_set == {"remanence"}:
-            raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
+            raise ValueError(
+                "remanence: is a law of a field, and there is none: give lambda_m or flux densities too"
+            )
         if self.lambda_m is None and None in densities and not self.without_field:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
-            raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
+            raise ValueError(
+                "a remanence of length zero is no magnetisation: leave the section out"
+            )
         if not self.applied.is_uniform and self.energy != "full":
             raise ValueError(
                 "the approximate energies are of uniform fields; gradient, components and sources need energy: full"
@@ -211,12 +248,19 @@ class MagneticSection(Section, Ability):
     def without_field(self) -> bool:
         """Whether the remanence is alone: nothing says how strong a field is."""
         given = self.model_fields_set
-        return self.remanent is not None and self.lambda_m is None and "remanent" in given and "applied" not in given
+        return (
+            self.remanent is not None
+            and self.lambda_m is None
+            and "remanent" in given
+            and "applied" not in given
+        )
 
     def _one_field(self) -> None:
         """Of a shell that is soft alone."""
         if self.lambda_m is not None and self.applied.reference is not None:
-            raise ValueError("give lambda_m, or the flux density (or the sources) of applied, not both")
+            raise ValueError(
+                "give lambda_m, or the flux density (or the sources) of applied, not both"
+            )
         if self.lambda_m is None and self.applied.reference is None:
             raise ValueError("give lambda_m, or applied.flux_density; the shell is soft alone")
         if self.model_fields_set & {"remanence"}:
@@ -257,7 +301,9 @@ class MagneticSection(Section, Ability):
                 "or lambda_m"
             )
         if self.without_field and not is_read(context) and self.interaction == "none":
-            raise ValueError("magnetic: give lambda_m, or remanent.flux_density and applied.flux_density")
+            raise ValueError(
+                "magnetic: give lambda_m, or remanent.flux_density and applied.flux_density"
+            )
         if self.interaction != "none":
             context.needs(
                 f"magnetic.interaction: {self.interaction}",
@@ -267,7 +313,12 @@ class MagneticSection(Section, Ability):
             )
         if self.energy != "full":
             expanded = f"magnetic.energy: {self.energy}"
-            context.needs(expanded, "a mid-surface", "a thickness that does not change", hint="or give energy: full")
+            context.needs(
+                expanded,
+                "a mid-surface",
+                "a thickness that does not change",
+                hint="or give energy: full",
+            )
         if self.remanent and isinstance(self.remanent.components, GivenField):
             context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
         layers = self.remanent.layers if self.remanent else None
@@ -294,7 +345,9 @@ class MagneticSection(Section, Ability):
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.magnetisation import (
+            leaves,
+        )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
         acts = [] if self.interaction == "none" else [Leaves("parts act on each other")]
@@ -302,26 +355,36 @@ class MagneticSection(Section, Ability):
         return acts + (leaves(context, outline) if seen else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
+        from magshell_fenicsx.models.shell.patterns import (
+            LARGEST,
+        )  # the solver takes long to import
 
         if self.remanent and isinstance(self.remanent.components, list):
-            yield Formulas("magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0)
+            yield Formulas(
+                "magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0
+            )
         if isinstance(self.susceptibility, str):
             yield Formulas("magnetic.susceptibility", [self.susceptibility], 0.0, MOST_SOFT, 1.0)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.magnetism.magnetisation import adds  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.magnetisation import (
+            adds,
+        )  # the solver takes long to import
 
         return adds(context, modelled)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
         from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
-        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism.sources.field import (
+            placed,
+        )  # the solver takes long to import
 
         refuse_unfit_interaction(context)
         lambda_m = strength(context)
-        largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell
+        largest = LARGEST_FIELD * (
+            100.0 if self.applied.sources else 1.0
+        )  # of 1 T, which no source makes on a shell
         if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:
             raise CaseError(
                 f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
@@ -329,7 +392,11 @@ class MagneticSection(Section, Ability):
             )
         for source in placed(context):
             B = source(places)[0]
-            if len(strong := places[np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)]):
+            if len(
+                strong := places[
+                    np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)
+                ]
+            ):
                 x, y, z = strong[0]
                 raise CaseError(
                     f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the field at (x, y, z)/R = "
@@ -342,8 +409,16 @@ class MagneticSection(Section, Ability):
                     f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) {source.nowhere}; "
                     "see its position"
                 )
-        components = {"remanent": self.remanent and self.remanent.components, "applied": self.applied.components}
-        for key, text in ((key, text) for key, each in components.items() if isinstance(each, list) for text in each):
+        components = {
+            "remanent": self.remanent and self.remanent.components,
+            "applied": self.applied.components,
+        }
+        for key, text in (
+            (key, text)
+            for key, each in components.items()
+            if isinstance(each, list)
+            for text in each
+        ):
             bad = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
             if len(bad):
                 x, y, z = bad[0]
@@ -358,7 +433,10 @@ class MagneticSection(Section, Ability):
         if not components:
             return None
         G = np.stack([with_derivatives(text)(places).gradient for text in components])
-        divergence, curl = np.abs(np.trace(G)), np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2)
+        divergence, curl = (
+            np.abs(np.trace(G)),
+            np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2),
+        )
         sizes = np.nan_to_num(divergence), np.nan_to_num(curl)
         largest = [float(values.max()) for values in sizes]
         if max(largest) <= SOURCES * np.nan_to_num(np.abs(G)).max():
@@ -371,19 +449,31 @@ class MagneticSection(Section, Ability):
         )
 
     def numbers(self, context: Context) -> list[str]:
-        """How strong magnets and coils are on the shell: too weak, and a place was meant in another unit."""
-        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
+        """How strong magnets and coils are on the shell: too weak, and a place was meant in another
+        unit.
+        """
+        from magshell_fenicsx.parts.magnetism.sources.field import (
+            placed,
+        )  # the solver takes long to import
         from magshell_fenicsx.shape.outline import outline
 
         if not (sources := placed(context)):
             return []
         places, unit = outline(context.shell).sample(), 1e3 * abs(self.applied.reference or 1.0)
-        sizes = unit * np.linalg.norm(np.sum([source(places)[0] for source in sources], axis=0), axis=1)
-        return [f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"]
+        sizes = unit * np.linalg.norm(
+            np.sum([source(places)[0] for source in sources], axis=0), axis=1
+        )
+        return [
+            f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"
+        ]
 
     def units(self, context: Context, units: Given) -> Given:
         """The flux density, or the strength of the sources, of lambda_m = 1."""
-        if isnan(units.E) or self.without_field or not (self.remanent is None or self.remanent.flux_density):
+        if (
+            isnan(units.E)
+            or self.without_field
+            or not (self.remanent is None or self.remanent.flux_density)
+        ):
             return units
         if self.applied.beside:
             return replace(units, applied=1e3 * self.tesla(units.E))

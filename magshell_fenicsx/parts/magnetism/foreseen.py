@@ -1,4 +1,6 @@
-"""Forces of all charges on each other near states at which they were computed, along a path and beside it."""
+"""Forces of all charges on each other near states at which they were computed, along a path and
+beside it.
+"""
 
 from collections import deque
 from collections.abc import Callable
@@ -15,13 +17,16 @@ Array = NDArray[np.float64]
 POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it
 CHANGES = 4  # beside the path that are remembered
 FEW = 3  # states of a point before: it, and two that tell a slope
-TOGETHER = 0.5  # states nearer to each other than this part of the way from the point before belong to one point
+# states nearer to each other than this part of the way from the point before belong to one point
+TOGETHER = 0.5
 OWN = 0.3  # of a change: what newer ones do not have, at least
 STRAIGHT = 0.5  # of a way: along the path, at least
 TURNED = 0.02  # angle by which a node has turned since D was turned: it is turned again
 APART = 0.1  # of the larger one of two places along the path: their distance, at least
 LAST = 6  # products with D that are kept
-ALONG = 0.999  # cosine of the angle between a change and a direction along which forces are then known
+ALONG = (
+    0.999  # cosine of the angle between a change and a direction along which forces are then known
+)
 SLOPE = 0.05  # of a way: two states as near as this one to each other tell a slope
 
 
@@ -40,16 +45,19 @@ class Known:
 
 
 class Foreseen:
-    """Forces near states at which they were computed, by an earlier second derivative D and by what D lacks.
+    """Forces near states at which they were computed, by an earlier second derivative D and by what
+    D lacks.
 
-    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth along the path, and
-    small beside it. Along the path, the forces without D u are a polynomial through its last points. It has slopes at
-    points where two states near each other are known. Changes of u beside the path correct D and the polynomial by
-    secants, the newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several
-    steps).
+    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth
+    along the path, and small beside it. Along the path, the forces without D u are a polynomial
+    through its last points. It has slopes at points where two states near each other are known.
+    Changes of u beside the path correct D and the polynomial by secants, the newest change first
+    (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
     """
 
-    def __init__(self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool) -> None:
+    def __init__(
+        self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool
+    ) -> None:
         self._blocks, self._turns, self._alone = blocks, turns, alone  # on one rank
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
@@ -83,7 +91,9 @@ class Foreseen:
         return foreseen
 
     def knows_along(self, u: Array, step: Array) -> bool:
-        """Whether the forces at two states near each other and u are known, one from the other along a direction."""
+        """Whether the forces at two states near each other and u are known, one from the other
+        along a direction.
+        """
         if not self._points or self._begins(u):
             return False
         near, size = SLOPE * self._ways[-1], float(np.linalg.norm(step))
@@ -110,7 +120,9 @@ class Foreseen:
         self._stored = Singles.of(D.stored, upper=self._alone) if turned is None else turned
         self._model = None
         self._products.clear()
-        self._points = [[Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points]
+        self._points = [
+            [Known(k.u, k.forces, self._product(k.u)) for k in point] for point in self._points
+        ]
 
     def _made(self) -> tuple["Along", list[tuple[Array, Array]]]:
         """The polynomial along the path, and orthonormal changes with what is lacking along them."""
@@ -118,7 +130,10 @@ class Foreseen:
         pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
         for one, other in pairs[:CHANGES]:
             s = one.u - other.u
-            y, size = one.rest - other.rest - along.rest(one.u) + along.rest(other.u), float(np.linalg.norm(s))
+            y, size = (
+                one.rest - other.rest - along.rest(one.u) + along.rest(other.u),
+                float(np.linalg.norm(s)),
+            )
             for _ in range(2):
                 for q, of_q in changes:
                     part = float(q @ s)
@@ -141,7 +156,8 @@ class Foreseen:
 
 @dataclass(frozen=True)
 class Along:
-    """What forces are without D u, as a polynomial of the place along a direction, from the newest state on.
+    """What forces are without D u, as a polynomial of the place along a direction, from the newest
+    state on.
 
     Attributes
     ----------
@@ -173,7 +189,9 @@ class Along:
             s = last.u - base.u
             at, size = float(direction @ s) / way, float(np.linalg.norm(s)) / way
             if last is not base:
-                if abs(at) < STRAIGHT * size or min(abs(at - x) for x in places) < APART * max(1.0, abs(at)):
+                if abs(at) < STRAIGHT * size or min(abs(at - x) for x in places) < APART * max(
+                    1.0, abs(at)
+                ):
                     continue
                 places.append(at)
                 rows.append(np.asarray(at**powers))
@@ -195,4 +213,6 @@ class Along:
     def rest(self, u: Array) -> Array:
         """At a state, on the path."""
         at = float(self.direction @ (u - self.base.u)) / self.way
-        return np.asarray(self.base.rest + at ** np.arange(1, len(self.coefficients) + 1) @ self.coefficients)
+        return np.asarray(
+            self.base.rest + at ** np.arange(1, len(self.coefficients) + 1) @ self.coefficients
+        )

@@ -1,4 +1,6 @@
-"""Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees of it."""
+"""Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees
+of it.
+"""
 
 from collections import deque
 from copy import copy
@@ -48,12 +50,15 @@ TOO_NEAR = (
 def polar(F: Array) -> Array:
     """The rotations nearest to matrices (n, 3, 3)."""
     U, _, V = np.linalg.svd(F)
-    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]  # a reflection where an iterate has turned a cell inside out
+    U[:, :, 2] *= np.linalg.det(U @ V)[
+        :, None
+    ]  # a reflection where an iterate has turned a cell inside out
     return np.asarray(U @ V)
 
 
 class InteractionTerm:
-    """The energy over E h R² of the parts of a model in each other's and their own field; its amplitude: `interaction`.
+    """The energy over E h R² of the parts of a model in each other's and their own field; its
+    amplitude: `interaction`.
 
     Raises
     ------
@@ -100,7 +105,8 @@ class InteractionTerm:
         return other
 
     def refuse_near(self) -> None:
-        """See that there are several parts, undeformed as far from each other as their cells can tell; collective.
+        """See that there are several parts, undeformed as far from each other as their cells can
+        tell; collective.
 
         Raises
         ------
@@ -133,7 +139,11 @@ class InteractionTerm:
     def add_foreseen(self, b: Array, factor: float) -> None:
         """See `assembly.whole.WholeTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
-        foreseen = self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2]) if self._stiff else None
+        foreseen = (
+            self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2])
+            if self._stiff
+            else None
+        )
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
 
     def knows_along(self, step: Array) -> bool:
@@ -141,7 +151,9 @@ class InteractionTerm:
         self._nodes()
         there, nodes = whole(self._u), self._u.function_space.dofmap.index_map
         own = step.reshape(-1, 3)[: nodes.size_local]
-        return self._foreseen.knows_along(there.ravel(), np.concatenate(self._comm.allgather(own)).ravel())
+        return self._foreseen.knows_along(
+            there.ravel(), np.concatenate(self._comm.allgather(own)).ravel()
+        )
 
     def compile_tangent(self) -> None:
         """A sum over pairs of charges."""
@@ -154,7 +166,9 @@ class InteractionTerm:
         return self._even.both(rough=rough)[1] if self._even else self.both(rough=rough)[0]
 
     def both(self, *, rough: bool) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
-        """The second derivative, and that by additions to u that are opposite in the images; collective."""
+        """The second derivative, and that by additions to u that are opposite in the images;
+        collective.
+        """
         nodes = self._nodes()
         if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
             self._stiff = None  # two are not kept at once
@@ -172,7 +186,9 @@ class InteractionTerm:
         part = slice(own_cells.start, own_cells.stop)
         if of_shape:
             into = self._charged.by_fields(nodes, turned, own_cells, weights, of_shape=True)
-            by_place, by_thickness = (self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness))
+            by_place, by_thickness = (
+                self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness)
+            )
             if name == "thickness":
                 assert self._model.thickness
                 return self._model.thickness, np.asarray(by_thickness[..., None])
@@ -180,9 +196,18 @@ class InteractionTerm:
         if name != own.Br.name:
             return None
         shape, cells, edges = self._all(may=True)
-        near = Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies, may=True)
+        near = Near(
+            shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies, may=True
+        )
         charged = Charged(
-            shape, self._parts, cells, edges, self._comm, near if self._itself else None, self._copies, may=True
+            shape,
+            self._parts,
+            cells,
+            edges,
+            self._comm,
+            near if self._itself else None,
+            self._copies,
+            may=True,
         )
         found = charged.by_fields(nodes, turned, own_cells, weights).by_remanence
         return own.Br, np.asarray(self._comm.allreduce(found))[part]
@@ -191,7 +216,9 @@ class InteractionTerm:
         """By the nodes of own cells: a placement moves charges as a displacement does; collective."""
         V, count = self._u.function_space, len(self._cells.own)
         D, v = self.acting(), whole(direction).ravel()
-        of_nodes = energy * self._evaluated()[1] + force * (D.stored @ v + D.times_others(v[:, None]).ravel())
+        of_nodes = energy * self._evaluated()[1] + force * (
+            D.stored @ v + D.times_others(v[:, None]).ravel()
+        )
         nodes = V.dofmap.list[:count]
         shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
         return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
@@ -206,12 +233,20 @@ class InteractionTerm:
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         far, near = self._charged.boxes(nodes, own)
-        stored, touching = np.zeros((local, count), dtype=bool), np.zeros((count, count), dtype=bool)
-        for into, row_in, pairs in ((stored, row_of, near), (touching, self._cells.nodes, far.beside(own))):
+        stored, touching = (
+            np.zeros((local, count), dtype=bool),
+            np.zeros((count, count), dtype=bool),
+        )
+        for into, row_in, pairs in (
+            (stored, row_of, near),
+            (touching, self._cells.nodes, far.beside(own)),
+        ):
             for cell, row in zip(own, pairs, strict=True):
                 columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
                 into[row_in[cell][:, None], columns] = True
-        self._comm.Allreduce(MPI.IN_PLACE, touching, MPI.LOR)  # the same blocks on any number of ranks
+        self._comm.Allreduce(
+            MPI.IN_PLACE, touching, MPI.LOR
+        )  # the same blocks on any number of ranks
         stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
         try:
             self._charged.evaluate(nodes, own, stiffness)
@@ -221,7 +256,16 @@ class InteractionTerm:
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(stiffness, far, B, self._scale, cells, sign, touching[numbers][stored], self._turning)
+            ActingOnEachOther(
+                stiffness,
+                far,
+                B,
+                self._scale,
+                cells,
+                sign,
+                touching[numbers][stored],
+                self._turning,
+            )
             for sign in ([1.0, -1.0] if several else [1.0, 1.0])
         )
         return even, odd
@@ -238,17 +282,24 @@ class InteractionTerm:
             k = self._cells.nodes.shape[1]
             energy, gradient = np.nan, np.full((len(self._cells.own), k, 3), np.nan)
         forces = np.zeros_like(self._u.x.array)
-        np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient)
+        np.add.at(
+            forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient
+        )
         self._seen.appendleft((nodes, self._scale * energy, forces))
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
             self._foreseen.learn(whole(self._u).ravel(), forces)
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
-        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes them changed."""
+        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes
+        them changed.
+        """
         r0, u = (whole(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
-        factor, of_nodes = self._model.thickness, own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list]
+        factor, of_nodes = (
+            self._model.thickness,
+            own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list],
+        )
         given: tuple[Array, ...] = (r0, self._cells.gathered(of_nodes))
         if factor is not None:
             given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
@@ -261,7 +312,9 @@ class InteractionTerm:
         return self._copies.of((r0 + u)[self._cells.nodes])
 
     def _turns(self, u: Array, before: Array) -> Array:
-        """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar last."""
+        """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar
+        last.
+        """
         r0, nodes = whole(self._model.r0), self._cells.nodes
         element = self._u.function_space.element.basix_element
         T = element.tabulate(1, element.points)[1:, :, :, 0]
@@ -287,7 +340,9 @@ class InteractionTerm:
         return Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies)
 
     def _all(self, *, may: bool = False) -> tuple[Shape, Ints, Ints]:
-        """The cells of all ranks, and their edges that are charged, or `may` be by any remanence; collective."""
+        """The cells of all ranks, and their edges that are charged, or `may` be by any remanence;
+        collective.
+        """
         own = own_field(self._sight)
         shape, (cells, edges) = own.shape({}), own.chargeable if may else own.edges
         thick = shape.thick and (shape.thick[0], self._given[2])
@@ -307,7 +362,9 @@ class InteractionTerm:
 
     @cached_property
     def _corners(self) -> Ints:
-        """(copies * cells, 3) numbers of corners; on a mirror plane an image has that of its original; collective."""
+        """(copies * cells, 3) numbers of corners; on a mirror plane an image has that of its
+        original; collective.
+        """
         r0, corners = whole(self._model.r0), self._cells.nodes[:, :3]
         places = self._copies.of(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
@@ -324,7 +381,9 @@ class InteractionTerm:
         if len(self._copies.images) == 1:
             return np.asarray(self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
-        graph = coo_array((ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size))
+        graph = coo_array(
+            (ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size)
+        )
         _, part_of_corner = connected_components(graph, directed=False)
         return np.asarray(np.unique(part_of_corner[corners[:, 0]], return_inverse=True)[1])
 

@@ -39,17 +39,23 @@ class Interaction:
 
 
 class InteractionStep(FactorStep):
-    """What is magnetised begins to act on the other parts of the shell: the factor of their energy grows from 0 to 1.
+    """What is magnetised begins to act on the other parts of the shell: the factor of their energy
+    grows from 0 to 1.
 
-    The square root of the factor multiplies the remanence in the interaction alone. By default the path is followed by
-    arc length, through its folds.
+    The square root of the factor multiplies the remanence in the interaction alone. By default the
+    path is followed by arc length, through its folds.
     """
 
     amplitude: ClassVar[str] = AMPLITUDE
     section: ClassVar[str] = "magnetic"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
-        Quantity(AMPLITUDE, "interaction", "Factor of the energy of magnetised parts in each other's field.", "load"),
+        Quantity(
+            AMPLITUDE,
+            "interaction",
+            "Factor of the energy of magnetised parts in each other's field.",
+            "load",
+        ),
     )
     kind: Literal["interaction"]
     factor: float | None = Field(default=None, ge=0, le=1e3)
@@ -61,7 +67,9 @@ class InteractionStep(FactorStep):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not acts(context):
-            raise ValueError(f"{step.key}.kind: interaction needs magnetic.interaction: others or all")
+            raise ValueError(
+                f"{step.key}.kind: interaction needs magnetic.interaction: others or all"
+            )
 
     def unstable_alone(self, value: float, course: Course, what: str) -> str:
         return (
@@ -84,7 +92,9 @@ def interaction(context: Context) -> Interaction | None:
     assert magnetic.remanent
     assert magnetic.remanent.flux_density
     assert E
-    return Interaction(magnetic.remanent.flux_density**2 / (MU_0 * E), magnetic.interaction == "all")
+    return Interaction(
+        magnetic.remanent.flux_density**2 / (MU_0 * E), magnetic.interaction == "all"
+    )
 
 
 def refuse_unfit_interaction(context: Context) -> None:

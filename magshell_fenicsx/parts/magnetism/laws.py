@@ -1,10 +1,10 @@
 """The magnetic terms of each law of the remanence and each energy.
 
-A remanence moves with F (`densities`), or it turns with the surface and does not stretch: R Br in place of F Br.
-R is the rotation of the polar decomposition of F = a_i (x) a0^i + n (x) n0. In the surface, with C = U^2,
-U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 = (F + J F C^-1)/T, and
-J F C^-1 = J a^i (x) a0_i: no root but of numbers above zero, at equal stretches too. In units and arguments as
-`densities`.
+A remanence moves with F (`densities`), or it turns with the surface and does not stretch: R Br in
+place of F Br. R is the rotation of the polar decomposition of F = a_i (x) a0^i + n (x) n0. In the
+surface, with C = U^2, U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 =
+(F + J F C^-1)/T, and J F C^-1 = J a^i (x) a0_i: no root but of numbers above zero, at equal
+stretches too. In units and arguments as `densities`.
 """
 
 import ufl
@@ -24,7 +24,9 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     J = kin.area_ratio(r) / area0
     trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))
     moved = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
-    across = (ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)) / area0
+    across = (
+        ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)
+    ) / area0
     along = ufl.dot(n0, Br)
     return -ufl.dot(Ba, (moved + across) / ufl.sqrt(trace + 2 * J) - Br + along * n)
 
@@ -57,7 +59,10 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 LINEAR = ("U1", "couple")
-_FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": magnetic}
+_FULL: dict[RemanenceLaw, MagneticDensity] = {
+    "deformation": densities.magnetic,
+    "rotation": magnetic,
+}
 _EXPANDED: dict[RemanenceLaw, dict[str, MagneticDensity]] = {
     "deformation": {
         "U1": densities.magnetic_first,
@@ -85,7 +90,9 @@ def full_density(law: RemanenceLaw, *, thins: bool) -> MagneticDensity:
     return densities.magnetic_thinned if thins and law == "deformation" else _FULL[law]
 
 
-def magnetic_densities(law: RemanenceLaw, energy: MagneticEnergy, *, thins: bool) -> dict[str, MagneticDensity]:
+def magnetic_densities(
+    law: RemanenceLaw, energy: MagneticEnergy, *, thins: bool
+) -> dict[str, MagneticDensity]:
     """Name of the term -> its density, linear in the applied field."""
     if energy == "full":
         return {"magnetic": full_density(law, thins=thins)}

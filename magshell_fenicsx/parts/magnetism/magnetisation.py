@@ -38,8 +38,21 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, mirrors_formula, nothing, tilted
-from magshell_fenicsx.shape.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
+from magshell_fenicsx.shape.symmetry import (
+    PARALLEL,
+    Leaves,
+    alike,
+    mirrors_formula,
+    nothing,
+    tilted,
+)
+from magshell_fenicsx.shape.turning import (
+    beside,
+    field_turns,
+    scalar_turns,
+    vector_turns,
+    vectors_of,
+)
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
@@ -59,7 +72,11 @@ def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
 
 
 def magnetisation(
-    magnetic: MagneticSection, context: Context, turn: float, within: Mapping[str, Inside], to: Sequence[Direction] = ()
+    magnetic: MagneticSection,
+    context: Context,
+    turn: float,
+    within: Mapping[str, Inside],
+    to: Sequence[Direction] = (),
 ) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
@@ -70,18 +87,25 @@ def magnetisation(
     to
         Directions that the field turns to.
     """
-    section, gradient = magnetic.remanent or RemanentSection.model_construct(), magnetic.applied.gradient
+    section, gradient = (
+        magnetic.remanent or RemanentSection.model_construct(),
+        magnetic.applied.gradient,
+    )
     field, driven = in_space(context, turn)
     own = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
     for direction in () if field else to:
-        away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
+        away = direction.vector(turn) - np.sum(
+            [(direction.vector(turn) @ e) * e for e in basis], axis=0
+        )
         if np.linalg.norm(away) > SAME:
             basis.append(away / np.linalg.norm(away))
     applied, *across = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(context.shell, MeshSurface):
-        patches = {name: _on_patch(direction, context, turn) for name, direction in section.patches.items()}
+        patches = {
+            name: _on_patch(direction, context, turn) for name, direction in section.patches.items()
+        }
     remanent = _remanence(section, context, turn, within) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
@@ -102,13 +126,17 @@ def magnetisation(
         section.components if isinstance(section.components, GivenField) else None,
         soft(context, turn, within),
         own if np.isfinite(own) else 1.0,
-        context.shell.reference if context.shell.with_units and np.isfinite(units(context)[1]) else 0.0,
+        context.shell.reference
+        if context.shell.with_units and np.isfinite(units(context)[1])
+        else 0.0,
         magnetic.lambda_m == 0 and not is_read(context),
     )
 
 
 def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | None:
-    """What is soft, in a frame turned about e3 (rad); None without a susceptibility; `within` is of `Problem`."""
+    """What is soft, in a frame turned about e3 (rad); None without a susceptibility; `within` is of
+    `Problem`.
+    """
     magnetic = context.of(MagneticSection)
     if magnetic is None or magnetic.susceptibility is None:
         return None
@@ -121,9 +149,14 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | 
         patches = {name: np.array([each]) for name, each in chi.items()}
     elif isinstance(chi, dict):
         rest = np.array([chi.get("rest", 0.0)])
-        rims = tuple((inside, np.array([chi[name]]) if name in chi else rest) for name, inside in within.items())
+        rims = tuple(
+            (inside, np.array([chi[name]]) if name in chi else rest)
+            for name, inside in within.items()
+        )
         pattern = WithinRims(rims, rest) if rims else float(rest[0])
-    scale = sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
+    scale = (
+        sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
+    )
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
     largest = None if magnetic.saturation is None else magnetic.saturation / tesla
     return Soft(pattern, scale, tesla, remanent is None, patches or None, largest)
@@ -152,7 +185,9 @@ def _remanence(
     if section.kind == "tangential":
         return tangential
     if isinstance(section.components, list):
-        return Components([formula(text) for text in section.components], rotation(turn) if turn else None)
+        return Components(
+            [formula(text) for text in section.components], rotation(turn) if turn else None
+        )
     if section.file:
         return by_points(section, turn)
     if section.layers:
@@ -187,16 +222,26 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         by_place = by_points(remanent)
         fields.append(lambda x: by_place(x, x))
         askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
-    patterns = {name: of for name, of in zip(remanent.patches or {}, given, strict=False) if isinstance(of, Placed)}
+    patterns = {
+        name: of
+        for name, of in zip(remanent.patches or {}, given, strict=False)
+        if isinstance(of, Placed)
+    }
     for name, pattern in patterns.items():
         if pattern.pattern in (radial, tangential):
             continue
         fields.append(partial(_at_places, pattern))
-        pieces = tuple(piece for piece in (outline.span.pieces if outline.span else ()) if name.startswith(piece.name))
+        pieces = tuple(
+            piece
+            for piece in (outline.span.pieces if outline.span else ())
+            if name.startswith(piece.name)
+        )
         span = outline.span and replace(outline.span, pieces=pieces)
         if not (span and field_turns(fields[-1], span, smooth=False)):
             askew.append(f"the remanence of {name} differs around e3")
-    if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
+    if remanent.components and not (
+        outline.span and vector_turns(remanent.components, outline.span)
+    ):
         askew.append("the formula of the remanence differs around e3")
     if formulas and not (outline.span and vector_turns(formulas, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
@@ -205,7 +250,9 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     ):
         askew.append("the susceptibility differs around e3")
     sources = values(context) if magnetic.applied.sources or whole else []
-    if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
+    if sources and not (
+        outline.span and all(field_turns(field, outline.span) for field in sources)
+    ):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         askew.append("the gradient of the applied field is not diag(a, a, b)")
@@ -219,15 +266,23 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
             few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
                 alike(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
-                for field, places in (*((field, x) for field in fields), *((field, few) for field in sources))
+                for field, places in (
+                    *((field, x) for field in fields),
+                    *((field, few) for field in sources),
+                )
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
             of_shells = [(each.pattern, each.place.Q[:, 2]) for each in patterns.values()]
             even = all(p is not radial or sign == 1.0 for p, _ in of_shells)
-            even &= all(p is not tangential or np.abs(S @ e3 - sign * e3).max() <= SAME for p, e3 in of_shells)
+            even &= all(
+                p is not tangential or np.abs(S @ e3 - sign * e3).max() <= SAME
+                for p, e3 in of_shells
+            )
             return uniform and varying and even and kinds.get(remanent.kind, sign) == sign
 
-        return soft_mirrored(magnetic.susceptibility, outline, mirror) and (images(1.0) or images(-1.0))
+        return soft_mirrored(magnetic.susceptibility, outline, mirror) and (
+            images(1.0) or images(-1.0)
+        )
 
     return [
         Leaves(
@@ -251,11 +306,16 @@ def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
 
 
 def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
-    """The field that a step drives; else the remanence alone, where a reduced model shows it as it is."""
+    """The field that a step drives; else the remanence alone, where a reduced model shows it as it
+    is.
+    """
     magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
-    read: dict[str, Any] = {"sensors": sensors(context, turn), "field_maps": field_maps(context, turn)}
+    read: dict[str, Any] = {
+        "sensors": sensors(context, turn),
+        "field_maps": field_maps(context, turn),
+    }
     read["interaction"] = interaction(context)
     if FieldSection.amplitude in driven:
         to = [step.to for step in _rotations(context)]
@@ -277,16 +337,23 @@ def account(context: Context, loads: Loads) -> Account:
     """The energy of the field, and its sources."""
     magnetic, field, words = context.of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
-        words = [f"magnetised parts in each other's field, |Br|²/(mu_0 E) = {loads.interaction.strength:g}"]
+        words = [
+            f"magnetised parts in each other's field, |Br|²/(mu_0 E) = {loads.interaction.strength:g}"
+        ]
     if magnetic is None or field is None:
         none = "lambda_m is zero" if magnetic else "no magnetic section"
         return Account(words, [f"magnetic energy: {none}"])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
     if field.soft:
-        chi, beside = magnetic.susceptibility, "without remanence" if field.soft.alone else "beside the remanence"
+        chi, beside = (
+            magnetic.susceptibility,
+            "without remanence" if field.soft.alone else "beside the remanence",
+        )
         chi = f"{chi:g}" if isinstance(chi, int | float) else chi
         law += f", soft magnetism of a sheet with the susceptibility {chi} {beside}"
         law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
     sources = enumerate(magnetic.applied.sources or [])
     words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
-    return Account([f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words])
+    return Account(
+        [f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words]
+    )

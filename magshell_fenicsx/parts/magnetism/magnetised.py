@@ -32,12 +32,13 @@ class Magnetisation:
     gradient
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
     in_space
-        The applied flux density as a function of the deformed place, in place of `applied` and `gradient`.
+        The applied flux density as a function of the deformed place, in place of `applied` and
+        `gradient`.
     driven
         Fields that amplitudes drive, added to `in_space`.
     across
-        Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
-        `ACROSS`.
+        Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the
+        amplitudes of `ACROSS`.
     axes
         Unit vectors along `applied` and `across`.
     turns
@@ -49,7 +50,8 @@ class Magnetisation:
     patches
         Vectors (3,) or patterns on named patches of a mesh, in place of `remanent`; None without.
     layers
-        Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
+        Fractions of the thickness and vectors (3,), from the inner face outwards, of which
+        `remanent` is the average.
     law
         Whether the remanence moves with F, as in the paper, or with its rotation R.
     soft
@@ -59,7 +61,8 @@ class Magnetisation:
     metres
         R in m; 0 if the case has no lengths with units, or no flux densities.
     absent
-        Whether the case says that nothing is magnetised, though it has a direction: lambda_m is 0, and nothing reads.
+        Whether the case says that nothing is magnetised, though it has a direction: lambda_m is 0,
+        and nothing reads.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -86,13 +89,17 @@ class Magnetisation:
         return self.gradient is None and self.in_space is None
 
     def at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The applied flux density (..., 3) at points r (..., 3), so that of a uniform one lambda_m is the size."""
+        """The applied flux density (..., 3) at points r (..., 3), so that of a uniform one lambda_m
+        is the size.
+        """
         along = mu.get("lambda_m", 0.0)
         if self.in_space and not along:
             return np.zeros_like(r)
         if self.in_space:
             x = r.reshape(-1, 3)
-            B = self.in_space(x)[0] + sum((each.at(x, mu).value[0] for each in self.driven), np.zeros(3))
+            B = self.in_space(x)[0] + sum(
+                (each.at(x, mu).value[0] for each in self.driven), np.zeros(3)
+            )
             return np.asarray(along * B.reshape(r.shape))
         uniform = along * self.applied
         for name, across in zip(ACROSS, self.across, strict=False):
@@ -102,14 +109,19 @@ class Magnetisation:
         return np.asarray(uniform + along * r @ self.gradient.T)
 
     def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
-        """1 if the mirror images of the applied field continue it, -1 if their opposites do; collective."""
+        """1 if the mirror images of the applied field continue it, -1 if their opposites do;
+        collective.
+        """
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
         images = self.at(mu, mirror.image(x)) @ mirror.reflection
-        return float(np.sign(r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.at(mu, x))))))
+        return float(
+            np.sign(r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.at(mu, x)))))
+        )
 
     def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
-        """With patterns in place of what is given by named patches of a mesh with so many cells on this rank.
+        """With patterns in place of what is given by named patches of a mesh with so many cells on
+        this rank.
 
         Raises
         ------
@@ -117,5 +129,7 @@ class Magnetisation:
             If there is no such patch.
         """
         remanent = by_patch(self.patches, patches, cells) if self.patches else self.remanent
-        soft = self.soft and self.soft.on(lambda of: by_patch(of, patches, cells, "magnetic.susceptibility"))
+        soft = self.soft and self.soft.on(
+            lambda of: by_patch(of, patches, cells, "magnetic.susceptibility")
+        )
         return replace(self, remanent=remanent, soft=soft)

@@ -1,10 +1,12 @@
-"""Solid harmonics: what charges in a box are to others far away, and how that is shifted, derived and translated.
+"""Solid harmonics: what charges in a box are to others far away, and how that is shifted, derived
+and translated.
 
-With R = r^l P_l^m(cos theta) e^(i m phi)/(l + m)! and I = (l - m)! P_l^m(cos theta) e^(i m phi)/r^(l + 1) about centres
-at a distance D from each other, 1/|a - b| is the sum of (-1)^l conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')(D)
-(L. Greengard, V. Rokhlin, Acta Numerica 6, 1997; M. A. Epton, B. Dembart, SIAM J. Sci. Comput. 16, 1995, 865).
-Real and imaginary parts are taken apart: Y has ORDER + 1 squared numbers. The sum ends with l + l' = ORDER: it is then
-Taylor's polynomial in a - b, so that what two charges do to each other is opposite to rounding.
+With R = r^l P_l^m(cos theta) e^(i m phi)/(l + m)! and I = (l - m)! P_l^m(cos theta) e^(i m
+phi)/r^(l + 1) about centres at a distance D from each other, 1/|a - b| is the sum of (-1)^l
+conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')(D) (L. Greengard, V. Rokhlin, Acta Numerica 6, 1997;
+M. A. Epton, B. Dembart, SIAM J. Sci. Comput. 16, 1995, 865). Real and imaginary parts are taken
+apart: Y has ORDER + 1 squared numbers. The sum ends with l + l' = ORDER: it is then Taylor's
+polynomial in a - b, so that what two charges do to each other is opposite to rounding.
 """
 
 from functools import cache
@@ -56,7 +58,8 @@ def derivatives() -> tuple[Array, Array, Array]:
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
             continue
-        # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz R_(l-1)^m
+        # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz
+        # R_(l-1)^m
         up, down, same = (along.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
         for i, row in enumerate(((up - down) / 2, (up + down) / 2j, same)):
             at = place_of(degree, m)
@@ -82,14 +85,19 @@ def _complex() -> tuple[dict[tuple[int, int], NDArray[np.complex128]], NDArray[n
 
 @cache
 def shift(octant: tuple[int, int, int]) -> Array:
-    """The matrix Z with Y(y/2 + s) = Z Y(y): from the middle of a box to that of the one of which it is this octant."""
+    """The matrix Z with Y(y/2 + s) = Z Y(y): from the middle of a box to that of the one of which
+    it is this octant.
+    """
     y = np.random.default_rng(0).uniform(-1, 1, (4 * COUNT, 3))
     s = (np.array(octant) - 0.5) / 2
     return np.asarray(np.linalg.lstsq(harmonics(y).T, harmonics(y / 2 + s).T, rcond=None)[0].T)
 
 
 def translations(D: Array) -> Array:
-    """The matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) . G Y(a), for vectors D (n, 3) from b's centre to a's."""
+    """The matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) .
+
+    G Y(a), for vectors D (n, 3) from b's centre to a's.
+    """
     x, y, z = D.T
     square, w = x * x + y * y + z * z, x + 1j * y
     of: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
@@ -107,10 +115,14 @@ def translations(D: Array) -> Array:
         for j, (l2, m2) in enumerate(keys):
             degree, m = l1 + l2, m1 + m2
             if degree <= ORDER:
-                G[:, j, i] = (-1) ** l1 * (of[degree, m] if m >= 0 else (-1) ** m * of[degree, -m].conj())
+                G[:, j, i] = (-1) ** l1 * (
+                    of[degree, m] if m >= 0 else (-1) ** m * of[degree, -m].conj()
+                )
     return np.ascontiguousarray((C.T @ G @ C).real)
 
 
 def ends() -> Ints:
     """(COUNT,) how many of the first rows of a column of these matrices are not zero."""
-    return np.concatenate([np.full(2 * degree + 1, (ORDER - degree + 1) ** 2) for degree in range(ORDER + 1)])
+    return np.concatenate(
+        [np.full(2 * degree + 1, (ORDER - degree + 1) ** 2) for degree in range(ORDER + 1)]
+    )

@@ -1,8 +1,9 @@
 """The energy of the charges of cells that touch each other, and of each cell with itself.
 
-The charges of one cell act on those of its neighbours, of the same part of a shell, at distances from zero on. As they
-stay with the material, energy, forces and stiffness are derivatives of one sum over pairs of points; only their rules
-are others than far away (`touching`), the same for all pairs of one kind.
+The charges of one cell act on those of its neighbours, of the same part of a shell, at distances
+from zero on. As they stay with the material, energy, forces and stiffness are derivatives of one
+sum over pairs of points; only their rules are others than far away (`touching`), the same for all
+pairs of one kind.
 """
 
 from collections.abc import Iterator
@@ -36,7 +37,10 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 NOTHING = 1e-13  # of the largest charge: elements without any
 CHUNK = 40_000  # points at which charges are found at once
-ON_STRIP = (8, 4)  # nodes along and across a strip at which charges are found; between them they are polynomials
+ON_STRIP = (
+    8,
+    4,
+)  # nodes along and across a strip at which charges are found; between them they are polynomials
 NODES = basix.create_element(
     basix.ElementFamily.P,
     basix.CellType.triangle,
@@ -44,7 +48,9 @@ NODES = basix.create_element(
     lagrange_variant=basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
-Kind = tuple[Any, ...]  # of a pair of elements: the first one with its sides, the second, and where they touch
+Kind = tuple[
+    Any, ...
+]  # of a pair of elements: the first one with its sides, the second, and where they touch
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ class Batch:
     own
         How many of the first pairs have their first cell on this rank.
     of_left, of_right
-        Where the charges are found, with the local edges of strips, and what these are multiplied by.
+        Where the charges are found, with the local edges of strips, and what these are multiplied
+        by.
     """
 
     pairs: Ints
@@ -132,7 +139,9 @@ class Near:
         for cell, three in enumerate(numbers):
             for each in three:
                 meeting.setdefault(each, []).append(cell)
-        self.touching = [sorted({other for each in three for other in meeting[each]}) for three in numbers]
+        self.touching = [
+            sorted({other for each in three for other in meeting[each]}) for three in numbers
+        ]
         self._free = self._at_boundary()
         kinds: dict[Kind, list[tuple[int, int]]] = {}
         for c, others in enumerate(self.touching):
@@ -144,12 +153,16 @@ class Near:
         self._batches = list(self._charged(kinds))
 
     def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
-        """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added, right for own cells."""
+        """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added,
+        right for own cells.
+        """
         energy = 0.0
         for batch in self._batches:
             rows = np.arange(len(batch.pairs))
             left, right = (batch.left, rows), (batch.right, rows)
-            energy += self._pairs.add(nodes, batch.pairs, batch.own, left, right, gradient, stiffness)
+            energy += self._pairs.add(
+                nodes, batch.pairs, batch.own, left, right, gradient, stiffness
+            )
             self._pairs.finish(nodes, batch.pairs[:, 0], batch.left, gradient, stiffness)
             if batch.right.tables.ndim == 3:
                 self._pairs.finish(nodes, batch.pairs[:, 1], batch.right, gradient, stiffness)
@@ -208,10 +221,23 @@ class Near:
         made = []
         for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
-            made.append(self._batch(kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)))
-        most = max((float(np.abs(q).max(initial=0.0)) for each in made for q in (each.left.q, each.right.q)), default=0)
+            made.append(
+                self._batch(
+                    kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)
+                )
+            )
+        most = max(
+            (
+                float(np.abs(q).max(initial=0.0))
+                for each in made
+                for q in (each.left.q, each.right.q)
+            ),
+            default=0,
+        )
         for each in made:
-            if self._may or all(np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)):
+            if self._may or all(
+                np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)
+            ):
                 yield each
 
     def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
@@ -230,11 +256,16 @@ class Near:
             )
         share = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
         left_points = Points(left[0], left[1], left[2], share * left[3])
-        of = (first, kind[1] if kind[0] != "faces" else None, share), (second, kind[3] if on_strips else None, 1.0)
+        of = (
+            (first, kind[1] if kind[0] != "faces" else None, share),
+            (second, kind[3] if on_strips else None, 1.0),
+        )
         return Batch(pairs, own, left_points, Points(T, h, t, q), *of)
 
     def _rules(self, kind: Kind) -> tuple[Places, Places, bool]:
-        """Points of both elements; of the second one those for each of the first, or, if true, the same for all."""
+        """Points of both elements; of the second one those for each of the first, or, if true, the
+        same for all.
+        """
         s = self._scale
         if kind[0] == "faces":
             first = Places(*around(kind[1], s))
@@ -256,7 +287,13 @@ class Near:
             if kind[2] == "end":  # as far from the common end as the place is, beyond it
                 at = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
             strips = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
-            return first, Places.of_strip(kind[3], *(np.concatenate(each) for each in zip(*strips, strict=True))), False
+            return (
+                first,
+                Places.of_strip(
+                    kind[3], *(np.concatenate(each) for each in zip(*strips, strict=True))
+                ),
+                False,
+            )
         return first, Places.of_strip(kind[3], t, eta, w), True
 
     def _each(self, rules: list[tuple[Array, Array]]) -> Places:
@@ -266,8 +303,12 @@ class Near:
         w = [np.concatenate([w, np.zeros(longest - len(w))]) for _, w in rules]
         return Places(np.concatenate(X), np.concatenate(w))
 
-    def _points(self, cells: Ints, points: Places, edge: int | None) -> tuple[Array, Array, Array, Array]:
-        """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n, layers)."""
+    def _points(
+        self, cells: Ints, points: Places, edge: int | None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n,
+        layers).
+        """
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
         up, charge = (each[copy][:, None] for each in (self._copies.up, self._copies.charges))
@@ -280,11 +321,18 @@ class Near:
         else:
             assert edge is not None
             q, layers = (self._on_strips[edge][cells] @ basis.T)[..., None], points.at[:, 1:] - 0.5
-        return T, np.ascontiguousarray(layers), np.ascontiguousarray(t), points.weights[:, None] * charge[..., None] * q
+        return (
+            T,
+            np.ascontiguousarray(layers),
+            np.ascontiguousarray(t),
+            points.weights[:, None] * charge[..., None] * q,
+        )
 
     @cached_property
     def _on_faces(self) -> Array:
-        """(cells, n, layers) charges per area of the reference triangle at nodes of what is modelled."""
+        """(cells, n, layers) charges per area of the reference triangle at nodes of what is
+        modelled.
+        """
         return np.concatenate([found.q for _, found in self._found_on_faces(None)])
 
     def _found_on_faces(self, into: Nodal | None) -> Iterator[tuple[Ints, Found]]:
@@ -292,12 +340,21 @@ class Near:
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         each = max(1, CHUNK // len(X))
         for part in (cells[first : first + each] for first in range(0, len(cells), each)):
-            yield part, Faces(self._shape, part, may=self._may).at(Boxes.whole(len(part)), ab, weights, into)
+            yield (
+                part,
+                Faces(self._shape, part, may=self._may).at(
+                    Boxes.whole(len(part)), ab, weights, into
+                ),
+            )
 
     @cached_property
     def _on_strips(self) -> list[Array]:
-        """(cells, n) charges per area of the coordinates of strips at their nodes; of each local edge."""
-        charges: list[Array] = [np.zeros((len(self._shape.r0), int(np.prod(ON_STRIP)))) for _ in range(3)]
+        """(cells, n) charges per area of the coordinates of strips at their nodes; of each local
+        edge.
+        """
+        charges: list[Array] = [
+            np.zeros((len(self._shape.r0), int(np.prod(ON_STRIP)))) for _ in range(3)
+        ]
         for edge, cells, found in self._found_on_strips(None):
             charges[edge][cells] = found.q[..., 0]
         return charges
@@ -313,7 +370,10 @@ class Near:
 
     def by_fields(self, moved: Complex, weights: Weights, into: Nodal) -> None:
         """Add the derivatives that `into` has: see `Charged.by_fields`."""
-        on_faces, on_strips = np.zeros_like(self._on_faces), [np.zeros_like(each) for each in self._on_strips]
+        on_faces, on_strips = (
+            np.zeros_like(self._on_faces),
+            [np.zeros_like(each) for each in self._on_strips],
+        )
         for batch in self._batches:
             pairs = batch.pairs[: batch.own]
             rows = np.arange(len(pairs))
@@ -324,9 +384,13 @@ class Near:
             for i, (points, edge, share) in sides:
                 copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
                 on = on_q[i][: len(pairs)].reshape(len(pairs), len(points.weights), -1)
-                on = share * points.weights[:, None] * self._copies.charges[copy][:, None, None] * on
+                on = (
+                    share * points.weights[:, None] * self._copies.charges[copy][:, None, None] * on
+                )
                 if edge is None:
-                    np.add.at(on_faces, cells, np.einsum("mj,nml->njl", _basis(points), on, optimize=True))
+                    np.add.at(
+                        on_faces, cells, np.einsum("mj,nml->njl", _basis(points), on, optimize=True)
+                    )
                 else:
                     np.add.at(on_strips[edge], cells, on[..., 0] @ _basis(points))
         for part, found in self._found_on_faces(into):
@@ -336,22 +400,30 @@ class Near:
             assert found.back
             found.back(np.zeros_like(found.x), on_strips[edge][cells][..., None])
 
-    def _by_heights(self, batch: Batch, pairs: Ints, moved: Complex, weights: Weights, into: Nodal) -> None:
+    def _by_heights(
+        self, batch: Batch, pairs: Ints, moved: Complex, weights: Weights, into: Nodal
+    ) -> None:
         rows, both = np.arange(len(pairs)), (batch.left, batch.right)
         on = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights, heights=True)
         for i, (places, _, _) in enumerate((batch.of_left, batch.of_right)):
             copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
             shape = len(pairs), len(places.weights), -1
             heights = both[i].heights.reshape(shape[1:])
-            on_t = self._copies.up[copy][:, None] * np.sum(heights * on[i][: len(pairs)].reshape(shape), axis=-1)
+            on_t = self._copies.up[copy][:, None] * np.sum(
+                heights * on[i][: len(pairs)].reshape(shape), axis=-1
+            )
             self._shape.back_of_thickness(cells, places.X, on_t, into)
 
 
 def _basis(points: Places) -> Array:
-    """(m, n) values at points of the polynomials that are one at one of the nodes each at which charges are found."""
+    """(m, n) values at points of the polynomials that are one at one of the nodes each at which
+    charges are found.
+    """
     if points.at is None:
         return np.asarray(NODES.tabulate(0, points.X)[0, :, :, 0])
-    basis = np.einsum("ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP)))
+    basis = np.einsum(
+        "ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP))
+    )
     return np.asarray(basis.reshape(len(points.X), -1))
 
 

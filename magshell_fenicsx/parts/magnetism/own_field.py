@@ -1,4 +1,6 @@
-"""The own field of a model's shell: what sensors read, its derivatives, its moment, and its export to magpylib."""
+"""The own field of a model's shell: what sensors read, its derivatives, its moment, and its export
+to magpylib.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -15,7 +17,15 @@ from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, place
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
-from magshell_fenicsx.parts.magnetism.charges import Faces, Family, Sides, field, gradient, moment, triangles
+from magshell_fenicsx.parts.magnetism.charges import (
+    Faces,
+    Family,
+    Sides,
+    field,
+    gradient,
+    moment,
+    triangles,
+)
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.seen import Sight
@@ -77,7 +87,9 @@ class OwnField:
         return self._model.carrier.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
 
     def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Any, list[Family]]:
-        """The shape and its charges at the displacement that the system has; `may`: of any other remanence."""
+        """The shape and its charges at the displacement that the system has; `may`: of any other
+        remanence.
+        """
         shape = self.shape(mu)
         cells, edges = self.chargeable if may else self.edges
         faces = Faces(shape, np.arange(self._owned), may=may)
@@ -89,7 +101,9 @@ class OwnField:
         return self._sides(every=True)
 
     def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
-        """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell; collective."""
+        """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell;
+        collective.
+        """
         total = np.zeros_like(places)
         for image in self._images:
             seen_from, sign = image.back(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
@@ -109,9 +123,14 @@ class OwnField:
         return families
 
     def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
-        """The derivatives of e . B at this rank's nodes, by the displacement and by the remanence."""
+        """The derivatives of e .
+
+        B at this rank's nodes, by the displacement and by the remanence.
+        """
         parts = list[Nodal]()
-        for may in (False, True) if self._plain else (True,):  # charges that are zero have derivatives
+        for may in (
+            (False, True) if self._plain else (True,)
+        ):  # charges that are zero have derivatives
             shape, families = self.families(mu, may=may)
             into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
             for image in self._images:
@@ -122,7 +141,9 @@ class OwnField:
         return into if self._plain else self._to_material(into, mu)
 
     def moment(self, mu: Mapping[str, float]) -> Array:
-        """The integral of what is magnetised over the volume, remanent and induced, (3,) over R³; collective."""
+        """The integral of what is magnetised over the volume, remanent and induced, (3,) over R³;
+        collective.
+        """
         total = np.asarray(self._model.system.comm.allreduce(self._moment(mu)))
         if mirror := self._sight.mirror:
             total = mirror.summed(total, self.sign_of_images(mu))
@@ -152,7 +173,9 @@ class OwnField:
             of, B = Q.element.basix_element, self._nodal()
             return Shape(element, r0, u, of, B, model.material.h, thick, size == 2, self._thins)
         Beff = self._material(self._jets(r0), self._jets(u), mu)
-        return Shape(element, r0, u, self._at, Beff, model.material.h, thick, size == 2, self._thins)
+        return Shape(
+            element, r0, u, self._at, Beff, model.material.h, thick, size == 2, self._thins
+        )
 
     @property
     def _thins(self) -> Array | float:
@@ -163,10 +186,14 @@ class OwnField:
     def _nodal(self, cells: int | None = None) -> Array:
         """The remanence at the nodes of cells."""
         Q = self.Br.function_space
-        return np.asarray(self.Br.x.array.reshape(-1, 3)[Q.dofmap.list[: self._owned if cells is None else cells]])
+        return np.asarray(
+            self.Br.x.array.reshape(-1, 3)[Q.dofmap.list[: self._owned if cells is None else cells]]
+        )
 
     def _jets(self, nodal: Array) -> Array:
-        """(derivatives, cells, nodes, 3) of a field at the nodes of what is taken back to the undeformed shell."""
+        """(derivatives, cells, nodes, 3) of a field at the nodes of what is taken back to the
+        undeformed shell.
+        """
         V = self._model.r0.function_space
         T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
         jets = np.einsum("dmk,nki->dnmi", T, nodal)
@@ -185,17 +212,26 @@ class OwnField:
             Q = self.Br.function_space
             T = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
             Br = np.einsum("mk,nki->nmi", T, self._nodal())
-            J = frame.convected(Br, u, thins=self._thins) if of.law == "deformation" else frame.rotated(Br, u)
+            J = (
+                frame.convected(Br, u, thins=self._thins)
+                if of.law == "deformation"
+                else frame.rotated(Br, u)
+            )
         if of.soft:
             B = of.at(mu, r0[0] + u[0])
             J = J + of.soft.scale**2 * of.soft.polarisation(r0[0], frame.n0, n, B)
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
         m = np.cross(r1, r2)
         area = np.sum(m * n, axis=-1, keepdims=True)
-        first, second = (np.sum(each * J, axis=-1, keepdims=True) / area for each in (np.cross(r2, n), np.cross(n, r1)))
+        first, second = (
+            np.sum(each * J, axis=-1, keepdims=True) / area
+            for each in (np.cross(r2, n), np.cross(n, r1))
+        )
         across = np.sum(n * J, axis=-1, keepdims=True)
         if np.any(self._thins):  # over the stretch of the thickness
-            across = across * (1 + np.asarray(self._thins)[..., None] * (area / frame.area[..., None] - 1))
+            across = across * (
+                1 + np.asarray(self._thins)[..., None] * (area / frame.area[..., None] - 1)
+            )
         return np.asarray(first * r0[1] + second * r0[2] + across * frame.n0)
 
     def _to_material(self, into: Nodal, mu: Mapping[str, float]) -> Nodal:
@@ -209,7 +245,11 @@ class OwnField:
                 for way, weight in CENTRAL:
                     moved = u.copy()
                     moved[d, ..., i] += way * STEP
-                    on[d, ..., i] += weight / STEP * np.sum(into.by_remanence * self._material(r0, moved, mu), axis=-1)
+                    on[d, ..., i] += (
+                        weight
+                        / STEP
+                        * np.sum(into.by_remanence * self._material(r0, moved, mu), axis=-1)
+                    )
         T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
         if self._dim == 1:
             flat = on[:2][..., [0, 2]]
@@ -229,7 +269,8 @@ class OwnField:
         return Nodal(by_u, by_B)
 
     def _sides(self, *, every: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Own cells and their local edges at the boundary, and where the remanence jumps, or `every` one.
+        """Own cells and their local edges at the boundary, and where the remanence jumps, or
+        `every` one.
 
         None on a mirror plane.
         """
@@ -238,7 +279,10 @@ class OwnField:
         topology, dim = mesh.topology, self._dim
         topology.create_connectivity(dim - 1, dim)
         topology.create_connectivity(dim, dim - 1)
-        to_cells, to_facets = topology.connectivity(dim - 1, dim), topology.connectivity(dim, dim - 1)
+        to_cells, to_facets = (
+            topology.connectivity(dim - 1, dim),
+            topology.connectivity(dim, dim - 1),
+        )
         at = to_facets.array.reshape(-1, dim + 1)
         several = np.diff(to_cells.offsets)
         values = self._nodal(len(at))
@@ -256,7 +300,11 @@ class OwnField:
                     continue
                 other = next(int(c) for c in to_cells.links(facet) if c != cell)
                 its_edge = int(np.flatnonzero(at[other] == facet)[0])
-                if every or not self._plain or np.abs(ends[cell, local] - ends[other, its_edge]).max() > JUMP * largest:
+                if (
+                    every
+                    or not self._plain
+                    or np.abs(ends[cell, local] - ends[other, its_edge]).max() > JUMP * largest
+                ):
                     cells.append(cell)
                     edges.append(local)
         sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
@@ -264,13 +312,19 @@ class OwnField:
             return sides
         X = np.array([[0.0], [1.0]])  # a pole has no edge: local facets of an interval are its ends
         T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
-        rho = np.einsum("mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0])
+        rho = np.einsum(
+            "mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
+        )
         off = np.abs(rho[sides]) > AXIS
         return sides[0][off], sides[1][off]
 
     def _ends(self, count: int, values: Array) -> Array:
         """The remanence in the middle of each local edge, (cells, edges, 3)."""
-        middles = np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]]) if self._dim == 2 else np.array([[0.0], [1.0]])
+        middles = (
+            np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]])
+            if self._dim == 2
+            else np.array([[0.0], [1.0]])
+        )
         T = self.Br.function_space.element.basix_element.tabulate(0, middles)[0, :, :, 0]
         return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
 
@@ -279,21 +333,28 @@ class OwnField:
         sign = self._sign
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
             shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
-            return self._sight.loads.magnetic.sign_of_images(shown, self._sight.model.r0, self._sight.mirror)
+            return self._sight.loads.magnetic.sign_of_images(
+                shown, self._sight.model.r0, self._sight.mirror
+            )
         return sign
 
     def _parity(self) -> float:
-        """1 if the mirror images of the remanence continue it, -1 if their opposites do; collective."""
+        """1 if the mirror images of the remanence continue it, -1 if their opposites do;
+        collective.
+        """
         if self._sight.mirror is None:
             return 1.0
         x, n = (each[: self._owned] for each in self._places())
         S, pattern = self._sight.mirror.reflection, self._pattern
         images = pattern(self._sight.mirror.image(x), n @ S) @ S
-        return float(np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n))))))
+        return float(
+            np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n)))))
+        )
 
 
 def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
-    """The integral of the remanence and of what a field induces, as they are carried, (3,) over R³; collective.
+    """The integral of the remanence and of what a field induces, as they are carried, (3,) over R³;
+    collective.
 
     In the frame of the model, at the displacement that its system has.
     """
@@ -306,7 +367,9 @@ def own_field(sight: Sight) -> OwnField:
     own = model.kept.get(OwnField)
     if own is None or own.magnetised is not of:
         if sight.model.r0.function_space.mesh.topology.dim == 3:
-            from magshell_fenicsx.parts.magnetism.own_field_of_body import OwnFieldOfBody  # it is an own field
+            from magshell_fenicsx.parts.magnetism.own_field_of_body import (
+                OwnFieldOfBody,
+            )  # it is an own field
 
             own = OwnFieldOfBody(sight)
         else:
@@ -316,7 +379,8 @@ def own_field(sight: Sight) -> OwnField:
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
-    """The body of a state as a source of magpylib, of charged triangles, in m and T; without units over R and |Br|.
+    """The body of a state as a source of magpylib, of charged triangles, in m and T; without units
+    over R and |Br|.
 
     Parameters
     ----------
@@ -332,7 +396,9 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
 
     of = magnetised(sight.loads)
     if of is None:
-        raise CaseError("to_magpylib: of a shell with a remanence or a susceptibility, this has neither")
+        raise CaseError(
+            "to_magpylib: of a shell with a remanence or a susceptibility, this has neither"
+        )
     made, own, mirror = magpylib("to_magpylib"), own_field(sight), sight.mirror
     Q, R = rotation(sight.azimuth), of.metres or 1.0
 
@@ -342,11 +408,15 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
         if mirror:
             sign = own.sign_of_images(state.mu)
             copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
-            all_charged = [(image.of(x), factor * q) for image, factor in copies for x, q in all_charged]
+            all_charged = [
+                (image.of(x), factor * q) for image, factor in copies for x, q in all_charged
+            ]
         return all_charged
 
     system = sight.model.system
-    all_charged = [each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank]
+    all_charged = [
+        each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank
+    ]
     corners, charges = (np.concatenate([each[i] for each in all_charged]) for i in range(2))
     corners = R * corners @ Q
     m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
@@ -357,7 +427,9 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
         B = np.zeros((len(observers), 3))
         for i, x in enumerate(observers):
             seen = np.broadcast_to(x, (len(J), 3))
-            B[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(axis=0)
+            B[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(
+                axis=0
+            )
         return np.asarray(B / MU_0 if field == "H" else B)
 
     return made.misc.CustomSource(field_func=total)

@@ -13,13 +13,22 @@ from magshell_fenicsx.mesh.hexahedra import WHOLE
 from magshell_fenicsx.models.shell.patterns import field_in_body, places_in_body
 from magshell_fenicsx.parts.magnetism.charged import unit
 from magshell_fenicsx.parts.magnetism.charges import Family
-from magshell_fenicsx.parts.magnetism.charges_of_body import Body, CellFaces, Inside, flat, on_faces, uneven
+from magshell_fenicsx.parts.magnetism.charges_of_body import (
+    Body,
+    CellFaces,
+    Inside,
+    flat,
+    on_faces,
+    uneven,
+)
 from magshell_fenicsx.parts.magnetism.own_field import JUMP, OwnField
 
 Array = NDArray[np.float64]
 Sides = tuple[NDArray[np.intp], NDArray[np.intp]]
 FINER = 1  # degree of what turns or is induced above that of the displacement
-LOOKED = np.array([[0.5, 0.5], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])  # where two cells meet
+LOOKED = np.array(
+    [[0.5, 0.5], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
+)  # where two cells meet
 
 
 class OwnFieldOfBody(OwnField):
@@ -32,8 +41,13 @@ class OwnFieldOfBody(OwnField):
         return places_in_body(self._model.r0.function_space)
 
     def _element(self) -> Any:
-        family, degree = basix.ElementFamily.P, self._model.r0.function_space.element.basix_element.degree + FINER
-        return basix.create_element(family, basix.CellType.hexahedron, degree, basix.LagrangeVariant.gll_warped)
+        family, degree = (
+            basix.ElementFamily.P,
+            self._model.r0.function_space.element.basix_element.degree + FINER,
+        )
+        return basix.create_element(
+            family, basix.CellType.hexahedron, degree, basix.LagrangeVariant.gll_warped
+        )
 
     def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Body, list[Family]]:
         shape = self.shape(mu)
@@ -58,7 +72,9 @@ class OwnFieldOfBody(OwnField):
     def flat(self, families: Sequence[Family]) -> Sequence[Family]:
         return flat(families)
 
-    def _polarised(self, X: Array, u: Array, Br: Array, mu: Mapping[str, float]) -> tuple[Array, Array]:
+    def _polarised(
+        self, X: Array, u: Array, Br: Array, mu: Mapping[str, float]
+    ) -> tuple[Array, Array]:
         """F, and the polarisation per undeformed volume, at points with jets (4, cells, points, 3)."""
         of = self.magnetised
         G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
@@ -83,7 +99,9 @@ class OwnFieldOfBody(OwnField):
     def _moment(self, mu: Mapping[str, float]) -> Array:
         V = self._model.r0.function_space
         points, weights = basix.make_quadrature(V.mesh.basix_cell(), WHOLE)
-        T, TB = (f.element.basix_element.tabulate(1, points)[..., 0] for f in (V, self.Br.function_space))
+        T, TB = (
+            f.element.basix_element.tabulate(1, points)[..., 0] for f in (V, self.Br.function_space)
+        )
         nodes = V.dofmap.list[: self._owned]
         X, u = (
             np.einsum("dqk,cki->dcqi", T, f.x.array.reshape(-1, 3)[nodes])
@@ -98,7 +116,8 @@ class OwnFieldOfBody(OwnField):
         return self._sides(every=True)
 
     def _sides(self, *, every: bool = False) -> Sides:
-        """Own cells and their local faces on the surface, and where the remanence jumps, or `every` one.
+        """Own cells and their local faces on the surface, and where the remanence jumps, or `every`
+        one.
 
         None on a mirror plane.
         """
@@ -116,7 +135,11 @@ class OwnFieldOfBody(OwnField):
 
     def _jumps(self, of_cells: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(cells, 6) whether the remanence is another one beyond each face."""
-        Q, V, values = self.Br.function_space, self._model.r0.function_space, self._nodal(len(of_cells))
+        Q, V, values = (
+            self.Br.function_space,
+            self._model.r0.function_space,
+            self._nodal(len(of_cells)),
+        )
         at = on_faces(np.arange(6), np.broadcast_to(LOOKED, (6, *LOOKED.shape)))
         T, TB = (f.element.basix_element.tabulate(0, at.reshape(-1, 3))[0, :, :, 0] for f in (V, Q))
         X = np.einsum("mk,nki->nmi", T, self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list])

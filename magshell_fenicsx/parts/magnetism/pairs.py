@@ -1,4 +1,6 @@
-"""Sums over pairs of charged cells, in C: energy, gradient and second derivatives, `LANES` pairs at once."""
+"""Sums over pairs of charged cells, in C: energy, gradient and second derivatives, `LANES` pairs at
+once.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,7 +45,8 @@ KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "flo
 
 @dataclass(frozen=True)
 class Copies:
-    """What is modelled and its images, which make the whole; cells of all are counted one copy after the other.
+    """What is modelled and its images, which make the whole; cells of all are counted one copy
+    after the other.
 
     Attributes
     ----------
@@ -58,7 +61,9 @@ class Copies:
 
     @property
     def up(self) -> Array:
-        """(copies,) 1, or -1 where an image turns normals over, so that its heights have the other sign."""
+        """(copies,) 1, or -1 where an image turns normals over, so that its heights have the other
+        sign.
+        """
         return np.array([image.sign for image in self.images])
 
     @property
@@ -81,8 +86,8 @@ class Points:
     Attributes
     ----------
     tables
-        (P, 3, k) shape functions and their derivatives by the reference coordinates, or (P, M, 3, k): M points for each
-        of the P of another element.
+        (P, 3, k) shape functions and their derivatives by the reference coordinates, or (P, M, 3,
+        k): M points for each of the P of another element.
     heights
         (.., L) of layers over the thickness.
     t
@@ -102,12 +107,15 @@ class Points:
 
     @cached_property
     def sums(self) -> Array:
-        """(rows, P, SUMS) derivatives at points that stay on their elements; zero between evaluations."""
+        """(rows, P, SUMS) derivatives at points that stay on their elements; zero between
+        evaluations.
+        """
         return np.zeros((*self.t.shape, SUMS))
 
 
 class Stiffness:
-    """Second derivatives, added to blocks of a matrix; those by the nodes of one cell are first summed for each cell.
+    """Second derivatives, added to blocks of a matrix; those by the nodes of one cell are first
+    summed for each cell.
 
     Parameters
     ----------
@@ -116,7 +124,8 @@ class Stiffness:
     factor
         Of all second derivatives.
     row_of, column_of
-        (cells, k) numbers of nodes; rows of other ranks and of images are -1, columns of images follow all others.
+        (cells, k) numbers of nodes; rows of other ranks and of images are -1, columns of images
+        follow all others.
     turn
         (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
 
@@ -126,12 +135,18 @@ class Stiffness:
         (n, 3, 3) row by row, added to; then those of images.
     """
 
-    def __init__(self, beside: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array) -> None:
+    def __init__(
+        self, beside: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array
+    ) -> None:
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
-        number = np.where(beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1).astype(np.int32)
+        number = np.where(
+            beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1
+        ).astype(np.int32)
         self._count = int(np.count_nonzero(beside))
         self.columns = np.nonzero(beside)[1].astype(np.int32)
-        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))]).astype(np.int32)
+        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))]).astype(
+            np.int32
+        )
         self.shape = 3 * beside.shape[0], 3 * beside.shape[1]
         of_images = [number + self._count] if len(turn) > 1 else []
         self.where = np.concatenate([number, *of_images], axis=1)
@@ -154,7 +169,12 @@ class Stiffness:
         """(3 local nodes, 3 all nodes), with the columns of images times the sign."""
         of_itself, of_images = self.blocks[: self._count], self.blocks[self._count :]
         return bsr_array(
-            (of_itself + sign * of_images if len(of_images) else of_itself, self.columns, self.starts), self.shape
+            (
+                of_itself + sign * of_images if len(of_images) else of_itself,
+                self.columns,
+                self.starts,
+            ),
+            self.shape,
         )
 
 
@@ -162,7 +182,9 @@ class Pairs:
     """The sums over pairs of cells with nodes (cells, k, 3)."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        source, *behind = (Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c"))
+        source, *behind = (
+            Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c")
+        )
         self._ffi, self._lib = native(source, FUNCTIONS, comm, *behind)
 
     def add(
@@ -175,7 +197,8 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """The energy of the first `counted` pairs (n, 2) of cells; gradient (cells, k, 3) and stiffness get all pairs.
+        """The energy of the first `counted` pairs (n, 2) of cells; gradient (cells, k, 3) and
+        stiffness get all pairs.
 
         What they add at points that stay on their elements is in the sums of these: see `finish`.
 
@@ -190,10 +213,24 @@ class Pairs:
         both, left_rows, right_rows = (_filled(rows, idle) for rows in (cells, left[1], right[1]))
         same = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        on_left, on_right = ([p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0]))
+        on_left, on_right = (
+            [p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0])
+        )
         sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
         sums = p(right[0].sums) if same else self._ffi.NULL
-        points = [P, L, *on_left, p(left[0].sums), p(left_rows), M, S, *on_right, sums, p(right_rows), int(same)]
+        points = [
+            P,
+            L,
+            *on_left,
+            p(left[0].sums),
+            p(left_rows),
+            M,
+            S,
+            *on_right,
+            sums,
+            p(right_rows),
+            int(same),
+        ]
         return float(self._lib.pairs(*sizes, *points, p(gradient), *self._matrix(nodes, stiffness)))
 
     def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
@@ -207,14 +244,23 @@ class Pairs:
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
         """What `add_close` and `seen` have of all pairs: see `Cells` in close.c."""
-        made = self._ffi.new("Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()})
+        made = self._ffi.new(
+            "Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()}
+        )
         KEPT[made] = arrays  # as long as what points at them
         return made
 
     def add_close(
-        self, of: Any, nodes: Array, cells: Ints, gradient: Array, stiffness: Stiffness | None = None
+        self,
+        of: Any,
+        nodes: Array,
+        cells: Ints,
+        gradient: Array,
+        stiffness: Stiffness | None = None,
     ) -> float:
-        """The energy of pairs (n, 2) of cells that are close, as `add`; no number if two are in each other."""
+        """The energy of pairs (n, 2) of cells that are close, as `add`; no number if two are in
+        each other.
+        """
         p, pairs = self._pointer, np.ascontiguousarray(cells)
         matrix = self._matrix(nodes, stiffness)
         return (
@@ -223,22 +269,38 @@ class Pairs:
             else 0.0
         )
 
-    def seen(self, of: Any, nodes: Array, one: int, other: int, most: int) -> tuple[Array, Array, Array, Array] | None:
-        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and `shift` (P,).
+    def seen(
+        self, of: Any, nodes: Array, one: int, other: int, most: int
+    ) -> tuple[Array, Array, Array, Array] | None:
+        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and
+        `shift` (P,).
 
         None if both are in each other.
         """
-        p, count, (inward, shift) = self._pointer, np.zeros(of.P, dtype=np.int64), np.zeros((2, of.P))
+        p, count, (inward, shift) = (
+            self._pointer,
+            np.zeros(of.P, dtype=np.int64),
+            np.zeros((2, of.P)),
+        )
         X, w = np.full((of.P, most, 2), 1 / 3), np.zeros((of.P, most))
-        if self._lib.seen_of(of, one, other, p(nodes), most, p(count), p(X), p(w), p(inward), p(shift)):
+        if self._lib.seen_of(
+            of, one, other, p(nodes), most, p(count), p(X), p(w), p(inward), p(shift)
+        ):
             return None
         longest = count.max()
         return X[:, :longest], w[:, :longest], inward, shift
 
     def finish(
-        self, nodes: Array, cells: Ints, points: "Points", gradient: Array, stiffness: Stiffness | None = None
+        self,
+        nodes: Array,
+        cells: Ints,
+        points: "Points",
+        gradient: Array,
+        stiffness: Stiffness | None = None,
     ) -> None:
-        """Add the sums at points of elements in cells (rows,) to gradient and stiffness, and make them zero."""
+        """Add the sums at points of elements in cells (rows,) to gradient and stiffness, and make
+        them zero.
+        """
         idle, p = -len(cells) % LANES, self._pointer
         filled, (P, *_) = _filled(cells, idle), points.tables.shape
         onto = p(stiffness.onto) if stiffness else self._ffi.NULL
@@ -259,7 +321,8 @@ class Pairs:
         flat: float,
         worst: float,
     ) -> NDArray[np.int8] | None:
-        """(own, cells) the number of the rule of each pair, -1 without one; None if two cells are too near each other.
+        """(own, cells) the number of the rule of each pair, -1 without one; None if two cells are
+        too near each other.
 
         Parameters
         ----------
@@ -285,10 +348,14 @@ class Pairs:
         p, chosen = self._pointer, np.empty((len(own), len(nodes)), dtype=np.int8)
         sizes = [len(nodes), own.start, own.stop, nodes.shape[1]]
         arrays = [p(array) for array in (nodes, centre, normal, radius, apart)]
-        too_near = self._lib.rules(*sizes, *arrays, h, space, above, flat, len(least), p(least), worst, p(chosen))
+        too_near = self._lib.rules(
+            *sizes, *arrays, h, space, above, flat, len(least), p(least), worst, p(chosen)
+        )
         return None if too_near else chosen
 
-    def translate(self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array) -> None:
+    def translate(
+        self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array
+    ) -> None:
         """Add G number `which` times M of boxes `other` to L (boxes, .., n) of boxes `one`.
 
         Parameters
@@ -302,7 +369,14 @@ class Pairs:
         if len(one):
             numbers = [p(each) for each in (one, other, which)]
             self._lib.translate(
-                len(one), *numbers, M.shape[1], p(ends), G.shape[1], M.shape[2], *(p(each) for each in arrays), p(L)
+                len(one),
+                *numbers,
+                M.shape[1],
+                p(ends),
+                G.shape[1],
+                M.shape[2],
+                *(p(each) for each in arrays),
+                p(L),
             )
 
     def _pointer(self, array: NDArray[Any]) -> Any:

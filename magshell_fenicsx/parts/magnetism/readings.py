@@ -1,6 +1,8 @@
-"""What is observed of a magnetised shell: what sensors read, and what a field induces in a soft one.
+"""What is observed of a magnetised shell: what sensors read, and what a field induces in a soft
+one.
 
-The solver takes long to import, and a case that is only checked needs no more than the names: its imports are late.
+The solver takes long to import, and a case that is only checked needs no more than the names: its
+imports are late.
 """
 
 from collections.abc import Sequence
@@ -39,7 +41,9 @@ register(
 
 
 class FieldSeen(Seen):
-    """How strong the field is and how far it has turned, columns of every run; and the moment of what is magnetised."""
+    """How strong the field is and how far it has turned, columns of every run; and the moment of
+    what is magnetised.
+    """
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return ()
@@ -63,7 +67,12 @@ class FieldSeen(Seen):
         moment = at.of(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)
         size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
         unit = "√(E/μ0) R³" if of.soft and of.soft.alone else "|Br| R³/μ0"
-        return {"magnetic_moment": {"value": (size * moment).tolist(), "unit": "A m²" if of.metres else unit}}
+        return {
+            "magnetic_moment": {
+                "value": (size * moment).tolist(),
+                "unit": "A m²" if of.metres else unit,
+            }
+        }
 
 
 class SoftSeen(Seen):
@@ -84,13 +93,17 @@ class SoftSeen(Seen):
         if field is None or field.soft is None:
             return {}
         at, forms = sight.model.system.at(state), sight.model.observed
-        J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(forms["induced volume"])
+        J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(
+            forms["induced volume"]
+        )
         if 1 not in sight.model.axes:  # of a meridian, with which they turn
             J[:2] = 0.0
         if sight.mirror:
             sign = field.sign_of_images(state.mu, sight.model.r0, sight.mirror)
             J = sight.mirror.summed(J, sign) / sight.mirror.copies
-        return dict(zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True))
+        return dict(
+            zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True)
+        )
 
 
 class SensorsSeen(Seen):
@@ -128,7 +141,12 @@ class SensorsSeen(Seen):
         from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
         from magshell_fenicsx.parts.magnetism.own_field import CENTRAL, STEP, own_field
 
-        matching = [(each, i) for each in sight.loads.sensors for i, name in enumerate(each.columns) if name == column]
+        matching = [
+            (each, i)
+            for each in sight.loads.sensors
+            for i, name in enumerate(each.columns)
+            if name == column
+        ]
         if not matching:
             return None
         (sensor, i), own = matching[0], own_field(sight)
@@ -149,8 +167,14 @@ class SensorsSeen(Seen):
             names = {"lambda_m", *ACROSS, *(name for each in applied.driven for name in each.names)}
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
                 size = STEP * (abs(value) or 1.0)
-                moved = ((way, State(state.u, {**state.mu, name: value + way * size})) for way, _ in CENTRAL)
-                values = {way: self._readings(sight, moved_state, [sensor])[0][i] for way, moved_state in moved}
+                moved = (
+                    (way, State(state.u, {**state.mu, name: value + way * size}))
+                    for way, _ in CENTRAL
+                )
+                values = {
+                    way: self._readings(sight, moved_state, [sensor])[0][i]
+                    for way, moved_state in moved
+                }
                 by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
         value = float(self._readings(sight, state, [sensor])[0][i])
         return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
@@ -158,19 +182,25 @@ class SensorsSeen(Seen):
     def _readings(self, sight: Sight, state: "State", of: Sequence[Sensor]) -> Array:
         """(n, 3) of each, in the case's frame."""
         places, total = np.array([each.place for each in of]), np.array([each.total for each in of])
-        own, applied = (np.array([getattr(each, name) for each in of])[:, None] for name in ("own", "applied"))
+        own, applied = (
+            np.array([getattr(each, name) for each in of])[:, None] for name in ("own", "applied")
+        )
         return field_at(sight, state, places, own, np.where(total[:, None], applied, 0.0))
 
 
-def field_at(sight: Sight, state: "State", places: Array, own: Array | float, applied: Array | float) -> Array:
-    """The field (n, 3) at places (n, 3) over R of the model's frame, in the frame of the case; collective.
+def field_at(
+    sight: Sight, state: "State", places: Array, own: Array | float, applied: Array | float
+) -> Array:
+    """The field (n, 3) at places (n, 3) over R of the model's frame, in the frame of the case;
+    collective.
 
     It is nan in the shell.
 
     Parameters
     ----------
     own, applied
-        What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n, 1), or of all.
+        What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n,
+        1), or of all.
     """
     from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
 

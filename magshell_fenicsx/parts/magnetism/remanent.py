@@ -22,18 +22,22 @@ class Layer(Direction):
 class RemanentSection(FileKeys, Direction):
     """The remanent flux density B^r; `polar` and `azimuth` belong to the uniform one.
 
-    radial: along the normal. tangential: along the meridians, away from e3. expression: components as
-    formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
-    (within its rim) of a hemisphere, those of a mesh, and "rest". layers: from the inner face outwards; a shell takes
-    their average. points: vectors at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
+    radial: along the normal. tangential: along the meridians, away from e3. expression: components
+    as formulas of the undeformed position x, y, z over R. patches: a direction per named patch,
+    "dimple" (within its rim) of a hemisphere, those of a mesh, and "rest". layers: from the inner
+    face outwards; a shell takes their average. points: vectors at points, of which each place has
+    the mean, weighted by exp(-(distance/filter)²).
     """
 
-    kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers", "points"] = "uniform"
+    kind: Literal[
+        "uniform", "radial", "tangential", "expression", "patches", "layers", "points"
+    ] = "uniform"
     """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
     components: Annotated[
-        Annotated[list[Formula], Field(min_length=3, max_length=3)] | GivenField | None, OrOfProgram(GivenField)
+        Annotated[list[Formula], Field(min_length=3, max_length=3)] | GivenField | None,
+        OrOfProgram(GivenField),
     ] = None
     """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
@@ -54,11 +58,15 @@ class RemanentSection(FileKeys, Direction):
         belongs |= {"file": "points", "filter": "points"}
         for key, kind in belongs.items():
             if (getattr(self, key) is not None) != (self.kind == kind):
-                raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
+                raise ValueError(
+                    f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}"
+                )
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
         if isinstance(self.components, GivenField) and self.components.size != 3:
-            raise ValueError(f"components: a function of {self.components.size} numbers; a vector has three")
+            raise ValueError(
+                f"components: a function of {self.components.size} numbers; a vector has three"
+            )
         if self.layers and abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
             raise ValueError("the fractions of the layers must add up to 1")
         return self
@@ -75,7 +83,9 @@ class RemanentSection(FileKeys, Direction):
         return self._of_shell
 
     def directions(self) -> list[Direction]:
-        """All directions that a mirror plane must hold; radial and tangential patterns allow every plane."""
+        """All directions that a mirror plane must hold; radial and tangential patterns allow every
+        plane.
+        """
         if self.kind == "uniform":
             return [self]
         return [*(self.patches or {}).values(), *(self.layers or [])]

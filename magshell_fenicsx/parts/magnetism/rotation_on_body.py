@@ -1,8 +1,9 @@
-"""The magnetic densities of a remanence that turns with the solid and does not stretch: R Br in place of F Br.
+"""The magnetic densities of a remanence that turns with the solid and does not stretch: R Br in
+place of F Br.
 
-F = R U. With C = U^2 and the invariants i1, i2, i3 of U, the theorem of Cayley and Hamilton gives
-R = (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), whose denominator is the product of the sums of two stretches:
-smooth at equal stretches too. In units and arguments as `densities`.
+F = R U. With C = U^2 and the invariants i1, i2, i3 of U, the theorem of Cayley and Hamilton gives R
+= (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), whose denominator is the product of the sums of two
+stretches: smooth at equal stretches too. In units and arguments as `densities`.
 """
 
 import ufl
@@ -19,7 +20,10 @@ def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
 
 
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
-    """The part of Ba = G x: -(G x) . R Br at the deformed place x = X + u, without its value at u = 0."""
+    """The part of Ba = G x: -(G x) .
+
+    R Br at the deformed place x = X + u, without its value at u = 0.
+    """
     turned = rotated(ufl.Identity(3) + H, Br)
     return -(ufl.dot(ufl.dot(G, X + u), turned) - ufl.dot(ufl.dot(G, X), Br)) / h
 
@@ -34,7 +38,11 @@ def rotated(F: Expr, v: Expr) -> Expr:
     """R v."""
     f1, f2, f3 = (F[:, i] for i in range(3))
     cofactor = ufl.as_tensor([ufl.cross(f2, f3), ufl.cross(f3, f1), ufl.cross(f1, f2)]).T
-    first, second, i3 = ufl.inner(F, F), ufl.inner(cofactor, cofactor), ufl.dot(f1, ufl.cross(f2, f3))
+    first, second, i3 = (
+        ufl.inner(F, F),
+        ufl.inner(cofactor, cofactor),
+        ufl.dot(f1, ufl.cross(f2, f3)),
+    )
     i1 = _trace(first, second, i3)
     i2 = ufl.sqrt(second + 2 * i3 * i1)
     Fv = ufl.dot(F, v)
@@ -43,9 +51,11 @@ def rotated(F: Expr, v: Expr) -> Expr:
 
 
 def _trace(first: Expr, second: Expr, i3: Expr) -> Expr:
-    """Compute i1 = tr U from the invariants of C: i1^2 = I + 2 i2 and i2^2 = II + 2 i1 i3, by Newton's method.
+    """Compute i1 = tr U from the invariants of C: i1^2 = I + 2 i2 and i2^2 = II + 2 i1 i3, by
+    Newton's method.
 
-    The fixed point of x -> sqrt(I + 2 sqrt(II + 2 i3 x)), which is almost linear with a slope of at most 1/9.
+    The fixed point of x -> sqrt(I + 2 sqrt(II + 2 i3 x)), which is almost linear with a slope of at
+    most 1/9.
     """
     x = ufl.sqrt(3 * first)
     for _ in range(STEPS):

@@ -1,7 +1,9 @@
-"""Langevin's law in a thin sheet: its energy in a field, known with three derivatives at the points of a model.
+"""Langevin's law in a thin sheet: its energy in a field, known with three derivatives at the points
+of a model.
 
-Along b = mu0 H the material has mu0 M = J L(3 chi b/J), L(x) = coth x - 1/x, that is chi k b with k = 3 L(x)/x, and the
-coenergy w = chi b² W/2 with W = 6 ln (sinh x/x)/x²; both are functions of y = x², with
+Along b = mu0 H the material has mu0 M = J L(3 chi b/J), L(x) = coth x - 1/x, that is chi k b with k
+= 3 L(x)/x, and the coenergy w = chi b² W/2 with W = 6 ln (sinh x/x)/x²; both are functions of y =
+x², with
 
     2 y k' = 3 (1 - k) - y k²/3,    (y W)' = k.
 
@@ -9,9 +11,10 @@ Along the sheet b is B; across it is the number with B_n = b_n (1 + chi k), for 
 
     e = max over b_n of -w(|(B_t, b_n)|) - (B_n - b_n)²/2
 
-is stationary. With p = B_n², s = |B_t|² and kappa = chi k its derivatives are e_p = -kappa/(1 + kappa)/2 and
-e_s = -kappa/2. So what is solved for stays out of compiled kernels: they take a polynomial of third order about the
-present p and s, whose derivatives are those of e itself, as many as tangents and their derivatives ask for.
+is stationary. With p = B_n², s = |B_t|² and kappa = chi k its derivatives are e_p = -kappa/(1 +
+kappa)/2 and e_s = -kappa/2. So what is solved for stays out of compiled kernels: they take a
+polynomial of third order about the present p and s, whose derivatives are those of e itself, as
+many as tangents and their derivatives ask for.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +29,9 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.following import PointField, at_quadrature
 
 Array = NDArray[np.float64]
-ORDERS = [(i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]]  # of derivatives by p and s
+ORDERS = [
+    (i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]
+]  # of derivatives by p and s
 SIZE = 2 + len(ORDERS)  # numbers of a polynomial: p and s, then its coefficients
 NEAR = 1.0  # y below which a series is summed; its terms are those of y/pi²
 TERMS = 18
@@ -49,7 +54,9 @@ def ratio(y: Array) -> Array:
     """k of y."""
     far = np.maximum(y, NEAR)
     x = np.sqrt(far)
-    return np.asarray(np.where(y < NEAR, RATIO(np.minimum(y, NEAR)), 3 * (x / np.tanh(x) - 1) / far))
+    return np.asarray(
+        np.where(y < NEAR, RATIO(np.minimum(y, NEAR)), 3 * (x / np.tanh(x) - 1) / far)
+    )
 
 
 def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
@@ -59,7 +66,9 @@ def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
     c, inverse = 1 / np.tanh(x), 4 * np.exp(-2 * x) / np.expm1(-2 * x) ** 2  # coth x and 1/sinh² x
     first = (1.5 * (c / x - inverse) - k) / far
     second = (0.75 * (2 * c * inverse - inverse / x - c / far) / x - 2 * first) / far
-    return np.where(close, RATIO.deriv()(near), first), np.where(close, RATIO.deriv(2)(near), second)
+    return np.where(close, RATIO.deriv()(near), first), np.where(
+        close, RATIO.deriv(2)(near), second
+    )
 
 
 def coenergy(y: Array) -> Array:
@@ -71,14 +80,18 @@ def coenergy(y: Array) -> Array:
 
 
 def across(chi: Array, p: Array, s: Array, J: float) -> Array:
-    """|b_n|: Newton's method from below, where the function is concave, and between the bounds that it has."""
+    """|b_n|: Newton's method from below, where the function is concave, and between the bounds that
+    it has.
+    """
     scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
     lowest = normal / (1 + chi)
     b = lowest
     for _ in range(STEPS):
         y = scale * (s + b**2)
         k = ratio(y)
-        change = (normal - b * (1 + chi * k)) / (1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0]))
+        change = (normal - b * (1 + chi * k)) / (
+            1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0])
+        )
         b = np.clip(b + change, lowest, normal)
         if np.all(np.abs(change) <= 4e-16 * normal):
             break
@@ -86,7 +99,9 @@ def across(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 
 def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) -> Array:
-    """mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1), of the normals n."""
+    """mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1), of the normals
+    n.
+    """
     s = np.sum(along * along, axis=-1, keepdims=True)
     kappa = chi * ratio((3 * chi / J) ** 2 * (s + across(chi, normal**2, s, J) ** 2))
     return np.asarray(kappa * (along + normal / (1 + kappa) * n))
@@ -152,7 +167,9 @@ def point_field(
     """
 
     def values() -> Array:
-        numbers = at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
+        numbers = (
+            at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
+        )
         polynomials = []
         for B, n in present():
             p = np.sum(B * n, axis=-1) ** 2

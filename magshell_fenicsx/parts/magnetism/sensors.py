@@ -22,9 +22,11 @@ STEPS, DIFFERENCE = 8, 1e-6  # of Gauss's and Newton's method for the nearest pl
 
 
 class SensorSection(Section):
-    """A point at which the field is read, outside the shell: columns NAME_Bx, NAME_By and NAME_Bz of path.csv.
+    """A point at which the field is read, outside the shell: columns NAME_Bx, NAME_By and NAME_Bz
+    of path.csv.
 
-    In T; where the case has no flux densities over |B^r|, of a shell that is soft alone over √(μ0 E).
+    In T; where the case has no flux densities over |B^r|, of a shell that is soft alone over √(μ0
+    E).
     """
 
     position: Coordinates
@@ -47,7 +49,8 @@ class Sensor:
     total
         Whether it reads the applied field too.
     own, applied
-        In the unit of the columns: the field of a remanence of length one, and an applied field of lambda_m = 1.
+        In the unit of the columns: the field of a remanence of length one, and an applied field of
+        lambda_m = 1.
     half
         Half of the thickness over R.
     """
@@ -70,13 +73,17 @@ def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
     shell, own = context.shell, units(context)
     R, half = shell.reference, 0.5 / shell.R_over_h
     return tuple(
-        Sensor(name, rotation(turn) @ np.array(each.position) / R, each.field == "total", *own, half)
+        Sensor(
+            name, rotation(turn) @ np.array(each.position) / R, each.field == "total", *own, half
+        )
         for name, each in given.items()
     )
 
 
 def units(context: Context) -> tuple[float, float]:
-    """What a remanence of length one and an applied field of lambda_m = 1 are: in T, or over |Br|; nan if unknown."""
+    """What a remanence of length one and an applied field of lambda_m = 1 are: in T, or over |Br|;
+    nan if unknown.
+    """
     magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None:
         return nan, nan
@@ -105,7 +112,10 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
                 )
             refuse_unknown_field(f"sensors.{name}", each.field, context)
             shell = context.shell
-            if not isinstance(shell, MeshSurface) and depth(shell, np.array(each.position) / shell.reference) < 0:
+            if (
+                not isinstance(shell, MeshSurface)
+                and depth(shell, np.array(each.position) / shell.reference) < 0
+            ):
                 x, y, z = each.position
                 raise CaseError(
                     f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
@@ -157,7 +167,9 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
     for _ in range(STEPS):
         steps = np.vstack([chart, *(chart + DIFFERENCE * e for e in np.eye(len(chart)))])
         foot, *there = drawn.embedding(steps)
-        change = np.linalg.lstsq(np.array([each - foot for each in there]).T / DIFFERENCE, x - foot, rcond=None)[0]
+        change = np.linalg.lstsq(
+            np.array([each - foot for each in there]).T / DIFFERENCE, x - foot, rcond=None
+        )[0]
         again = np.asarray(drawn.inverse(drawn.embedding((chart + change)[None])[0]), dtype=float)
         if not np.isfinite(again).all():
             break

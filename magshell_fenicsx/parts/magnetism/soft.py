@@ -1,9 +1,10 @@
 """A soft-magnetic shell: its magnetisation follows the field at each place.
 
-Along a thin sheet H is continuous, across it B is. So a sheet of susceptibility chi has the polarisation
-mu0 M = chi (B_t + B_n n/(1 + chi)) and, per area, the energy -h M.B/2. Over E h, with B in units of mu0 E/|Br|
-(lambda_m is the size of the applied field in them), it is -chi/2 (s B)² with s = sqrt(mu0 E)/|Br|. A shell without
-remanence has sqrt(mu0 E) in place of |Br|. The field of other places of the shell is left out.
+Along a thin sheet H is continuous, across it B is. So a sheet of susceptibility chi has the
+polarisation mu0 M = chi (B_t + B_n n/(1 + chi)) and, per area, the energy -h M.B/2. Over E h, with
+B in units of mu0 E/|Br| (lambda_m is the size of the applied field in them), it is -chi/2 (s B)²
+with s = sqrt(mu0 E)/|Br|. A shell without remanence has sqrt(mu0 E) in place of |Br|. The field of
+other places of the shell is left out.
 
 With a saturation J the material follows Langevin's law: `saturation.py`.
 """
@@ -63,7 +64,11 @@ class Soft:
 
     def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "Soft":
         """With a pattern in place of patches."""
-        return replace(self, susceptibility=carried(self.patches), patches=None) if self.patches else self
+        return (
+            replace(self, susceptibility=carried(self.patches), patches=None)
+            if self.patches
+            else self
+        )
 
     def at(self, r0: Array, n0: Array) -> Array:
         """The susceptibility (...) at places (..., 3)."""
@@ -71,7 +76,9 @@ class Soft:
         return np.asarray(chi(r0, n0)[..., 0] if callable(chi) else np.full(r0.shape[:-1], chi))
 
     def polarisation(self, r0: Array, n0: Array, n: Array, B: Array) -> Array:
-        """mu0 M (..., 3) in the unit of B at places of the undeformed shell, with the present normals n (..., 3)."""
+        """mu0 M (..., 3) in the unit of B at places of the undeformed shell, with the present
+        normals n (..., 3).
+        """
         chi = self.at(r0, n0)[..., None]
         across = np.sum(n * B, axis=-1, keepdims=True)
         if self.saturation is None:
@@ -83,8 +90,8 @@ class Soft:
 class Sheet:
     """The densities of a field's soft part, of numbers and vectors in this order.
 
-    chi, s, an amplitude for each uniform part of the field, then either these parts and perhaps the gradient, or the
-    polynomial of a field known by its values.
+    chi, s, an amplitude for each uniform part of the field, then either these parts and perhaps the
+    gradient, or the polynomial of a field known by its values.
     """
 
     field: "Magnetisation"
@@ -148,7 +155,9 @@ class Sheet:
 
         return saturation.point_field(field, chi, self.saturation, present, by)
 
-    def _known(self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array) -> list[Array]:
+    def _known(
+        self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array
+    ) -> list[Array]:
         """Both fields (cells, points, 3) at points, as `fields`."""
         numbers = [float(each.value) for each in amplitudes]
         if polynomials is not None:
@@ -164,19 +173,28 @@ class Sheet:
         `law` is the susceptibility or, of what saturates, the polynomials at u and at u = 0.
         """
         (B, B0), (present, at_first) = self.fields(r0.r, u.r, given), self._halves(law)
-        return s**2 * (self.of_field(present, B, kin.normal(r0 + u)) - self.of_field(at_first, B0, kin.normal(r0)))
+        return s**2 * (
+            self.of_field(present, B, kin.normal(r0 + u))
+            - self.of_field(at_first, B0, kin.normal(r0))
+        )
 
     def induced(self, r0: Jet, u: Jet, law: Expr, e: Expr, *given: Expr) -> Expr:
         """The polarisation along a vector, in the unit of lambda_m."""
         B, _ = self.fields(r0.r, u.r, given)
         return ufl.dot(e, self.polarisation(self._halves(law)[0], B, kin.normal(r0 + u)))
 
-    def of_body(self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr) -> Expr:
+    def of_body(
+        self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
+    ) -> Expr:
         """The same of a body, in units of E h R²: its layers are sheets, with the normal n0 before."""
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
-        return s**2 * (self.of_field(present, B, across(H, n0)) - self.of_field(at_first, B0, n0)) / h
+        return (
+            s**2 * (self.of_field(present, B, across(H, n0)) - self.of_field(at_first, B0, n0)) / h
+        )
 
-    def induced_in_body(self, X: Expr, u: Expr, H: Expr, law: Expr, e: Expr, n0: Expr, *given: Expr) -> Expr:
+    def induced_in_body(
+        self, X: Expr, u: Expr, H: Expr, law: Expr, e: Expr, n0: Expr, *given: Expr
+    ) -> Expr:
         """As `induced`."""
         B, _ = self.fields(X, u, given)
         return ufl.dot(e, self.polarisation(self._halves(law)[0], B, across(H, n0)))
@@ -213,6 +231,8 @@ def across(H: Expr, n0: Expr) -> Expr:
     """The normal of a layer of a body, cof F n0 over its length."""
     F = ufl.Identity(3) + H
     f = [F[:, i] for i in range(3)]
-    cofactor = ufl.as_tensor([ufl.cross(f[1], f[2]), ufl.cross(f[2], f[0]), ufl.cross(f[0], f[1])]).T
+    cofactor = ufl.as_tensor(
+        [ufl.cross(f[1], f[2]), ufl.cross(f[2], f[0]), ufl.cross(f[0], f[1])]
+    ).T
     n = ufl.dot(cofactor, n0)
     return n / ufl.sqrt(ufl.dot(n, n))

@@ -31,9 +31,10 @@ class SpinSection(AboutAxis):
 class SourceStep(LoadStep):
     """A source moves, turns or becomes stronger, in proportion to a factor.
 
-    Its conjugate is the force of the shell on the source along the motion, the torque about the axis, or, of the
-    strength, minus the derivative of the energy by it. Later steps may drive the same source again, from where it is
-    then. The field must be there: a step of kind: field before, in a list of steps.
+    Its conjugate is the force of the shell on the source along the motion, the torque about the
+    axis, or, of the strength, minus the derivative of the energy by it. Later steps may drive the
+    same source again, from where it is then. The field must be there: a step of kind: field before,
+    in a list of steps.
     """
 
     conjugate: ClassVar[str] = "force on the source"
@@ -57,13 +58,17 @@ class SourceStep(LoadStep):
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:
-        given = [key for key in ("move", "to", "turn", "strength") if getattr(self, key) is not None]
+        given = [
+            key for key in ("move", "to", "turn", "strength") if getattr(self, key) is not None
+        ]
         if len(given) != 1:
             raise ValueError("give one of move, to, turn and strength")
         if self.strength == 1 or (self.move and not any(self.move)):
             raise ValueError(f"{given[0]}: changes nothing")
         if self.name in ({*TAKEN, *QUANTITIES} - {"source"}):
-            raise ValueError(f"name: {self.name}: is taken; choose another name for the factor of the source")
+            raise ValueError(
+                f"name: {self.name}: is taken; choose another name for the factor of the source"
+            )
         return self
 
     @property
@@ -97,7 +102,9 @@ class SourceStep(LoadStep):
                 f"{', '.join(names) or 'none'}"
             )
         if context.whole and FieldSection.amplitude not in context.driven_before(step.number):
-            raise ValueError(f"{key}.kind: source needs the field of its source: a step of kind: field before it")
+            raise ValueError(
+                f"{key}.kind: source needs the field of its source: a step of kind: field before it"
+            )
         loads = (each for each in context.steps if each.name != step.name)
         others = [each.load for each in loads if isinstance(each.load, SourceStep)]
         same = (other for other in others if other.number(sources) == self.number(sources))
@@ -111,10 +118,15 @@ def source_columns(loads: "Loads") -> dict[str, str]:
     turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
     for each in loads.magnetic.driven if loads.magnetic else ():
         own = [motion for motion in each.motions if motion.name not in turns]
-        kinds_of |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
+        kinds_of |= {
+            motion.name: "source_torque" if motion.turns else "source_force" for motion in own
+        }
         kinds_of |= dict.fromkeys(each.factors, "source_work")
     kinds = list(kinds_of.values())
-    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in kinds_of.items()}
+    return {
+        name: kind if kinds.count(kind) == 1 else f"{kind}_{name}"
+        for name, kind in kinds_of.items()
+    }
 
 
 def source_size(loads: "Loads", name: str) -> float:
@@ -168,7 +180,9 @@ class SourcesSeen(Seen):
     )
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.patterns import by_patch  # the solver takes long to import
+        from magshell_fenicsx.models.shell.patterns import (
+            by_patch,
+        )  # the solver takes long to import
 
         if loads.magnetic and loads.magnetic.patches:
             by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
@@ -180,13 +194,22 @@ class SourcesSeen(Seen):
         return source_columns(loads)
 
     def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        motions = [motion for driven in (loads.magnetic.driven if loads.magnetic else ()) for motion in driven.motions]
-        return {motion.name: (bool(motion.turns), source_size(loads, motion.name)) for motion in motions}
+        motions = [
+            motion
+            for driven in (loads.magnetic.driven if loads.magnetic else ())
+            for motion in driven.motions
+        ]
+        return {
+            motion.name: (bool(motion.turns), source_size(loads, motion.name)) for motion in motions
+        }
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         values: dict[str, float] = {}
         for name, column in source_columns(sight.loads).items():
-            values |= {name: state.mu[name], column: -sight.potential(state, name) / self._unit(sight, name)}
+            values |= {
+                name: state.mu[name],
+                column: -sight.potential(state, name) / self._unit(sight, name),
+            }
         return values
 
     def conjugate_unit(self, sight: Sight, name: str) -> float | None:

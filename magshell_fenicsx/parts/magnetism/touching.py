@@ -1,8 +1,10 @@
-"""Rules for the charges of two cells that touch, or of one with itself: points where 1/distance is nearly singular.
+"""Rules for the charges of two cells that touch, or of one with itself: points where 1/distance is
+nearly singular.
 
-Each point of the first cell sees the second along rays from where it is itself, or from where the plane of the second
-would have it. With polar coordinates and r = s sinh v a rule is exact for charges in one surface, where the area
-r dr dangle takes the pole away, and for those in two at a distance s: both faces, with the same points.
+Each point of the first cell sees the second along rays from where it is itself, or from where the
+plane of the second would have it. With polar coordinates and r = s sinh v a rule is exact for
+charges in one surface, where the area r dr dangle takes the pole away, and for those in two at a
+distance s: both faces, with the same points.
 """
 
 from itertools import pairwise
@@ -42,7 +44,9 @@ def barycentric(X: Array) -> Array:
 
 
 def polar(apex: Array, s: float) -> tuple[Array, Array]:
-    """Points (n, 2) and weights of the reference triangle as seen from a place (2,) in its plane, with the scale s."""
+    """Points (n, 2) and weights of the reference triangle as seen from a place (2,) in its plane,
+    with the scale s.
+    """
     V = CORNERS - apex
     inside = min(_turn(V[i], V[j]) for i, j in ENDS) > -THIN
     lines = np.array([V[j] - V[i] for i, j in ENDS])
@@ -71,7 +75,9 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
 
 
 def _sectors(V: Array, inside: bool) -> list[tuple[Array, Array]]:
-    """Pairs of rays between which the corners (3, 2) of a triangle around or beside the origin have no other."""
+    """Pairs of rays between which the corners (3, 2) of a triangle around or beside the origin have
+    no other.
+    """
     if inside:
         return [(V[i], V[j]) for i, j in ENDS if _turn(V[i], V[j]) > THIN]
     towards = V.mean(axis=0)
@@ -81,7 +87,9 @@ def _sectors(V: Array, inside: bool) -> list[tuple[Array, Array]]:
 
 
 def _cuts(lines: Array, starts: Array, rays: Array) -> Array:
-    """Where rays (n, 2) from the origin cut the sides of a triangle, (n, 3); infinite where they do not."""
+    """Where rays (n, 2) from the origin cut the sides of a triangle, (n, 3); infinite where they do
+    not.
+    """
     starts = starts[[i for i, _ in ENDS]]
     det = rays[:, :1] * lines[:, 1] - rays[:, 1:] * lines[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,7 +119,9 @@ def at_corner(corner: int) -> tuple[Array, Array]:
     (a, wa), (b, wb) = gauss(6), gauss(5)
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
     side = A - V + b[:, None] * (B - A)
-    return (V + a[:, None, None] * side).reshape(-1, 2), np.asarray(np.outer(wa * a, wb).ravel(), dtype=np.float64)
+    return (V + a[:, None, None] * side).reshape(-1, 2), np.asarray(
+        np.outer(wa * a, wb).ravel(), dtype=np.float64
+    )
 
 
 def on_edge(edge: int, t: Array) -> Array:
@@ -125,7 +135,11 @@ def beyond(X: Array, sides: tuple[int, int], flip: bool) -> Array:
     m, n = (n, m) if flip else (m, n)
     beyond_side = np.zeros_like(bary)
     rest = bary[:, 3 - i - j]
-    beyond_side[:, m], beyond_side[:, n], beyond_side[:, 3 - m - n] = bary[:, i] + rest, bary[:, j] + rest, -rest
+    beyond_side[:, m], beyond_side[:, n], beyond_side[:, 3 - m - n] = (
+        bary[:, i] + rest,
+        bary[:, j] + rest,
+        -rest,
+    )
     return np.asarray(beyond_side[:, 1:])
 
 
@@ -141,16 +155,26 @@ def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
     """The same of a strip seen from a place on it, or beyond one of its ends."""
     x, w = gauss(STRIP[1])
     v, wv = gauss(RADIAL)
-    beyond_it = not 0 <= t <= 1  # where normals may differ, so that no points come too near each other
+    beyond_it = (
+        not 0 <= t <= 1
+    )  # where normals may differ, so that no points come too near each other
     power, least = (1, 0.1) if beyond_it else (3, 0.02)
-    ways = [(0.0, t, -1.0), (0.0, 1 - t, 1.0)] if not beyond_it else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
+    ways = (
+        [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]
+        if not beyond_it
+        else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
+    )
     pieces = list[tuple[Array, Array, Array]]()
     for high in (-eta, 1 - eta):
-        for e, we in zip(eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True):
+        for e, we in zip(
+            eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True
+        ):
             scale = s * max(abs(e - eta), least)
             for near, far, way in ways:
                 bottom, top = np.arcsinh(near / scale), np.arcsinh(far / scale)
                 r = bottom + (top - bottom) * v
                 along = t + way * scale * np.sinh(r)
-                pieces.append((along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r)))
+                pieces.append(
+                    (along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r))
+                )
     return tuple(np.concatenate(each) for each in zip(*pieces, strict=True))

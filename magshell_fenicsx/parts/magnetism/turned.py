@@ -1,4 +1,6 @@
-"""Second derivatives of charges by nodes where these have turned, in C: near nodes, in single precision."""
+"""Second derivatives of charges by nodes where these have turned, in C: near nodes, in single
+precision.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,10 +48,15 @@ class Kept:
         """Some (blocks,) of all; if `upper`, those below the diagonal are not stored."""
         which = np.flatnonzero(some).astype(np.int32)
         starts = np.append(0, np.cumsum(some, dtype=np.int32))[stiffness.starts].astype(np.int32)
-        rows, columns = np.repeat(np.arange(len(starts) - 1), np.diff(starts)), stiffness.columns[which]
+        rows, columns = (
+            np.repeat(np.arange(len(starts) - 1), np.diff(starts)),
+            stiffness.columns[which],
+        )
         stored = columns >= (rows if upper else 0)
         onto = np.append(0, np.cumsum(stored, dtype=np.int32))[starts].astype(np.int32)
-        return cls(starts, which, (starts[1:] - np.diff(onto)).astype(np.int32), onto, columns[stored])
+        return cls(
+            starts, which, (starts[1:] - np.diff(onto)).astype(np.int32), onto, columns[stored]
+        )
 
 
 class Turning:
@@ -60,11 +67,16 @@ class Turning:
         self._upper = comm.size == 1
 
     def kept(self, stiffness: Stiffness, some: NDArray[np.bool_]) -> Kept:
-        """What is kept of some blocks (blocks,); of a matrix that is all on one rank those of one half."""
+        """What is kept of some blocks (blocks,); of a matrix that is all on one rank those of one
+        half.
+        """
         return Kept.of(stiffness, some, upper=self._upper)
 
-    def turned(self, stiffness: Stiffness, sign: float, number: Ints, q: Array, kept: Kept) -> Singles | None:
-        """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes, 4), scalar last.
+    def turned(
+        self, stiffness: Stiffness, sign: float, number: Ints, q: Array, kept: Kept
+    ) -> Singles | None:
+        """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes,
+        4), scalar last.
 
         None where there are several images, whose blocks are not stored apart.
         """
@@ -73,9 +85,17 @@ class Turning:
             return None
         p, values = self._pointer, np.empty((len(kept.columns), 3, 3), dtype=np.float32)
         images = p(stiffness.blocks[count:]) if len(stiffness.turn) > 1 else self._ffi.NULL
-        arrays = p(kept.starts), p(kept.which), p(stiffness.columns), p(stiffness.blocks[:count]), images
+        arrays = (
+            p(kept.starts),
+            p(kept.which),
+            p(stiffness.columns),
+            p(stiffness.blocks[:count]),
+            images,
+        )
         onto = p(kept.first), p(kept.onto), p(values)
-        self._lib.turn_blocks(len(kept.first), *arrays, sign, p(stiffness.turn[-1]), p(number), p(q), *onto)
+        self._lib.turn_blocks(
+            len(kept.first), *arrays, sign, p(stiffness.turn[-1]), p(number), p(q), *onto
+        )
         return Singles(kept.onto, kept.columns, values, self._upper)
 
     def _pointer(self, array: NDArray[Any]) -> Any:

@@ -1,4 +1,6 @@
-"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the viscosity of a shell."""
+"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the
+viscosity of a shell.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -13,7 +15,9 @@ from magshell_fenicsx.input.section import Section, in_units, number_and_unit, w
 from magshell_fenicsx.parts.part import Ability, Context, Offer
 
 Value = Callable[[Any], float]  # a time or a level as a plain number
-Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
+Curve = Callable[
+    [float, bool], float
+]  # of the time since the step began, at a jump before or after it
 
 
 def measured(unit: str) -> Any:
@@ -23,7 +27,9 @@ def measured(unit: str) -> Any:
         in_units(unit)(value)
         return value
 
-    return Annotated[float | str, BeforeValidator(check, json_schema_input_type=float | with_unit(unit))]
+    return Annotated[
+        float | str, BeforeValidator(check, json_schema_input_type=float | with_unit(unit))
+    ]
 
 
 def _level(value: float | str) -> float | str:
@@ -79,7 +85,9 @@ def _formula(text: str) -> str:
             raise ValueError(text)
         formula(re.sub(r"\bt\b", "x", text))
     except ValueError:
-        raise ValueError(f"{text!r} is not a formula of the time t, such as 0.5*sin(2*pi*t)") from None
+        raise ValueError(
+            f"{text!r} is not a formula of the time t, such as 0.5*sin(2*pi*t)"
+        ) from None
     return text
 
 
@@ -116,7 +124,9 @@ def curve(history: History, time: Value, level: Value, here: float) -> Curve:
         size, period, mean = level(history.size), time(history.period), level(history.mean)
         if history.kind == "sine":
             return lambda t, before: float(mean + size * np.sin(2 * np.pi * t / period))
-        return lambda t, before: float(mean + size * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period)))
+        return lambda t, before: float(
+            mean + size * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period))
+        )
     times, values = [time(t) for t, _ in history], [level(v) for _, v in history]
 
     def interpolated(t: float, before: bool) -> float:
@@ -183,7 +193,11 @@ class Viscosity(Ability):
     @classmethod
     def of(cls, context: Context) -> "Viscosity | None":
         shell = context.shell
-        return cls(shell.viscosity, shell.relaxation) if shell.viscosity is not None or shell.relaxation else None
+        return (
+            cls(shell.viscosity, shell.relaxation)
+            if shell.viscosity is not None or shell.relaxation
+            else None
+        )
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Stress depends on the history of strain."""
@@ -192,7 +206,9 @@ class Viscosity(Ability):
     def refuse_unfit(self, context: Context) -> None:
         """See that its numbers are positive and that their units have a meaning."""
         times = {f"relaxation.{i}.time": branch.time for i, branch in enumerate(self.branches)}
-        moduli = {f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)}
+        moduli = {
+            f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)
+        }
         if self.viscosity is not None:
             times = {"viscosity": self.viscosity, **times}
         units = context.time_unit is not None and context.shell.with_units
@@ -201,4 +217,6 @@ class Viscosity(Ability):
             if in_units("pascal" if key in moduli else "second")(value) <= 0:
                 raise ValueError(f"shell.{key}: {value}: must be positive")
             if isinstance(value, str) and not units:
-                raise ValueError(f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths")
+                raise ValueError(
+                    f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths"
+                )

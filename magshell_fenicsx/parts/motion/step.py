@@ -9,7 +9,14 @@ from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.course import Ahead, Errors
-from magshell_fenicsx.parts.motion.history import History, Level, Time, levels_of, measured, times_of
+from magshell_fenicsx.parts.motion.history import (
+    History,
+    Level,
+    Time,
+    levels_of,
+    measured,
+    times_of,
+)
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves, alike
@@ -24,7 +31,9 @@ Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
 
 
 class PushSection(Section):
-    """The shell leaves its state along a natural mode of the model's own symmetry, with a largest component of one."""
+    """The shell leaves its state along a natural mode of the model's own symmetry, with a largest
+    component of one.
+    """
 
     mode: int = Field(default=1, ge=1, le=50)
     """Number of the mode, from the lowest frequency"""
@@ -44,10 +53,11 @@ class EventSection(Section):
 
 
 class TimeSection(Step):
-    """The shell moves for a time, from the state before; loads follow their `history`, all others are constant.
+    """The shell moves for a time, from the state before; loads follow their `history`, all others
+    are constant.
 
-    Times are text with a unit, or numbers: with `shell.density` in the unit of time of the case (seconds), else over
-    R √(ρ/E). Generalised alpha, second order, with steps for `tolerance`.
+    Times are text with a unit, or numbers: with `shell.density` in the unit of time of the case
+    (seconds), else over R √(ρ/E). Generalised alpha, second order, with steps for `tolerance`.
     """
 
     amplitude: ClassVar[str] = "time"
@@ -98,13 +108,19 @@ class TimeSection(Step):
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
-            size = in_units("1/second" if key == "drag" else "second")(value) if value is not None else 1.0
+            size = (
+                in_units("1/second" if key == "drag" else "second")(value)
+                if value is not None
+                else 1.0
+            )
             if size < 0 or (size == 0 and key != "drag"):
                 raise ValueError(f"{key}: {value}: must be positive")
         for name, history in self.history.items():
             times = [float(in_units("second")(t)) for t in times_of(history)]
             if isinstance(history, list) and (times[0] < 0 or times != sorted(times)):
-                raise ValueError(f"history.{name}: the times of a table must not fall, nor be negative")
+                raise ValueError(
+                    f"history.{name}: the times of a table must not fall, nor be negative"
+                )
             jumps, least = getattr(history, "kind", "") == "step", min(times, default=1.0)
             if not isinstance(history, list) and (least < 0 or (least == 0 and not jumps)):
                 raise ValueError(f"history.{name}: times must be positive")
@@ -128,13 +144,21 @@ class TimeSection(Step):
 
     @property
     def needs_inertia_alone(self) -> bool:
-        """Whether neither an equilibrium nor a mode of the shell is asked for, so that it may be free."""
+        """Whether neither an equilibrium nor a mode of the shell is asked for, so that it may be
+        free.
+        """
         return self.until in ("duration", "event") and self.push is None and not self.hold
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         key, driven = step.key, context.driven_before(step.number)
-        timed = {each.name: each for ability in context.abilities if (each := ability.in_time(context, driven))}
-        if "field" in self.history and (why := timed["field"].refused if "field" in timed else NO_FIELD):
+        timed = {
+            each.name: each
+            for ability in context.abilities
+            if (each := ability.in_time(context, driven))
+        }
+        if "field" in self.history and (
+            why := timed["field"].refused if "field" in timed else NO_FIELD
+        ):
             raise ValueError(f"{key}.history.field: {why}")
         for where, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
@@ -146,7 +170,9 @@ class TimeSection(Step):
         allowed = {"field", "pressure", *factors, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
-                raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
+                raise ValueError(
+                    f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}"
+                )
             times = [t for t, _ in history] if isinstance(history, list) else []
             jumps = getattr(history, "kind", "") == "step" or len(set(times)) < len(times)
             if jumps and name in loads and not loads[name].jumps:
@@ -174,7 +200,9 @@ class TimeSection(Step):
         given: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
         for name, history in self.history.items():
             given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
-        yield from ((key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str))
+        yield from (
+            (key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str)
+        )
 
 
 def _factors_of_sections(context: Context) -> set[str]:
@@ -183,7 +211,9 @@ def _factors_of_sections(context: Context) -> set[str]:
     from magshell_fenicsx.parts.registered import FIRST, STEPS  # which has this step too
 
     steps = [STEPS[kind] for kind in FIRST]
-    return {each.amplitude for each in steps if issubclass(each, FactorStep) and each.asked_for(context)}
+    return {
+        each.amplitude for each in steps if issubclass(each, FactorStep) and each.asked_for(context)
+    }
 
 
 def level_in(context: Context, name: str, level: Level) -> float:

@@ -24,38 +24,55 @@ MERIDIAN = "meridian"
 
 
 def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natural | None:
-    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of `Problem`."""
+    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of
+    `Problem`.
+    """
     section = context.of(NaturalSection)
     if section is None:
         return None
     Q, R = rotation(turn), context.shell.reference
 
-    def varying(value: object, whole: Callable[[object], list[float | str]], factor: float) -> Varying | None:
+    def varying(
+        value: object, whole: Callable[[object], list[float | str]], factor: float
+    ) -> Varying | None:
         if value is None:
             return None
         if isinstance(value, GivenField):
-            return value.mapped(lambda numbers: factor * _completed(numbers, stretch=whole is _stretches))
+            return value.mapped(
+                lambda numbers: factor * _completed(numbers, stretch=whole is _stretches)
+            )
         if not isinstance(value, dict):
             parts = whole(value)
             if any(isinstance(v, str) for v in parts):
                 return ByFormula([function(v) for v in parts], Q, R, factor)
             return factor * np.array(parts, dtype=float)
-        vectors = {name: factor * np.array(whole(each), dtype=float) for name, each in value.items()}
+        vectors = {
+            name: factor * np.array(whole(each), dtype=float) for name, each in value.items()
+        }
         if isinstance(context.shell, MeshSurface):
             return vectors
         outside = vectors.get("rest", np.zeros(3))
-        return WithinRims(tuple((inside, vectors.get(name, outside)) for name, inside in within.items()), outside)
+        return WithinRims(
+            tuple((inside, vectors.get(name, outside)) for name, inside in within.items()), outside
+        )
 
-    curvature, stretch = varying(section.curvature, _curvatures, R), varying(section.stretch, _stretches, 1.0)
+    curvature, stretch = (
+        varying(section.curvature, _curvatures, R),
+        varying(section.stretch, _stretches, 1.0),
+    )
     return Natural(curvature, stretch, frame(context, turn))
 
 
 def frame(context: Context, turn: float) -> Pattern:
-    """A pattern whose part in the surface is the first direction of the frame, in a frame turned about e3 (rad)."""
+    """A pattern whose part in the surface is the first direction of the frame, in a frame turned
+    about e3 (rad).
+    """
     direction = along(context)
     if direction == MERIDIAN:
         return meridians
-    return ByFormula([function(v) for v in direction], rotation(turn), context.shell.reference, vectors=True)
+    return ByFormula(
+        [function(v) for v in direction], rotation(turn), context.shell.reference, vectors=True
+    )
 
 
 def along(context: Context) -> list[float | str] | str:
@@ -113,8 +130,13 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
         return True
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-    d, image = (np.stack([function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x)))
-    return any(bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all()) for sign in (1, -1))
+    d, image = (
+        np.stack([function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x))
+    )
+    return any(
+        bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all())
+        for sign in (1, -1)
+    )
 
 
 def _each(value: object) -> list[list[float | str]]:
@@ -139,7 +161,11 @@ def _completed(numbers: Array, *, stretch: bool) -> Array:
         return np.concatenate([numbers - 1, np.zeros_like(numbers[..., :1])], axis=-1)
     if stretch:
         return np.repeat(numbers - 1, 3, axis=-1)
-    return numbers if numbers.shape[-1] == 3 else np.concatenate([numbers, numbers, 0 * numbers], axis=-1)
+    return (
+        numbers
+        if numbers.shape[-1] == 3
+        else np.concatenate([numbers, numbers, 0 * numbers], axis=-1)
+    )
 
 
 def leaves(context: Context, outline: Outline) -> list[Leaves]:
@@ -147,7 +173,9 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     chosen = along(context) if uneven(context) else MERIDIAN
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
-    return [Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))]
+    return [
+        Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))
+    ]
 
 
 def account(context: Context, loads: Loads) -> Account:

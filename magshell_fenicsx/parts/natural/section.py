@@ -1,4 +1,6 @@
-"""The natural shape: the curvature and size that the shell would have without stress, and their growth as a load."""
+"""The natural shape: the curvature and size that the shell would have without stress, and their
+growth as a load.
+"""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -37,15 +39,25 @@ def per_length(value: Any) -> Any:
     return in_units("1/metre")(f"{matched['number']} {unit}**-1")
 
 
-def _components(numbers: int, least: float, most: float, *, lengths: bool = False) -> BeforeValidator:
-    """One value, a list of this many, or a mapping of patches to either; a value is a number or a formula."""
+def _components(
+    numbers: int, least: float, most: float, *, lengths: bool = False
+) -> BeforeValidator:
+    """One value, a list of this many, or a mapping of patches to either; a value is a number or a
+    formula.
+    """
 
     def one(value: Any) -> Any:
         value = per_length(value) if lengths else value
         if isinstance(value, str):
             formula(value)
-        elif isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-            raise ValueError(f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, z")
+        elif (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not least <= value <= most
+        ):
+            raise ValueError(
+                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, z"
+            )
         return value
 
     def some(value: Any) -> Any:
@@ -63,7 +75,10 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
         if not value:
             raise ValueError("a mapping names at least one patch")
         for name, each in value.items():
-            if any(isinstance(v, str) and per_length(v) is v for v in (each if isinstance(each, list) else [each])):
+            if any(
+                isinstance(v, str) and per_length(v) is v
+                for v in (each if isinstance(each, list) else [each])
+            ):
                 raise ValueError(f"{name}: of a patch numbers, no formulas")
         return {name: some(each) for name, each in value.items()}
 
@@ -75,17 +90,20 @@ CURVATURE = 1e6  # of a natural shape by formula, over 1/R
 Number = float | str
 Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
 Values = Annotated[
-    Number | list[Number] | dict[str, Number | list[Number]] | GivenField | None, OrOfProgram(GivenField)
+    Number | list[Number] | dict[str, Number | list[Number]] | GivenField | None,
+    OrOfProgram(GivenField),
 ]
 
 
 class NaturalSection(Section, Ability):
-    """The curvature and the size that the shell would have without stress: growth, swelling, pre-stretch.
+    """The curvature and the size that the shell would have without stress: growth, swelling,
+    pre-stretch.
 
-    Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1
-    (what is given here) and beyond. A step of kind: natural drives one; before a single load of another kind both grow
-    to 1. Formulas are of the undeformed place x, y, z in the shell's length. A mapping has a value for each patch of a
-    mesh, for the dimple, and for the rest.
+    Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell
+    as drawn) to 1 (what is given here) and beyond. A step of kind: natural drives one; before a
+    single load of another kind both grow to 1. Formulas are of the undeformed place x, y, z in the
+    shell's length. A mapping has a value for each patch of a mesh, for the dimple, and for the
+    rest.
     """
 
     curvature: Annotated[Values, _components(3, -1e9, 1e9, lengths=True)] = None
@@ -94,7 +112,9 @@ class NaturalSection(Section, Ability):
     stretch: Annotated[Values, _components(2, 0.05, 20)] = None
     """Natural over drawn length: one number for all directions, the thickness too, or two along t1 and t2 of `along`,
     with the thickness as drawn"""
-    along: Literal["meridian"] | Annotated[list[Component], Field(min_length=3, max_length=3)] | None = None
+    along: (
+        Literal["meridian"] | Annotated[list[Component], Field(min_length=3, max_length=3)] | None
+    ) = None
     """t1 of the frame t1, t2 = n x t1: away from the pole on the meridians of e3, or the part in the surface of a
     vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
 
@@ -112,7 +132,12 @@ class NaturalSection(Section, Ability):
     @property
     def texts(self) -> list[str]:
         """The formulas of the curvature and the stretch."""
-        return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
+        return [
+            text
+            for value in (self.curvature, self.stretch)
+            for text in components(value)
+            if isinstance(text, str)
+        ]
 
     def refuse_unfit(self, context: Context) -> None:
         """A function of a program is one of the mid-surface."""
@@ -133,7 +158,10 @@ class NaturalSection(Section, Ability):
         return leaves(context, outline)
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST  # the solver takes long to import
+        from magshell_fenicsx.parts.natural.shape import (
+            LARGEST,
+            SMALLEST,
+        )  # the solver takes long to import
 
         R = context.shell.reference
         bounds = {"stretch": (SMALLEST, LARGEST), "curvature": (-CURVATURE / R, CURVATURE / R)}
@@ -142,18 +170,27 @@ class NaturalSection(Section, Ability):
             yield Formulas(f"natural.{name}", components(value), least, most, R)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.natural.planned import natural  # the solver takes long to import
+        from magshell_fenicsx.parts.natural.planned import (
+            natural,
+        )  # the solver takes long to import
 
         return {"natural": natural(context, modelled.turn, modelled.within)}
 
 
 def components(value: Any) -> list[float | str]:
     """The numbers and formulas of a curvature or stretch, none of patches and functions."""
-    return value if isinstance(value, list) else [value] if isinstance(value, float | int | str) else []
+    return (
+        value
+        if isinstance(value, list)
+        else [value]
+        if isinstance(value, float | int | str)
+        else []
+    )
 
 
 class GrowthSection(LoadStep):
-    """The natural shape grows from the drawn one: the factor of `natural.curvature`, or of `natural.stretch` less one.
+    """The natural shape grows from the drawn one: the factor of `natural.curvature`, or of
+    `natural.stretch` less one.
 
     `until: target` ends at a factor, the others need `grows`.
     """
@@ -174,7 +211,9 @@ class GrowthSection(LoadStep):
     def _one_grows(self) -> Self:
         said = {self.grows, *self._given} - {None}
         if len(said) != 1:
-            raise ValueError("give curvature or stretch, the factor that it grows to, or without a target grows")
+            raise ValueError(
+                "give curvature or stretch, the factor that it grows to, or without a target grows"
+            )
         return self
 
     @property
@@ -196,22 +235,36 @@ class GrowthSection(LoadStep):
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if getattr(context.of(NaturalSection), self.key, None) is None:
-            raise ValueError(f"loading.{self.key}: is a factor of natural.{self.key}: give that too")
+            raise ValueError(
+                f"loading.{self.key}: is a factor of natural.{self.key}: give that too"
+            )
 
 
 class NaturalSeen(Seen):
     """The amplitudes of the natural shape."""
 
     quantities = (
-        Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
-        Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
+        Quantity(
+            "natural_curvature",
+            "natural curvature",
+            "Factor of the natural curvature; 0: as drawn.",
+            "load",
+        ),
+        Quantity(
+            "natural_stretch",
+            "natural stretch",
+            "Factor of the natural stretch less one; 0: as drawn.",
+            "load",
+        ),
     )
 
     def named(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(loads.natural.amplitudes) if loads.natural else ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.patterns import by_patch  # the solver takes long to import
+        from magshell_fenicsx.models.shell.patterns import (
+            by_patch,
+        )  # the solver takes long to import
 
         for key in ("curvature", "stretch"):
             if isinstance(values := getattr(loads.natural, key, None), Mapping):

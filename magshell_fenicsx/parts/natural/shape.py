@@ -4,12 +4,13 @@ With the stretch tensor U of the surface, the stretch s of its thickness and the
 
     a_n = U a0 U,    b_n = sym(b0 U^2)/s + U kappa U,    h_n = s h,
 
-so that grown alike in all directions, U = s = lambda, a shell is free of stress as its enlarged image. Membrane and
-bending energy are those of a shell with these forms, per area of the natural surface; U = 1 + mu_s T and
-s = 1 + mu_s t grow with the amplitude "natural_stretch", kappa with "natural_curvature".
+so that grown alike in all directions, U = s = lambda, a shell is free of stress as its enlarged
+image. Membrane and bending energy are those of a shell with these forms, per area of the natural
+surface; U = 1 + mu_s T and s = 1 + mu_s t grow with the amplitude "natural_stretch", kappa with
+"natural_curvature".
 
-Of a body it is the growth tensor G in F = F_e G, on which no energy is spent. With the same numbers, at the distance z
-along the normal n,
+Of a body it is the growth tensor G in F = F_e G, on which no energy is spent. With the same
+numbers, at the distance z along the normal n,
 
     G = (1 - s z kappa) U + s n n,
 
@@ -47,7 +48,10 @@ Array = NDArray[np.float64]
 Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | GivenField
 STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
 SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
-FIELD = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # the components of a tensor in space, in the field's order
+FIELD = (
+    [0, 1, 2, 0, 0, 1],
+    [0, 1, 2, 1, 2, 2],
+)  # the components of a tensor in space, in the field's order
 SMALLEST, LARGEST = 0.05, 20.0  # of a natural stretch
 NORMAL_AT, HEIGHT_AT = SIZE, SIZE + 3  # first numbers of n and z in the field of a body
 NORMAL = 1e-6  # length in the surface of a unit vector that is normal to it
@@ -60,9 +64,9 @@ class Natural:
     Attributes
     ----------
     curvature
-        kappa_11, kappa_22, kappa_12 R, positive where the surface bends towards its normal; a vector (3,), a pattern,
-        vectors of named patches, or a field that was given on the mesh. None: it does not grow, and there is no such
-        amplitude.
+        kappa_11, kappa_22, kappa_12 R, positive where the surface bends towards its normal; a
+        vector (3,), a pattern, vectors of named patches, or a field that was given on the mesh.
+        None: it does not grow, and there is no such amplitude.
     stretch
         The stretches along t1, along t2 and of the thickness, less one; likewise.
     along
@@ -85,7 +89,8 @@ class Natural:
         cells: int,
         carried: Callable[[GivenField], Pattern] | None = None,
     ) -> "Natural":
-        """The same with a vector for each cell where it is given by patches, and with given fields as patterns.
+        """The same with a vector for each cell where it is given by patches, and with given fields
+        as patterns.
 
         Raises
         ------
@@ -99,16 +104,22 @@ class Natural:
             if isinstance(value, Mapping)
         }
         varying = {key: value for key, value in given.items() if isinstance(value, GivenField)}
-        return replace(self, **by_cell, **{key: carried(value) for key, value in varying.items() if carried})
+        return replace(
+            self, **by_cell, **{key: carried(value) for key, value in varying.items() if carried}
+        )
 
     def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
-        """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells, nodes, 3)."""
+        """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells,
+        nodes, 3).
+        """
         stretch, curvature = (_values(value, r0, n0) for value in (self.stretch, self.curvature))
         t1, t2 = self._frame(r0, n0, (stretch[..., 0] != stretch[..., 1]) | _uneven(curvature))
         return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
 
     def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
-        """Derivatives (..., 3) by kappa_11, kappa_22 and kappa_12 from those (..., 6) by kappa's field."""
+        """Derivatives (..., 3) by kappa_11, kappa_22 and kappa_12 from those (..., 6) by kappa's
+        field.
+        """
         t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
         ones = (_tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3))
         return np.stack([np.sum(forces * one, axis=-1) for one in ones], axis=-1)
@@ -118,7 +129,11 @@ class Natural:
         """Those of stretch and curvature."""
         given = (getattr(each, "formulas", None) for each in (self.stretch, self.curvature))
         several = [each for each in given if each]
-        return replace(several[0], functions=[f for one in several for f in one.functions]) if several else None
+        return (
+            replace(several[0], functions=[f for one in several for f in one.functions])
+            if several
+            else None
+        )
 
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
         """t1 and t2 (cells, nodes, 3); zero where nobody needs them and they are not there."""
@@ -135,7 +150,9 @@ class Natural:
 
 
 def meridians(r0: Array, n0: Array) -> Array:
-    """Along the meridians, across circles about e3: e_theta x n; on the axis, where there are none, e1."""
+    """Along the meridians, across circles about e3: e_theta x n; on the axis, where there are none,
+    e1.
+    """
     x, y = r0[..., 0], r0[..., 1]
     off = np.hypot(x, y)[..., None] > NORMAL
     return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
@@ -147,7 +164,8 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
     Raises
     ------
     MeshError
-        On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no direction.
+        On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no
+        direction.
     """
     said, element = None, V.element.basix_element
     r0, n0, _ = cells.at(element.points)
@@ -159,7 +177,9 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
     if problems := [text for text in V.mesh.comm.allgather(said) if text]:
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
-    field = OfPlacement(Q, "natural", lambda r: natural_field(natural, cells_of(r), r.function_space))
+    field = OfPlacement(
+        Q, "natural", lambda r: natural_field(natural, cells_of(r), r.function_space)
+    )
     values = _numbers(T, kappa, t)
     if any(getattr(each, "by_formula", False) for each in (natural.stretch, natural.curvature)):
         of = fitted(
@@ -184,7 +204,8 @@ def _numbers(T: Array, kappa: Array, t: Array) -> Array:
 def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
     stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
     fine = {
-        f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST) & (stretch <= LARGEST),
+        f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST)
+        & (stretch <= LARGEST),
         "curvature: has no finite value (or one above 1e6/R)": np.abs(curvature) <= 1e6,
     }
     for what, good in fine.items():
@@ -195,7 +216,9 @@ def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
 
 @dataclass(frozen=True)
 class Shape:
-    """A natural shape in the densities of a model: its field, see `natural_field`, and its amplitudes; None for 0."""
+    """A natural shape in the densities of a model: its field, see `natural_field`, and its
+    amplitudes; None for 0.
+    """
 
     field: fem.Function
     curvature: fem.Constant | None
@@ -205,7 +228,9 @@ class Shape:
     def of(cls, field: fem.Function, natural: Natural, shared: Constants) -> "Shape":
         """With amplitudes that all terms of a model share, kept in `known`."""
         domain = field.function_space.mesh
-        amplitudes = {name: shared.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes}
+        amplitudes = {
+            name: shared.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes
+        }
         return cls(field, amplitudes.get(CURVATURE), amplitudes.get(STRETCH))
 
     @property
@@ -219,12 +244,18 @@ class Shape:
         return None if self.stretch is None else (self.field.x.array, self.stretch.value)
 
     def volume(self, first: Array, points: Array) -> Array:
-        """Natural over undeformed volume (cells, places), of a surface with these tangents (2, cells, places, 3)."""
+        """Natural over undeformed volume (cells, places), of a surface with these tangents (2,
+        cells, places, 3).
+        """
         assert self.stretch is not None
-        return np.asarray(np.polynomial.polynomial.polyval(float(self.stretch.value), self.volumes(first, points)))
+        return np.asarray(
+            np.polynomial.polynomial.polyval(float(self.stretch.value), self.volumes(first, points))
+        )
 
     def volumes(self, first: Array, points: Array) -> Array:
-        """Its coefficients (4, cells, places) by powers of the amplitude of the stretch: det(1 + mu T) (1 + mu t)."""
+        """Its coefficients (4, cells, places) by powers of the amplitude of the stretch: det(1 + mu
+        T) (1 + mu t).
+        """
         numbers = at_quadrature(self.field, points)
         T = np.empty((*numbers.shape[:2], 3, 3))
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
@@ -236,7 +267,9 @@ class Shape:
     def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
         """The natural forms at a point where the field and the amplitudes have these values."""
         given = list(amplitudes)
-        bent, stretched = (given.pop(0) if p is not None else None for p in (self.curvature, self.stretch))
+        bent, stretched = (
+            given.pop(0) if p is not None else None for p in (self.curvature, self.stretch)
+        )
         return _forms(r0, field, bent, stretched)
 
 
@@ -299,7 +332,9 @@ def _uneven(curvature: Array) -> NDArray[np.bool_]:
 
 
 def _tensor(components: Array, t1: Array, t2: Array) -> Array:
-    """Of S_11, S_22 and perhaps S_12 in a frame; S_22 times the unit tensor, exactly, where it is isotropic."""
+    """Of S_11, S_22 and perhaps S_12 in a frame; S_22 times the unit tensor, exactly, where it is
+    isotropic.
+    """
 
     def product(a: Array, b: Array) -> Array:
         return np.asarray(a[..., :, None] * b[..., None, :])
@@ -311,7 +346,9 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
     return np.asarray(tensor)
 
 
-def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[str, fem.Constant]) -> Shape:
+def body_shape(
+    natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[str, fem.Constant]
+) -> Shape:
     """The natural shape of a body; collective.
 
     Raises
@@ -335,14 +372,19 @@ def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[st
 def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
     """What grows there, a tensor in space, where the field and the amplitudes have these values."""
     given = list(amplitudes)
-    bent, stretched = (given.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch))
+    bent, stretched = (
+        given.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch)
+    )
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
     n = n / ufl.sqrt(ufl.dot(n, n))
     across = ufl.outer(n, n)
     P = ufl.Identity(3) - across
     s, U = 1, P
     if stretched is not None:
-        s, U = 1 + stretched * field[12], P + stretched * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P))
+        s, U = (
+            1 + stretched * field[12],
+            P + stretched * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P)),
+        )
     if bent is not None:
         U = U - s * z * bent * ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
     return U + s * across

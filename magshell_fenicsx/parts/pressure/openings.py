@@ -1,9 +1,10 @@
 """Edges that a live pressure leaves open.
 
-p int n . v da is the variation of p V, V the volume between the surface and a point, where every edge is held or stays
-in a plane through that point. Else a line integral over the edge remains. Its curl, p int (v x w) . dx for two
-motions v and w of the edge (Romano 1972, Buefler 1984, Schweizerhof and Ramm 1984), vanishes where the edge moves in
-a single direction or in its own plane: then the pressure has a potential, `densities.swept`. Elsewhere it has none.
+p int n . v da is the variation of p V, V the volume between the surface and a point, where every
+edge is held or stays in a plane through that point. Else a line integral over the edge remains. Its
+curl, p int (v x w) . dx for two motions v and w of the edge (Romano 1972, Buefler 1984,
+Schweizerhof and Ramm 1984), vanishes where the edge moves in a single direction or in its own
+plane: then the pressure has a potential, `densities.swept`. Elsewhere it has none.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence, Set
@@ -28,7 +29,9 @@ def moving(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Conditio
     edges
         Name -> sides of cells, in any way that two names share.
     """
-    closed = set[Hashable]().union(*(edges[name] for name, c in conditions.items() if name in edges and closes(c)))
+    closed = set[Hashable]().union(
+        *(edges[name] for name, c in conditions.items() if name in edges and closes(c))
+    )
     return [name for name, sides in edges.items() if sides - closed]
 
 
@@ -83,7 +86,9 @@ def openings(
         by_rank = r0.x.array.reshape(-1, 3)[dofs if nodes is None else dofs[nodes[dofs]]]
         return np.concatenate(comm.allgather(by_rank))
 
-    by_rank = comm.allgather(moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions))
+    by_rank = comm.allgather(
+        moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions)
+    )
     names = [name for name in edges if any(name in rank for rank in by_rank)]
     return names, without_potential(names, conditions, places)
 
@@ -108,7 +113,9 @@ def on_each(pressed: fem.Function) -> Array:
     return np.asarray(pressed.x.array[pressed.function_space.dofmap.list[:, 0]])
 
 
-def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dict[str, NDArray[np.int32]]:
+def beside(
+    edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function
+) -> dict[str, NDArray[np.int32]]:
     """The parts of edges, facets on this rank, whose cells are pressed."""
     topology, sides = pressed.function_space.mesh.topology, on_each(pressed)
     topology.create_connectivity(1, 2)
@@ -117,18 +124,29 @@ def beside(edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function) -> dic
     def acts(facet: int) -> bool:
         return bool(sides[links.links(facet)[0]])
 
-    return {name: facets[np.array([acts(f) for f in facets], dtype=bool)] for name, facets in edges.items()}
+    return {
+        name: facets[np.array([acts(f) for f in facets], dtype=bool)]
+        for name, facets in edges.items()
+    }
 
 
 def side_of(end: str, on: Mapping[str, float]) -> float:
-    """The side on which a pressure acts on the shell of an end, as of `on_cells`; without `on` all from outside."""
-    return next((side for shell, side in on.items() if end.startswith(f"{shell}_")), 0.0) if on else 1.0
+    """The side on which a pressure acts on the shell of an end, as of `on_cells`; without `on` all
+    from outside.
+    """
+    return (
+        next((side for shell, side in on.items() if end.startswith(f"{shell}_")), 0.0)
+        if on
+        else 1.0
+    )
 
 
 def ring_openings(
     ends: Mapping[str, Array], conditions: Mapping[str, Condition], on: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """The same of a meridian with ends at (rho, z), of shells that a pressure acts on, see `side_of`."""
+    """The same of a meridian with ends at (rho, z), of shells that a pressure acts on, see
+    `side_of`.
+    """
     ends = {name: at for name, at in ends.items() if side_of(name, on)}
 
     def ring(name: str) -> Array:
@@ -143,7 +161,9 @@ def meridian_openings(
     meridian: Meridian, conditions: Mapping[str, Condition], on: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
     """The ends that are not held, and those of them where a live pressure has no potential."""
-    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
+    places = {
+        name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends
+    }
     return ring_openings(places, conditions, on)
 
 

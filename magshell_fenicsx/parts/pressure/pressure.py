@@ -56,13 +56,22 @@ class PressureSection(PathStep):
         if self.on is None:
             return
         if context.solid or not isinstance(context.shell, MeshSurface):
-            raise ValueError(f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it out")
+            raise ValueError(
+                f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it out"
+            )
         loads = [other.load for other in context.steps]
-        if any(isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads):
-            raise ValueError(f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells")
+        if any(
+            isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads
+        ):
+            raise ValueError(
+                f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells"
+            )
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
-        return [*super().leaves(step, context, outline), of_patches(f"{step.key}.on", self.on or (), context.shell)]
+        return [
+            *super().leaves(step, context, outline),
+            of_patches(f"{step.key}.on", self.on or (), context.shell),
+        ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         sides = {"outside": 1.0, "inside": -1.0}
@@ -72,13 +81,19 @@ class PressureSection(PathStep):
         course = super().course(here)
         if here.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
-        if here.context.shell.rubber is not None and course.drive.first < 0:  # blown up far beyond p_c
+        if (
+            here.context.shell.rubber is not None and course.drive.first < 0
+        ):  # blown up far beyond p_c
             finer = partial(_longer, BLOWN / here.h)
             course = replace(course, drive=replace(course.drive, scale=1 / here.h), finer=finer)
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
-        return PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on) if last else self
+        return (
+            PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on)
+            if last
+            else self
+        )
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
@@ -103,7 +118,9 @@ class PressureSeen(Seen):
     """What is conjugate to a live pressure is the change of volume, which every run has."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.thickness import patch_of  # the solver takes long to import
+        from magshell_fenicsx.models.shell.thickness import (
+            patch_of,
+        )  # the solver takes long to import
 
         for name in loads.pressed:
             patch_of(surface.patches, name, "loading.on")
@@ -115,7 +132,9 @@ class PressureSeen(Seen):
         return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
 
     def left_out(self, sight: Sight) -> list[str]:
-        from magshell_fenicsx.parts.pressure.openings import no_potential  # the solver takes long to import
+        from magshell_fenicsx.parts.pressure.openings import (
+            no_potential,
+        )  # the solver takes long to import
 
         open_at = sight.model.without_potential if sight.loads.pressure else ()
         return [no_potential(open_at)] if open_at else []
@@ -125,13 +144,22 @@ def account(context: Context, loads: "Loads") -> Account:
     """Whether there is a live pressure."""
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
-    on = ", ".join(f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed.items())
-    return Account(["live pressure on the outer face" if context.solid else f"live pressure{on and f' on {on}'}"])
+    on = ", ".join(
+        f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed.items()
+    )
+    return Account(
+        [
+            "live pressure on the outer face"
+            if context.solid
+            else f"live pressure{on and f' on {on}'}"
+        ]
+    )
 
 
 @dataclass(frozen=True)
 class Enclosed:
-    """A gas from where it was closed in, an equilibrium: (ambient - p) V stays what it was there (Boyle's law).
+    """A gas from where it was closed in, an equilibrium: (ambient - p) V stays what it was there
+    (Boyle's law).
 
     Attributes
     ----------
@@ -156,13 +184,18 @@ class Enclosed:
         Raises
         ------
         CaseError
-            If the volume under the shell is not known, or the pressure is not below the ambient one.
+            If the volume under the shell is not known, or the pressure is not below the ambient
+            one.
         """
         ambient = self.section.ambient_over_pc
         if ambient is None:
             if self.shell.youngs_modulus is None:
-                raise CaseError("hold.pressure.gas.ambient: needs shell.youngs_modulus; or give ambient_over_pc")
-            ambient = float(self.section.ambient or 0.0) / (self.classical_pressure * self.shell.youngs_modulus)
+                raise CaseError(
+                    "hold.pressure.gas.ambient: needs shell.youngs_modulus; or give ambient_over_pc"
+                )
+            ambient = float(self.section.ambient or 0.0) / (
+                self.classical_pressure * self.shell.youngs_modulus
+            )
         first, now, unit = self._volume(), self.pressure, self.unit
         changed = self.conjugate / unit
         if first + changed <= 0:
@@ -181,7 +214,9 @@ class Enclosed:
         return conjugate
 
     def by_begin(self, p: float) -> tuple[float, float]:
-        """What the conjugate at p/p_c changes by with that where the gas was closed in, and with p there."""
+        """What the conjugate at p/p_c changes by with that where the gas was closed in, and with p
+        there.
+        """
         at_now, slope = self.law()(p)
         first = self._volume()
         ahead = (at_now / self.unit + first) / slope * self.unit  # ambient - p
@@ -205,4 +240,6 @@ def volume(shell: ShellSection | Surface) -> float:
     if isinstance(shell, CapSurface) and shell.geometry == "cap":
         c = cos(radians(shell.polar))
         return pi * (2 + c) * (1 - c) ** 2 / 3
-    raise CaseError(f"hold.pressure.gas.volume: give the volume of the gas under a {shell.geometry}")
+    raise CaseError(
+        f"hold.pressure.gas.volume: give the volume of the gas under a {shell.geometry}"
+    )

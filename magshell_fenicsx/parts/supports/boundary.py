@@ -38,28 +38,35 @@ class HeldSection(Section):
 
 def _condition(value: Any) -> Any:
     """One message for a union."""
-    if isinstance(value, HeldSection) or (isinstance(value, str) and value in get_args(EdgeCondition)):
+    if isinstance(value, HeldSection) or (
+        isinstance(value, str) and value in get_args(EdgeCondition)
+    ):
         return value
     if isinstance(value, dict) and set(value) == {"held"}:
         try:
             return HeldSection.model_validate(value)
         except ValidationError:
             pass
-    raise ValueError(f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these")
+    raise ValueError(
+        f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these"
+    )
 
 
 class BoundarySection(Section, Ability):
     """Edge, point or patch of a mesh -> condition; edges that are not named are free.
 
-    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: the edge
-    lies in a mirror plane of a shape of which this is a part (of a whole shape take `symmetry: half`). held:
-    some components of the displacement; a point of `points` can be held too. A patch of a mesh file can be
-    clamped or held, all of it, if no edge has its name.
+    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement.
+    symmetry: the edge lies in a mirror plane of a shape of which this is a part (of a whole shape
+    take `symmetry: half`). held: some components of the displacement; a point of `points` can be
+    held too. A patch of a mesh file can be clamped or held, all of it, if no edge has its name.
     """
 
     model_config = Section.model_config | {"extra": "allow"}
     __pydantic_extra__: dict[
-        str, Annotated[Any, BeforeValidator(_condition, json_schema_input_type=EdgeCondition | HeldSection)]
+        str,
+        Annotated[
+            Any, BeforeValidator(_condition, json_schema_input_type=EdgeCondition | HeldSection)
+        ],
     ]
 
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
@@ -88,12 +95,18 @@ class BoundarySection(Section, Ability):
         edges = EDGES[shell.geometry] if isinstance(shell, ShellSection) else ()
         for name in self.conditions() if edges else ():
             if name not in edges and name not in context.points:
-                raise ValueError(f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}")
+                raise ValueError(
+                    f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}"
+                )
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """With an edge in a mirror plane the case is a part of a shape."""
         part = "symmetry" in self.conditions().values()
-        return {"the whole shell": "with boundary: symmetry the case is a part of it alone"} if part else {}
+        return (
+            {"the whole shell": "with boundary: symmetry the case is a part of it alone"}
+            if part
+            else {}
+        )
 
     @property
     def fixes(self) -> bool:
@@ -106,14 +119,22 @@ class BoundarySection(Section, Ability):
         )
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
-        """A half that is loaded does not see rigid motions across its plane: it needs a support against all."""
+        """A half that is loaded does not see rigid motions across its plane: it needs a support
+        against all.
+        """
         parts = list[Leaves]()
         for name, condition in self.conditions().items():
             reason = None
             if isinstance(condition, HeldSection):
                 one_sided = len({0, 1} & set(condition.components)) == 1
                 off = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
-                why = "is held along x or y alone" if one_sided else "is held off the axis" if off else None
+                why = (
+                    "is held along x or y alone"
+                    if one_sided
+                    else "is held off the axis"
+                    if off
+                    else None
+                )
                 reason = why and f"boundary.{name}: {why}"
             parts.append(Leaves(reason, mirrors=partial(self._mirrored, context, name)))
         at_rest = not context.steps and context.sections.get("frequencies") is not None
@@ -126,11 +147,18 @@ class BoundarySection(Section, Ability):
         conditions = self.conditions()
         condition, other = conditions[name], conditions.get(mirror.other(name), "free")
         if isinstance(condition, HeldSection):
-            held, S = np.diag([float(i in condition.components) for i in range(3)]), mirror.reflection
+            held, S = (
+                np.diag([float(i in condition.components) for i in range(3)]),
+                mirror.reflection,
+            )
             if np.abs(S @ held @ S - held).max() > PARALLEL:
                 return False
         place = context.points.get(name)
-        off = 0.0 if place is None else float(mirror.beyond(np.array(place) / context.shell.reference))
+        off = (
+            0.0
+            if place is None
+            else float(mirror.beyond(np.array(place) / context.shell.reference))
+        )
         return abs(off) < ROUNDING and condition == other
 
 
@@ -138,6 +166,10 @@ def refuse_taken(points: Iterable[str]) -> None:
     """Refuse names of points that the program gives itself."""
     for point in points:
         if point == "pole":
-            raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
+            raise ValueError(
+                "points.pole: is taken, by the point that w_pole_over_h is of; choose another name"
+            )
         if re.fullmatch(r"load(_\d+)?", point):
-            raise ValueError(f"points.{point}: is taken, by the point that is indented; choose another name")
+            raise ValueError(
+                f"points.{point}: is taken, by the point that is indented; choose another name"
+            )

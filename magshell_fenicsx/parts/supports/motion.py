@@ -35,7 +35,8 @@ class TurnSection(AboutAxis):
 class MoveSection(Section):
     """A rigid motion of supports: first a rotation, then a translation, for a factor of one.
 
-    A clamped edge turns with its normal. The angle, and the translation, are proportional to the factor.
+    A clamped edge turns with its normal. The angle, and the translation, are proportional to the
+    factor.
     """
 
     supports: list[str] = Field(min_length=1, max_length=1000)
@@ -55,10 +56,10 @@ class MoveSection(Section):
 class EdgeSection(PathStep):
     """Supports that move, all in proportion to one factor.
 
-    Its conjugate is the reaction: the forces of the supports along their translations (their work over the sum of the
-    lengths of these), without translations the moments about the axes; with a pressure, that on the rigid lids
-    which close such edges counts. Later steps may move the same supports again,
-    from where they are then.
+    Its conjugate is the reaction: the forces of the supports along their translations (their work
+    over the sum of the lengths of these), without translations the moments about the axes; with a
+    pressure, that on the rigid lids which close such edges counts. Later steps may move the same
+    supports again, from where they are then.
     """
 
     conjugate: ClassVar[str] = "reaction"
@@ -86,10 +87,14 @@ class EdgeSection(PathStep):
     @model_validator(mode="after")
     def _each_once(self) -> Self:
         if self.name in ({*TAKEN, *QUANTITIES} - {"motion"}):
-            raise ValueError(f"name: {self.name}: is taken; choose another name for the factor of the motion")
+            raise ValueError(
+                f"name: {self.name}: is taken; choose another name for the factor of the motion"
+            )
         named = [name for move in self.moves for name in move.supports]
         if twice := next((name for name in named if named.count(name) > 1), None):
-            raise ValueError(f"moves: {twice}: moves twice in one step; let a later step move it again")
+            raise ValueError(
+                f"moves: {twice}: moves twice in one step; let a later step move it again"
+            )
         return self
 
     @property
@@ -127,13 +132,19 @@ class EdgeSection(PathStep):
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         R = context.shell.reference
-        return [Leaves(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))]
+        return [
+            Leaves(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))
+        ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.models.shell.parameters import Move  # the solver takes long to import
 
         R, turn = context.shell.reference, modelled.turn
-        return {"moves": tuple(Move(tuple(one.supports), motion(one, step.name, R, turn)) for one in self.moves)}
+        return {
+            "moves": tuple(
+                Move(tuple(one.supports), motion(one, step.name, R, turn)) for one in self.moves
+            )
+        }
 
 
 def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> Motion:
@@ -155,7 +166,9 @@ def sideways(load: EdgeSection) -> str | None:
 
 
 def held_vectors(load: EdgeSection) -> list[Array]:
-    """Unit vectors (3,) that a mirror plane through e3 must hold: translations, and normals of axes of rotation."""
+    """Unit vectors (3,) that a mirror plane through e3 must hold: translations, and normals of axes
+    of rotation.
+    """
     vectors = [np.array(one.translation) for one in load.moves if one.translation]
     vectors += [np.cross([0.0, 0.0, 1.0], one.rotation.axis) for one in load.moves if one.rotation]
     return [v / np.linalg.norm(v) for v in vectors if v.any()]

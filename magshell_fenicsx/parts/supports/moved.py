@@ -30,8 +30,9 @@ class Support:
     turn
         The rotation in that term, if a motion turns the edge.
     kind
-        Whether it is a point, a part (an edge or a patch), or a mirror plane, in the direction of its normal alone. Of
-        the supports that hold a component, those that come first in `PRECEDENCE` have its force.
+        Whether it is a point, a part (an edge or a patch), or a mirror plane, in the direction of
+        its normal alone. Of the supports that hold a component, those that come first in
+        `PRECEDENCE` have its force.
     """
 
     dofs: NDArray[np.int32]
@@ -68,13 +69,21 @@ def moving(
 ) -> Moving | None:
     """The nodes that move; None without motions."""
     moved = {name: motions_of(loads, name) for name in supports}
-    bodies = [Body(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]]
+    bodies = [
+        Body(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]
+    ]
     return Moving(r0, bodies, pressed) if bodies else None
 
 
 def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collection[str]) -> bool:
-    """Whether lids on edges that move close the shell: all edges are held, move, or lie in planes of symmetry."""
-    return bool(loads.moves) and not without_potential and all(motions_of(loads, name) for name in free_edges)
+    """Whether lids on edges that move close the shell: all edges are held, move, or lie in planes
+    of symmetry.
+    """
+    return (
+        bool(loads.moves)
+        and not without_potential
+        and all(motions_of(loads, name) for name in free_edges)
+    )
 
 
 def pressed_edges(
@@ -104,9 +113,13 @@ def pressed_edges(
     alike = dict[tuple[object, ...], list[str]]()
     for name in curves:
         if motions := motions_of(loads, name):
-            same = tuple((m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions)
+            same = tuple(
+                (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
+            )
             alike.setdefault(same, []).append(name)
-    on_planes = np.concatenate([np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)])
+    on_planes = np.concatenate(
+        [np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)]
+    )
     on_any = np.concatenate(comm.allgather(on_planes))
     lids = []
     for names in alike.values():
@@ -115,4 +128,6 @@ def pressed_edges(
         if not len(open_at) or (closing is not None and np.isin(open_at, on_any).all()):
             origin = np.zeros(3) if closing is None else closing
             lids.append(Lid.over(of_lid, x, motions_of(loads, names[0]), origin, comm))
-    return Pressed(PRESSURE, unit, lids, [curves[name] for names in alike.values() for name in names])
+    return Pressed(
+        PRESSURE, unit, lids, [curves[name] for names in alike.values() for name in names]
+    )

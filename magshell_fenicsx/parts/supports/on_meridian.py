@@ -1,4 +1,6 @@
-"""Supports of a meridian: displacements that are zero at its ends, and the rigid motions that they may stop."""
+"""Supports of a meridian: displacements that are zero at its ends, and the rigid motions that they
+may stop.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,7 +31,8 @@ class RigidMotions:
     around
         Waves m = 0 around e3, as coefficients (U + V, V, W), (n, nodes times 3).
     across
-        Waves m = 1 that move the shell across e3 or turn it about an axis across it, likewise. Each has a twin.
+        Waves m = 1 that move the shell across e3 or turn it about an axis across it, likewise. Each
+        has a twin.
     """
 
     along: Array
@@ -50,7 +53,8 @@ class Supports:
     mirror
         Where a plane normal to e3 mirrors the shell.
     named
-        Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are held there.
+        Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are
+        held there.
     """
 
     axis: Facets
@@ -67,10 +71,15 @@ class Supports:
     def held_waves(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
         """Of the coefficients (U + V, V, W): a wave m = 1 may move the axis across itself."""
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
-        return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
+        return [
+            *at_axis,
+            *(_zero(V, self.horizontal, i) for i in range(2)),
+            _zero(V, self.axial, 2),
+        ]
 
     def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
-        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `held_waves`, without their space.
+        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `held_waves`, without
+        their space.
 
         The nodes of the spaces of displacements and of waves have the same numbers.
         """
@@ -92,7 +101,9 @@ class Supports:
             zero = 0.0 * one
             along.append(np.column_stack([zero, one]).ravel())
             around.append(np.column_stack([rho, rho, zero]).ravel())
-            across += [np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])]
+            across += [
+                np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])
+            ]
         return RigidMotions(np.array(along), np.array(around), np.array(across))
 
 

@@ -31,7 +31,9 @@ def motion_columns(loads: "Loads") -> dict[str, str]:
 
 
 def motion_size(loads: "Loads", name: str) -> float:
-    """The sum of the lengths of the translations of an amplitude, over R; without any of the angles (rad)."""
+    """The sum of the lengths of the translations of an amplitude, over R; without any of the angles
+    (rad).
+    """
     motions = [move.motion for move in loads.moves if move.motion.name == name for _ in move.names]
     shifts = float(sum(np.linalg.norm(motion.shift) for motion in motions))
     return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
@@ -75,19 +77,29 @@ class Moved(Seen):
         return (*super().columns(loads, supports), *columns(supports))
 
     def moments(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(column for name, column in motion_columns(loads).items() if only_turns(loads, name))
+        return tuple(
+            column for name, column in motion_columns(loads).items() if only_turns(loads, name)
+        )
 
     def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        return {name: (only_turns(loads, name), motion_size(loads, name)) for name in motion_columns(loads)}
+        return {
+            name: (only_turns(loads, name), motion_size(loads, name))
+            for name in motion_columns(loads)
+        }
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Forces and moments in the case's units."""
         values: dict[str, float] = {}
         for name, column in motion_columns(sight.loads).items():
-            values |= {name: state.mu[name], column: sight.potential(state, name) / -self._unit(sight, name)}
+            values |= {
+                name: state.mu[name],
+                column: sight.potential(state, name) / -self._unit(sight, name),
+            }
         if sight.reactions:
             frame = rotation(sight.azimuth)
-            values |= observed_reactions(sight.model, state, sight.mirror, frame, sight.force, sight.length)
+            values |= observed_reactions(
+                sight.model, state, sight.mirror, frame, sight.force, sight.length
+            )
         return values
 
     def conjugate_unit(self, sight: Sight, name: str) -> float | None:
@@ -99,7 +111,12 @@ class Moved(Seen):
 
 
 def observed_reactions(
-    model: "Observed", state: "State", mirror: Mirror | None, frame: Array, force: float, length: float
+    model: "Observed",
+    state: "State",
+    mirror: Mirror | None,
+    frame: Array,
+    force: float,
+    length: float,
 ) -> dict[str, float]:
     """The values of `columns` of all supports, sorted by support; collective.
 
@@ -110,7 +127,9 @@ def observed_reactions(
     force, length
         E h R and R in the case's units.
     """
-    from magshell_fenicsx.parts.supports.reactions import reactions  # the solver takes long to import
+    from magshell_fenicsx.parts.supports.reactions import (
+        reactions,
+    )  # the solver takes long to import
 
     by_column: dict[str, float] = {}
     for name, one in reactions(model, state, mirror).items():

@@ -36,7 +36,9 @@ class Reaction:
     point: Array
 
     def image(self, S: Array, point: Array) -> "Reaction":
-        """What the mirror image of the support does; `S` mirrors vectors, and `point` is the image of the point."""
+        """What the mirror image of the support does; `S` mirrors vectors, and `point` is the image
+        of the point.
+        """
         return Reaction(S @ self.force, -S @ self.moment, point)
 
     def whole(self, mirror: Mirror) -> "Reaction":
@@ -47,9 +49,9 @@ class Reaction:
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """The reactions of all supports in the model's frame; collective.
 
-    A point has the force of its node; edges and patches that hold a node together share it equally. A clamped edge
-    also makes a couple: its energy is invariant if shell and edge turn together, so the couple is minus the moment of
-    that energy's gradient.
+    A point has the force of its node; edges and patches that hold a node together share it equally.
+    A clamped edge also makes a couple: its energy is invariant if shell and edge turn together, so
+    the couple is minus the moment of that energy's gradient.
 
     Parameters
     ----------
@@ -59,16 +61,24 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     system, comm = model.system, model.system.comm
     R, shares = system.forces(state.u, state.mu), _shares(model)
     axes = system.u.function_space.dofmap.index_map_bs
-    r = in_space(model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes)
+    r = in_space(
+        model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes
+    )
     by_support: dict[str, Reaction] = {}
     for name, support in model.supports.items():
         dofs = support.dofs[support.dofs < system.size]
-        box = _box(r[np.unique(dofs // axes)], mirror if mirror and mirror.other(name) == name else None, comm)
+        box = _box(
+            r[np.unique(dofs // axes)],
+            mirror if mirror and mirror.other(name) == name else None,
+            comm,
+        )
         point = box.mean(axis=0)
         F, arm = in_space(shares[name] * R, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
         if support.edge:
-            M = M - np.cross(arm, in_space(system.forces(state.u, state.mu, support.edge), axes)).sum(axis=0)
+            M = M - np.cross(
+                arm, in_space(system.forces(state.u, state.mu, support.edge), axes)
+            ).sum(axis=0)
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
         if axes == 2:  # around the axis
             force, moment, point = force * [0.0, 0.0, 1.0], 0 * moment, point * [0.0, 0.0, 1.0]
@@ -77,7 +87,8 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
 
 
 def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
-    """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a way (3,).
+    """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a
+    way (3,).
 
     As in `reactions`, of the whole shell.
     """
@@ -87,14 +98,17 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
         way = mirror.summed(way)
     system = model.system
     axes = system.u.function_space.dofmap.index_map_bs
-    along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
+    along = (
+        way if axes == 3 else np.array([0.0, way[2]])
+    )  # around the axis only that along it is left
     return np.asarray(_shares(model)[name] * np.tile(along, system.size // axes))
 
 
 def _shares(model: "Observed") -> dict[str, Array]:
     """Return the share that each support has in the force at the owned unknowns.
 
-    A point has the force of its node alone, edges and patches share it equally, and a mirror plane has what is left.
+    A point has the force of its node alone, edges and patches share it equally, and a mirror plane
+    has what is left.
     """
     size = model.system.size
     shares = {name: np.zeros(size) for name in model.supports}

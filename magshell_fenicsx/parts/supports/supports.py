@@ -1,6 +1,8 @@
-"""What holds a shell or a solid: displacements that are zero, and whether it is held against rigid motions.
+"""What holds a shell or a solid: displacements that are zero, and whether it is held against rigid
+motions.
 
-Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface alone.
+Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface
+alone.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -27,8 +29,10 @@ Array = NDArray[np.float64]
 ALL = (0, 1, 2)
 ROUNDING = 1e-9
 BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
-RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
-FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
+# mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
+RIGHT = 0.99
+# of the squares that a rigid motion has where the shell is held, over the largest: rounding
+FREE = 1e-12
 NOT_HELD = "boundary: the shell is not held: it is free to "
 LOOSE = 1e-13  # of a rigid motion's energy, over the sum of magnitudes that it is made of: rounding
 
@@ -40,19 +44,25 @@ def held_on(
     axes: Iterable[int],
     nodes: NDArray[np.bool_] | None = None,
 ) -> list[fem.DirichletBC]:
-    """Those components are zero on entities of some dimension, or at some of the `nodes` there alone."""
+    """Those components are zero on entities of some dimension, or at some of the `nodes` there
+    alone.
+    """
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
     conditions = []
     for space in (V.sub(i) for i in axes):
         dofs = fem.locate_dofs_topological(space, dim, entities)
-        conditions.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space))
+        conditions.append(
+            fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space)
+        )
     return conditions
 
 
 def held_at_vertex(
     V: fem.FunctionSpace, x: Array, axes: Iterable[int], beside: NDArray[np.bool_] | None = None
 ) -> list[fem.DirichletBC]:
-    """Those components are zero at the node at a vertex; `beside` are the cells that may have it, None for all."""
+    """Those components are zero at the node at a vertex; `beside` are the cells that may have it,
+    None for all.
+    """
     near = fem.locate_dofs_geometrical(V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
     near = near if beside is None else near[np.isin(near, V.dofmap.list[beside])]
     return [fem.dirichletbc(0.0, 3 * near + np.int32(i), V.sub(i)) for i in axes]
@@ -72,12 +82,16 @@ def refuse_unknown(
     MeshError
         With the name and those that there are.
     """
-    joined = {edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges}
+    joined = {
+        edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges
+    }
 
     def refuse_joined(key: str, name: str) -> None:
         if name in joined and name not in patches:
             there, number = ", ".join(sorted(edges)) or "none", joined[name]
-            raise MeshError(f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: {there}")
+            raise MeshError(
+                f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: {there}"
+            )
 
     for name, condition in conditions.items():
         allowed = set(edges)
@@ -95,7 +109,10 @@ def refuse_unknown(
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
     for term in loads.own:
         if term.on is not None and term.on not in edges:
-            allowed_names, key = ", ".join(sorted(edges)) or "none", term.key or f"terms: {term.name}: on"
+            allowed_names, key = (
+                ", ".join(sorted(edges)) or "none",
+                term.key or f"terms: {term.name}: on",
+            )
             raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {allowed_names}")
 
 
@@ -105,7 +122,8 @@ def no_mirror(name: str) -> str:
 
 
 def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
-    """The plane of an edge, which the surface crosses at right angles, or of a face of a body; collective.
+    """The plane of an edge, which the surface crosses at right angles, or of a face of a body;
+    collective.
 
     Raises
     ------
@@ -118,7 +136,9 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
     places = np.concatenate(V.mesh.comm.allgather(r0.x.array.reshape(-1, 3)[dofs]))
     centre = places.mean(axis=0)
     _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
-    conormals = _conormals(r0, facets) if on_edge else axes[2:]  # the thickness stands at right angles
+    conormals = (
+        _conormals(r0, facets) if on_edge else axes[2:]
+    )  # the thickness stands at right angles
     if spread[1] > STRAIGHT * spread[0]:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
@@ -134,12 +154,15 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
 
 
 def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
-    """Move the nodes of an edge into the plane of its vertices, if curved elements leave them a little beside it.
+    """Move the nodes of an edge into the plane of its vertices, if curved elements leave them a
+    little beside it.
 
     The vertices of a chart are exact, the cubic edges between them are not. Collective.
     """
     V, domain = r0.function_space, r0.function_space.mesh
-    ends = mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty(0, dtype=np.int32)
+    ends = (
+        mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty(0, dtype=np.int32)
+    )
     vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
@@ -153,7 +176,9 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:
-    """A point (3,) of all planes, from which the volume beside them is measured; None if they have none."""
+    """A point (3,) of all planes, from which the volume beside them is measured; None if they have
+    none.
+    """
     if not planes:
         return np.zeros(3)
     normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])
@@ -181,7 +206,9 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
 
 
 def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> str:
-    """A rigid motion of a piece of the shell that is left free, as a message; empty if there is none. Collective."""
+    """A rigid motion of a piece of the shell that is left free, as a message; empty if there is
+    none. Collective.
+    """
     x = r0.x.array[: system.size].reshape(-1, 3)
     pieces_of_shell = _pieces(system, r0)
     for own in pieces_of_shell:
@@ -192,14 +219,24 @@ def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampli
         shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / total
         moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
         centre = system.comm.allreduce(x[own].sum(axis=0)) / total
-        along = ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3)) if moves else ""
-        where = "" if len(pieces_of_shell) == 1 else f"; this is its piece around {place_text(centre)}, over R"
+        along = (
+            ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3))
+            if moves
+            else ""
+        )
+        where = (
+            ""
+            if len(pieces_of_shell) == 1
+            else f"; this is its piece around {place_text(centre)}, over R"
+        )
         return NOT_HELD + (f"move along ({along})" if moves else "turn") + where
     return ""
 
 
 def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> int:
-    """The number of rigid motions that nothing resists, of all pieces of the shell together; collective."""
+    """The number of rigid motions that nothing resists, of all pieces of the shell together;
+    collective.
+    """
     x = r0.x.array[: system.size].reshape(-1, 3)
     return sum(len(_loose(system, x, amplitudes, own)) for own in _pieces(system, r0))
 
@@ -207,13 +244,17 @@ def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amp
 def _pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
     """Which nodes of this rank each piece of the shell has; collective."""
     piece = pieces(r0.function_space)[: system.size // 3]
-    return [piece == n for n in range(1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX))]
+    return [
+        piece == n for n in range(1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX))
+    ]
 
 
 def _loose(
     system: FiniteElementSystem, x: Array, amplitudes: Amplitudes, own: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The rigid motions (k, unknowns) of the nodes of a piece that nothing resists, the loosest first; collective."""
+    """The rigid motions (k, unknowns) of the nodes of a piece that nothing resists, the loosest
+    first; collective.
+    """
     total = system.comm.allreduce(int(own.sum()))
     centre = system.comm.allreduce(x[own].sum(axis=0)) / total
     motions = np.zeros((6, *x.shape))
@@ -221,11 +262,16 @@ def _loose(
         motions[i, :, i] = own
         motions[3 + i] = np.cross(axis, x - centre) * own[:, None]
     return unresisted(
-        motions.reshape(6, -1), system.held, lambda: system.tangent(np.zeros(system.size), amplitudes), system.comm
+        motions.reshape(6, -1),
+        system.held,
+        lambda: system.tangent(np.zeros(system.size), amplitudes),
+        system.comm,
     )
 
 
-def unresisted(rigid: Array, held: Callable[[Vector], Vector], tangent: Callable[[], Tangent], comm: MPI.Comm) -> Array:
+def unresisted(
+    rigid: Array, held: Callable[[Vector], Vector], tangent: Callable[[], Tangent], comm: MPI.Comm
+) -> Array:
     """Return the rigid motions that neither a support nor the shell's energy resists; collective.
 
     Parameters
@@ -273,7 +319,8 @@ def _sums_of_rows(K: PETSc.Mat) -> Array:
 def supports(
     body: Body, r0: fem.Function, conditions: Mapping[str, Condition]
 ) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
-    """What is held, the planes of symmetry but the mirror plane of a half model, and each support; collective.
+    """What is held, the planes of symmetry but the mirror plane of a half model, and each support;
+    collective.
 
     Raises
     ------
@@ -299,11 +346,15 @@ def supports(
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
         elif name in body.patches:
-            conditions_of_part = held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
+            conditions_of_part = held_on(
+                V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes
+            )
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
         held += conditions_of_part
-        named[name] = Support.of(conditions_of_part, kind="point" if name in body.points else "part")
+        named[name] = Support.of(
+            conditions_of_part, kind="point" if name in body.points else "part"
+        )
     return held, planes, named | on_planes
 
 

@@ -51,7 +51,8 @@ def touchings(
     thickness
         What multiplies h, (1,); None for 1.
     thins
-        1 in the cells of this rank (cells, 1) whose thickness follows from their area, or in all; else 0.
+        1 in the cells of this rank (cells, 1) whose thickness follows from their area, or in all;
+        else 0.
     images
         Of a half or a sector the copies that make the whole, itself first; none of a whole.
     on_planes
@@ -76,11 +77,16 @@ def touchings(
         topology.create_connectivity(*dims)
 
     nodes = cells_of_all.nodes[first : first + count]
-    corners = topology.index_map(0).local_to_global(topology.connectivity(2, 0).array[: 3 * count].astype(np.int32))
+    corners = topology.index_map(0).local_to_global(
+        topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
+    )
     cells = Cells(element, cells_of_all.nodes, cells_of_all.gathered(corners.reshape(-1, 3)))
     placed = whole(r0)
     local = first, count + topology.index_map(2).num_ghosts
-    times, thinning = np.ones(nodes.shape), np.broadcast_to(np.asarray(thins) > 0, (local[1], 1))[:, 0]
+    times, thinning = (
+        np.ones(nodes.shape),
+        np.broadcast_to(np.asarray(thins) > 0, (local[1], 1))[:, 0],
+    )
     if thickness is not None:
         times = thickness.x.array[thickness.function_space.dofmap.list[:count]]
     powers, grown = np.array([times]), None
@@ -90,7 +96,10 @@ def touchings(
         rates = natural.volumes(tangents, element.points)
         rates[:, ~thinning] = np.eye(4)[0][:, None, None]
         powers, grown = times * rates[:, :count], natural.stretch
-    powers, keeps_volume = np.array([cells_of_all.gathered(each) for each in powers]), cells_of_all.gathered(thinning)
+    powers, keeps_volume = (
+        np.array([cells_of_all.gathered(each) for each in powers]),
+        cells_of_all.gathered(thinning),
+    )
     named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     own = 3 * index.local_range[0], 3 * index.size_local
@@ -103,21 +112,46 @@ def touchings(
         vertices = _vertices(topology, on_planes)
         cells, placed = copies.cells(cells, placed, vertices), copies.placed(placed)
         named = {name: copies.each(inside) for name, inside in named.items()}
-        powers, keeps_volume = np.array([copies.each(each) for each in powers]), copies.each(keeps_volume)
-        kind, own, moved = partial(Mirrored, copies, own), (0, placed.size), lambda: copies.moved(whole(u))
+        powers, keeps_volume = (
+            np.array([copies.each(each) for each in powers]),
+            copies.each(keeps_volume),
+        )
+        kind, own, moved = (
+            partial(Mirrored, copies, own),
+            (0, placed.size),
+            lambda: copies.moved(whole(u)),
+        )
     varies = thickness is not None or keeps_volume.any()
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if varies else None
-    segments = Segments(cells, first + np.arange(count), placed, (degree, element.degree), h, planes)
+    segments = Segments(
+        cells, first + np.arange(count), placed, (degree, element.degree), h, planes
+    )
     shape = Shape(r0, thickness, cells_of_all.nodes, slice(first, first + count))
     made = list[Touching]()
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
 
-        def allowed(i: Longs, j: Longs, one: Inside = one, other: Inside = other) -> NDArray[np.bool_]:
+        def allowed(
+            i: Longs, j: Longs, one: Inside = one, other: Inside = other
+        ) -> NDArray[np.bool_]:
             return np.asarray((one[i] & other[j]) | (other[i] & one[j]))
 
         of_both = np.unique(cells.nodes[one | other])
-        touching = kind(pair, cells, segments, allowed, h, placed, moved, own, local, comm, of_both, shape, faces)
+        touching = kind(
+            pair,
+            cells,
+            segments,
+            allowed,
+            h,
+            placed,
+            moved,
+            own,
+            local,
+            comm,
+            of_both,
+            shape,
+            faces,
+        )
         deep, place = touching.deepest()
         if deep > WITHIN * h:
             where = ", ".join(f"{x:.4g}" for x in place + 0.0)
@@ -130,7 +164,9 @@ def touchings(
 
 def _nodes(V: fem.FunctionSpace, sides: Sequence[NDArray[np.int32]]) -> Longs:
     """Global numbers of the nodes of sides of cells, of all ranks; collective."""
-    local = fem.locate_dofs_topological(V, 1, np.concatenate([*sides, np.empty(0, np.int32)]), remote=False)
+    local = fem.locate_dofs_topological(
+        V, 1, np.concatenate([*sides, np.empty(0, np.int32)]), remote=False
+    )
     numbers = V.dofmap.index_map.local_to_global(local)
     return np.asarray(np.unique(over_ranks(V.mesh.comm, numbers)))
 
@@ -139,5 +175,7 @@ def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Lo
     """Global numbers of the vertices of sides of cells, of all ranks; collective."""
     of_side, of_all = topology.connectivity(1, 0), topology.index_map(0)
     local = [of_side.links(int(side)) for side in np.concatenate(sides)]
-    numbers = of_all.local_to_global(np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32))
+    numbers = of_all.local_to_global(
+        np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32)
+    )
     return np.asarray(np.unique(over_ranks(topology.comm, numbers)))

@@ -1,11 +1,14 @@
-"""What the energy of a contact changes by with its faces' growth, the thickness, and the place that it is drawn at.
+"""What the energy of a contact changes by with its faces' growth, the thickness, and the place that
+it is drawn at.
 
-The gap depends on half the thickness H at nodes, H = V/A with V = (h/2) sum t J0 of the cells around (see `faces`), and
-on the places r0 + u; the energy is a sum over points with the weights J0(X). So of e Pi + f w . Pi,u the derivative is
+The gap depends on half the thickness H at nodes, H = V/A with V = (h/2) sum t J0 of the cells
+around (see `faces`), and on the places r0 + u; the energy is a sum over points with the weights
+J0(X). So of e Pi + f w . Pi,u the derivative is
 
     by t:  (h/2) J0 g_V,    g_V = g/A + f Pi,H (H,u w)/V,    g = e Pi,H + f (Pi,Hu w + Pi,HH H,u w),
 
-and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay in their cells.
+and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay
+in their cells.
 """
 
 from collections.abc import Callable, Sequence
@@ -114,7 +117,8 @@ class Present:
         Parameters
         ----------
         tables, places
-            Shape functions at points with their derivatives (3, n, functions), and so the places (3, n, 3).
+            Shape functions at points with their derivatives (3, n, functions), and so the places
+            (3, n, 3).
         """
         n = np.cross(*places[1:])
         n = n / np.sum(n * n, axis=1)[:, None]
@@ -126,7 +130,9 @@ class Present:
         _, n, beta, nodes = self.geometry(self.places)
         moved = self.moved(w)
         moves = -np.einsum("nki,nki->n", slope_of(n, beta, moved.shape[1]), moved[nodes])
-        return np.bincount(self.joined.group, self.joined.weight * moves, len(self.joined.first)).astype(float)
+        return np.bincount(
+            self.joined.group, self.joined.weight * moves, len(self.joined.first)
+        ).astype(float)
 
 
 @dataclass(frozen=True)
@@ -142,7 +148,9 @@ class ByGrowth:
         """On this rank's part."""
         now = self.of()
         forces, growth = now.forces[:, -1], now.of_faces.by_growth(now.u, self.order)
-        of_forces = float(_grown(now)[:, -1] @ now.of_faces.by_growth(now.u)) if self.order == 2 else 0.0
+        of_forces = (
+            float(_grown(now)[:, -1] @ now.of_faces.by_growth(now.u)) if self.order == 2 else 0.0
+        )
         return of_forces + float(forces @ growth)
 
     def add_residual(self, b: Array, factor: float) -> None:
@@ -152,7 +160,9 @@ class ByGrowth:
         self.add(b, factor * forces)
 
 
-def with_growth(grows: Parameter, of: Callable[[], Present], add: Callable[[Array, Array], None]) -> Parameter:
+def with_growth(
+    grows: Parameter, of: Callable[[], Present], add: Callable[[Array, Array], None]
+) -> Parameter:
     """A parameter with the derivatives of a contact by it among its own."""
 
     def twice(q: object) -> Sequence[Derivative]:
@@ -205,7 +215,9 @@ def _by_weights(now: Present, of: Weights) -> Array:
         return forces
     value, first, _ = now.pressed
     points, point = now.points, now.places.point[now.joined.first]
-    per_weight = np.bincount(point, (of.energy * value + of.force * first * now.deeper(of.w)) / 2, len(points.cell))
+    per_weight = np.bincount(
+        point, (of.energy * value + of.force * first * now.deeper(of.w)) / 2, len(points.cell)
+    )
     some = np.unique(point)
     element, nodes = now.cells.element, now.cells.nodes[points.cell[some]]
     tables = element.tabulate(1, points.shape[some] @ element.points)[..., 0]

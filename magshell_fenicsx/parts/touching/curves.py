@@ -1,6 +1,7 @@
 """Points on meridians, and the places of other meridians that are nearest to them.
 
-Places have rho, z, and half the thickness less h/2, of points with the other sign: see `nearest` and `on_meridian`.
+Places have rho, z, and half the thickness less h/2, of points with the other sign: see `nearest`
+and `on_meridian`.
 """
 
 from dataclasses import dataclass, fields
@@ -16,12 +17,19 @@ from magshell_fenicsx.parts.touching.rules import BEFORE, rule_on_line
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Inside = NDArray[np.bool_]
-ROUNDS, EXACT = 30, 1e-10  # Newton's steps at most; after a smaller one, in the cell, the place is exact
+ROUNDS, EXACT = (
+    30,
+    1e-10,
+)  # Newton's steps at most; after a smaller one, in the cell, the place is exact
 FLAT = 1e-3  # of the square of the speed: below it the step takes that
-START = 4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
+START = (
+    4  # parts of a cell, from whose ends the search for the nearest place begins, for each degree
+)
 SAME = 1e-9  # of h: places of two cells at the same distance are one
 SIGNS = np.array([1.0, 1.0, -1.0])  # of the squares of components in A
-BELOW = 0.5  # the sine of an angle between a curve and the way from a place to a point that is above it
+BELOW = (
+    0.5  # the sine of an angle between a curve and the way from a place to a point that is above it
+)
 
 
 @dataclass(frozen=True)
@@ -90,8 +98,8 @@ class Around:
     Parameters
     ----------
     points, cells
-        Undeformed places of the points (n, 3) and of the nodes of all cells (cells, functions, 3), the last component
-        half the thickness, of points with the other sign.
+        Undeformed places of the points (n, 3) and of the nodes of all cells (cells, functions, 3),
+        the last component half the thickness, of points with the other sign.
     nodes
         (cells, functions) of all cells, the ends first.
     of
@@ -115,12 +123,17 @@ class Around:
         fits = ~self._near[cell, other]
         near = np.flatnonzero(~fits & (cell != other))
         i, j = cell[near], other[near]
-        now, way = (np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3) for r in (nodal, self._cells[..., :2]))
+        now, way = (
+            np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3)
+            for r in (nodal, self._cells[..., :2])
+        )
         fits[near] = (now < SHRUNK * way).any(axis=(1, 2))
         return fits
 
     def apart(self, at: "Faced", shape: Array, above: Inside) -> Inside:
-        """Which places count: those far along the curve, or else far undeformed and above or below their points."""
+        """Which places count: those far along the curve, or else far undeformed and above or below
+        their points.
+        """
         near = self.near(self.of[at.point], at.cell)
         off = self._points[at.point] - np.einsum("nk,nki->ni", shape, self._cells[at.cell])
         away = np.linalg.norm(off[:, :2], axis=1) > BESIDE * np.abs(off[:, 2])
@@ -128,7 +141,8 @@ class Around:
 
 
 class Close:
-    """Which cells of the other shell points may be near to: from circles about cells, then from chords.
+    """Which cells of the other shell points may be near to: from circles about cells, then from
+    chords.
 
     Parameters
     ----------
@@ -143,7 +157,12 @@ class Close:
     """
 
     def __init__(
-        self, rule: Rule, nodes: Longs, sides: tuple[Inside, Inside], element: Any, around: Around | None
+        self,
+        rule: Rule,
+        nodes: Longs,
+        sides: tuple[Inside, Inside],
+        element: Any,
+        around: Around | None,
     ) -> None:
         self._one, self._other = (np.flatnonzero(side) for side in sides)
         self._around = around
@@ -152,7 +171,9 @@ class Close:
         self._starts[rule.cell[::-1]] = np.arange(len(rule.cell))[::-1]
         at = np.linspace(0.0, 1.0, 20 * element.degree + 1, dtype=np.float64)[:, None]
         inner = np.abs(element.tabulate(0, at)[0, :, 2:, 0])
-        self._bulge = BULGE * float(inner.sum(axis=1).max(initial=0.0))  # of a curve, over that of its nodes
+        self._bulge = BULGE * float(
+            inner.sum(axis=1).max(initial=0.0)
+        )  # of a curve, over that of its nodes
         self._part = element.points[2:, :1]
 
     def __call__(self, x: Array, nodal: Array, reach: float) -> tuple[Longs, Longs]:
@@ -177,7 +198,9 @@ class Close:
         one, other, centres = self._one, self._other, nodal.mean(axis=1)
         radii = BULGE * np.sqrt(np.sum((nodal - centres[:, None]) ** 2, axis=2).max(axis=1))
         way = centres[one][:, None] - centres[other]
-        i, j = np.nonzero(np.sum(way * way, axis=2) < (radii[one][:, None] + radii[other] + reach) ** 2)
+        i, j = np.nonzero(
+            np.sum(way * way, axis=2) < (radii[one][:, None] + radii[other] + reach) ** 2
+        )
         of, cell = one[i], other[j]
         if self._around:
             fits = self._around.fits(of, cell, nodal)
@@ -240,7 +263,9 @@ class Curves:
         self.beside = beside(nodes)
         self._start = np.linspace(0.0, 1.0, START * element.degree + 1, dtype=np.float64)
         self.at_nodes = self.table(1, element.points.ravel())[1]
-        self.lebesgue = BETWEEN_PLACES * float(np.abs(self.table(0, self._start)[0]).sum(axis=1).max())
+        self.lebesgue = BETWEEN_PLACES * float(
+            np.abs(self.table(0, self._start)[0]).sum(axis=1).max()
+        )
 
     def table(self, order: int, X: Array) -> Array:
         """Shape functions and derivatives (order + 1, n, functions); basix takes no empty X."""
@@ -269,7 +294,9 @@ class Curves:
             normal = np.stack([-along[..., 1], along[..., 0]], axis=-1) / speed[..., None]
             on_edge = np.tile((X < 2 * BEFORE) & begins | (X > 1 - 2 * BEFORE) & last, len(cells))
             cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
-            parts.append((cell, shape, area.ravel(), sides[0][cell], normal.reshape(-1, 2), on_edge))
+            parts.append(
+                (cell, shape, area.ravel(), sides[0][cell], normal.reshape(-1, 2), on_edge)
+            )
         return Rule(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def projected(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> Faced:
@@ -292,7 +319,9 @@ class Curves:
         return Faced(point, cell, X, free, distances(x[point] - jets[0]))
 
     def nearest(self, at: Faced, x: Array, nodal: Array, around: Around | None) -> Faced:
-        """Of all places those from which the curve goes on to no nearer one, one on each side of a point."""
+        """Of all places those from which the curve goes on to no nearer one, one on each side of a
+        point.
+        """
         number = len(self.nodes)
         at = at.of(np.argsort(at.point * number + at.cell))
         above: Inside = np.ones(len(at.point), dtype=bool)
@@ -304,7 +333,9 @@ class Curves:
         stays: Inside = np.ones(len(keys), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
             beyond = self.beside[at.cell, end]
-            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            there = np.minimum(
+                np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0)
+            )
             listed = keys[there] == at.point * number + beyond
             nearer = listed & (at.distance[there] < at.distance - SAME * self._h)
             folded = above & around.near(around.of[at.point], beyond) if around else False
@@ -325,11 +356,15 @@ class Curves:
         return at.of(chosen)
 
     def _above(self, at: Faced, x: Array, nodal: Array) -> Inside:
-        """Whether points are above or below their places, and not beside them as in one curve that is straight."""
+        """Whether points are above or below their places, and not beside them as in one curve that
+        is straight.
+        """
         y, along, _ = self.jets(at.X, nodal[at.cell])[..., :2]
         way = x[at.point, :2] - y
         high = np.abs(way[:, 0] * along[:, 1] - way[:, 1] * along[:, 0])
-        return np.asarray(high > BELOW * np.linalg.norm(way, axis=1) * np.linalg.norm(along, axis=1))
+        return np.asarray(
+            high > BELOW * np.linalg.norm(way, axis=1) * np.linalg.norm(along, axis=1)
+        )
 
     def cell_normals(self) -> Array:
         """(cells, 2) undeformed, of the straight lines between the ends."""

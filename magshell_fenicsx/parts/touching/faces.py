@@ -1,12 +1,14 @@
-"""How far faces are from a mid-surface whose thickness varies or changes: half of it, continuous from cell to cell.
+"""How far faces are from a mid-surface whose thickness varies or changes: half of it, continuous
+from cell to cell.
 
-At each node it is the undeformed volume per deformed area of the cells around, and between nodes their polynomial:
+At each node it is the undeformed volume per deformed area of the cells around, and between nodes
+their polynomial:
 
     H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell gets thinner as it stretches, J0 where it does not,
 
-with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has grown V is the
-natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by the displacement and by this are
-exact.
+with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has
+grown V is the natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by
+the displacement and by this are exact.
 """
 
 from dataclasses import dataclass
@@ -19,7 +21,15 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.coupled import Entries
 from magshell_fenicsx.assembly.parameters import Settable
-from magshell_fenicsx.parts.touching.nearest import SIGNS, Cells, Longs, Places, inverse, jets, slopes
+from magshell_fenicsx.parts.touching.nearest import (
+    SIGNS,
+    Cells,
+    Longs,
+    Places,
+    inverse,
+    jets,
+    slopes,
+)
 from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
@@ -68,10 +78,11 @@ class Faces:
     h
         Thickness over R.
     thickness, thins
-        (n, cells, functions) coefficients, by powers of the amplitude, of what multiplies it at the nodes of each cell,
-        and (cells,) whether it follows from the area.
+        (n, cells, functions) coefficients, by powers of the amplitude, of what multiplies it at the
+        nodes of each cell, and (cells,) whether it follows from the area.
     same
-        (nodes,) for each node the first of those at its place: images share what is on their planes.
+        (nodes,) for each node the first of those at its place: images share what is on their
+        planes.
     grown
         The amplitude; None without.
 
@@ -130,7 +141,9 @@ class Faces:
     def jacobian(self, u: Array, which: NDArray[np.bool_]) -> Any:
         """The sparse derivative (nodes, 3 nodes) of H at some nodes."""
         area = self._area(u)
-        return scipy.sparse.diags_array(np.where(which, -self._volume() / area**2, 0.0)) @ self._slopes(u, which)
+        return scipy.sparse.diags_array(
+            np.where(which, -self._volume() / area**2, 0.0)
+        ) @ self._slopes(u, which)
 
     def change(self, u: Array, w: Array) -> Array:
         """What H (nodes,) changes by along w (nodes, 3)."""
@@ -149,8 +162,12 @@ class Faces:
         return np.asarray(at_places * per_factor * self._areas(self._r0, slice(None)))
 
     def by_area(self, by_volume: Array, by_area: Array) -> Array:
-        """Those (nodes, 3) by the undeformed place, as far as volumes and areas that stay depend on it alone."""
-        of_volume, of_area = (np.bincount(self._same, f, len(f))[self._places] for f in (by_volume, by_area))
+        """Those (nodes, 3) by the undeformed place, as far as volumes and areas that stay depend on
+        it alone.
+        """
+        of_volume, of_area = (
+            np.bincount(self._same, f, len(f))[self._places] for f in (by_volume, by_area)
+        )
         h_t = np.polynomial.polynomial.polyval(self.value, self._per_factor) * self._thickness
         by_J0 = of_volume * h_t + of_area * ~self._thins[:, None]
         some = np.flatnonzero((by_J0 != 0).any(axis=1))
@@ -169,10 +186,17 @@ class Faces:
         some, area, by = self._around(f != 0), self._area(u), self._slopes(u, f != 0)
         weight = -f * self._volume() / area**2
         whole = by.T @ scipy.sparse.diags_array(-2 * weight / area) @ by
-        H = self._bends(u, some, np.bincount(self._same, weight, len(weight)).astype(float)[self._places[some]])
+        H = self._bends(
+            u, some, np.bincount(self._same, weight, len(weight)).astype(float)[self._places[some]]
+        )
         dofs = self._unknowns(some)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
-        return whole + scipy.sparse.coo_array((H.ravel(), (rows.ravel(), columns.ravel())), whole.shape).tocsr()
+        return (
+            whole
+            + scipy.sparse.coo_array(
+                (H.ravel(), (rows.ravel(), columns.ravel())), whole.shape
+            ).tocsr()
+        )
 
     def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
         """Those of a second derivative by the displacement, of one by the displacement and H.
@@ -190,7 +214,9 @@ class Faces:
             return rows[of_places], columns[of_places], values[of_places]
         which = np.zeros(size, dtype=bool)
         which[rows] = True
-        by_u = scipy.sparse.vstack([scipy.sparse.eye_array(count), self.jacobian(u, which[count:])]).tocsr()
+        by_u = scipy.sparse.vstack(
+            [scipy.sparse.eye_array(count), self.jacobian(u, which[count:])]
+        ).tocsr()
         K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
         i, j, v = scipy.sparse.find(by_u.T @ K @ by_u + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
@@ -201,11 +227,19 @@ class Faces:
             return rows, columns
         nodes, count = self._places, len(self._r0)
         has = np.repeat(np.arange(len(nodes)), nodes.shape[1])
-        cells = scipy.sparse.coo_array((np.ones(nodes.size), (has, nodes.ravel())), (len(nodes), count)).tocsr()
-        moves = scipy.sparse.coo_array((np.ones(nodes.size), (has, self._cells.nodes.ravel())), cells.shape).tocsr()
-        of_places = scipy.sparse.coo_array((np.ones(count), (np.arange(count), self._same)), (count, count)).tocsr()
+        cells = scipy.sparse.coo_array(
+            (np.ones(nodes.size), (has, nodes.ravel())), (len(nodes), count)
+        ).tocsr()
+        moves = scipy.sparse.coo_array(
+            (np.ones(nodes.size), (has, self._cells.nodes.ravel())), cells.shape
+        ).tocsr()
+        of_places = scipy.sparse.coo_array(
+            (np.ones(count), (np.arange(count), self._same)), (count, count)
+        ).tocsr()
         by = scipy.sparse.eye_array(count) + of_places @ cells.T @ moves
-        acting = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
+        acting = scipy.sparse.coo_array(
+            (np.ones(len(rows)), (rows, columns)), (count, count)
+        ).tocsr()
         i, j = (by.T @ acting @ by).nonzero()
         return i.astype(np.int64), j.astype(np.int64)
 
@@ -233,7 +267,9 @@ class Faces:
         slope, places = self._area_slopes(u, some), self._places[some]
         rows, columns = np.broadcast_arrays(places[:, :, None], self._unknowns(some)[:, None, :])
         size = len(self._r0), self._parts * len(self._r0)
-        return scipy.sparse.coo_array((slope.ravel(), (rows.ravel(), columns.ravel())), size).tocsr()[self._same]
+        return scipy.sparse.coo_array(
+            (slope.ravel(), (rows.ravel(), columns.ravel())), size
+        ).tocsr()[self._same]
 
     def _unknowns(self, some: Longs) -> Longs:
         """Numbers of those of the displacement in some cells."""
@@ -286,10 +322,14 @@ def unknowns(nodes: Longs, count: int, parts: int = 3, dim: int = 3) -> Longs:
 
 
 def slope_of(n: Array, beta: Array, parts: int) -> Array:
-    """The derivative (n, functions, parts) of distances along n (n, 3) by the unknowns, with beta of `touching`."""
+    """The derivative (n, functions, parts) of distances along n (n, 3) by the unknowns, with beta
+    of `touching`.
+    """
     half = beta.shape[1] // 2
     thicker = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
-    return np.asarray(np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts])
+    return np.asarray(
+        np.concatenate([beta[:, :, None] * n[:, None, :], thicker[..., None]], axis=2)[..., :parts]
+    )
 
 
 def hessians(
@@ -327,7 +367,11 @@ def hessians(
     rows = [slope_of(n, beta, parts)[:, None], (beta[:, :, None] * normal)[:, None], C]
     left = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
     middle = np.zeros((len(d), 4, 4))
-    middle[:, 0, 0], middle[:, 1, 1], middle[:, 2:, 2:] = weight * second, bent, bent[:, None, None] * M
+    middle[:, 0, 0], middle[:, 1, 1], middle[:, 2:, 2:] = (
+        weight * second,
+        bent,
+        bent[:, None, None] * M,
+    )
     H = left.transpose(0, 2, 1) @ (middle @ left)
     both = bent[:, None, None] * beta[:, :, None] * beta[:, None, :]
     for i in range(3):
@@ -346,8 +390,8 @@ def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int
     Parameters
     ----------
     slopes, nodes, group
-        Of all places: the weighted derivative (n, functions, parts) of the distance by the nodes (n, functions) of
-        `count`, and the joined one (n,) that it belongs to.
+        Of all places: the weighted derivative (n, functions, parts) of the distance by the nodes
+        (n, functions) of `count`, and the joined one (n,) that it belongs to.
     weight
         Of each joined one.
     """
@@ -359,8 +403,12 @@ def between(slopes: Array, nodes: Longs, group: Longs, weight: Array, count: int
     return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
 
 
-def geometry(cells: Cells, points: Points, r: Array, at: Places) -> tuple[Array, Array, Array, Longs]:
-    """Distances, normals, and beta (n, functions of both cells) with its nodes, where all nodes are at r."""
+def geometry(
+    cells: Cells, points: Points, r: Array, at: Places
+) -> tuple[Array, Array, Array, Longs]:
+    """Distances, normals, and beta (n, functions of both cells) with its nodes, where all nodes are
+    at r.
+    """
     nodes = np.concatenate([cells.nodes[points.cell[at.point]], cells.nodes[at.cell]], axis=1)
     half, N = nodes.shape[1] // 2, points.shape[at.point]
     (shape, y), *_ = jets(cells.element, at.X, r[nodes[:, half:]], 0)

@@ -1,6 +1,7 @@
 """Which places of other cells the points of a surface face, at a displacement.
 
-A tree gives the cells that are near, which are kept while nodes move little; Newton's method the nearest place of each.
+A tree gives the cells that are near, which are kept while nodes move little; Newton's method the
+nearest place of each.
 """
 
 from collections.abc import Callable
@@ -35,14 +36,21 @@ from magshell_fenicsx.parts.touching.segments import Points
 
 Array = NDArray[np.float64]
 Inside = NDArray[np.bool_]
-MARGIN = 0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
+MARGIN = (
+    0.5  # of the cells' mean radius: nodes that move less keep the pairs of cells that are near
+)
 MANY = 2_000_000  # distances of a point from a place at a time
-BLUR = 1e-6  # of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
+# of the thickness: distances that differ by less belong to one place, see `nearest.Joined`
+BLUR = 1e-6
 ALIKE = 0.5  # the cosine between the ways to places that are one: folds between cells are smaller
-SHRUNK = 0.9  # of the way between corners of cells beside each other, less than which they are apart where these fold
+# of the way between corners of cells beside each other, less than which they are apart where these
+# fold
+SHRUNK = 0.9
 STEEP = 0.87  # the cosine of an angle between cells at which an edge is no part of a face any more
 NEARER_FIRST = 0.3, 0.5  # of a reach: whether a place is so near is asked first, which costs less
-SAME = 40 * BLUR  # of the thickness: a place that is farther than another by more than this does not count
+SAME = (
+    40 * BLUR
+)  # of the thickness: a place that is farther than another by more than this does not count
 
 
 class Facing:
@@ -59,7 +67,8 @@ class Facing:
     r0
         (nodes, 3) undeformed.
     faces
-        How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
+        How far they are from the mid-surface where the thickness varies, or changes with the state;
+        None where it is h.
     """
 
     def __init__(
@@ -74,7 +83,9 @@ class Facing:
     ) -> None:
         self._cells, self._rule, self._allowed, self._h = cells, rule, allowed, h
         self._r0, self._faces, self._comm = r0, faces, comm
-        self.half: Array = faces.undeformed if faces else np.full(len(r0), h / 2)  # undeformed, at all nodes
+        self.half: Array = (
+            faces.undeformed if faces else np.full(len(r0), h / 2)
+        )  # undeformed, at all nodes
         self._thickest = 2 * highest(self.half[cells.nodes], cells.lebesgue)
         self._beside = cells.near_in_surface(r0, 2 * BESIDE * self.half)
         self._undeformed = np.column_stack([r0, self.half])
@@ -86,20 +97,26 @@ class Facing:
         """All nodes, with what half the thickness is more than h/2 as a fourth component if it is another one; see
         `nearest`."""
         r = self._r0 + u
-        return np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
+        return (
+            np.column_stack([r, self._faces.half(u) - self._h / 2]) if faces and self._faces else r
+        )
 
     def x_of(self, points: Points, r: Array, which: Any = slice(None)) -> Array:
         """The places of some points."""
         return places_of(self._cells, r, points.cell[which], points.shape[which])
 
     def near_on_way(self, u: Array, v: Array) -> bool:
-        """Whether any cells that may touch come near each other between two displacements; collective."""
+        """Whether any cells that may touch come near each other between two displacements;
+        collective.
+        """
         both = [self._spheres(self._r0 + each) for each in (u, v)]
         centres = (both[0][0] + both[1][0]) / 2
         apart = np.linalg.norm(both[1][0] - both[0][0], axis=1) / 2
         radii = np.maximum(both[0][1], both[1][1]) + apart
         far = self._thickest
-        near = self._fit(*near_pairs(centres, radii, far, self._own_cells), far, self._r0 + u, self._r0 + v)
+        near = self._fit(
+            *near_pairs(centres, radii, far, self._own_cells), far, self._r0 + u, self._r0 + v
+        )
         return bool(self._comm.allreduce(len(near[0])))
 
     def _spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -109,7 +126,9 @@ class Facing:
         return centres, BULGE * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
 
     def _fit(self, i: Longs, j: Longs, far: float = 0.0, *displaced: Array) -> tuple[Longs, Longs]:
-        """The pairs of cells that may touch; of those beside each other where one of some surfaces is folded."""
+        """The pairs of cells that may touch; of those beside each other where one of some surfaces
+        is folded.
+        """
         allowed = self._allowed(i, j)
         i, j = i[allowed], j[allowed]
         fits = ~self._is_beside(i * len(self._cells.nodes) + j)
@@ -124,7 +143,9 @@ class Facing:
         return np.asarray(self._beside[at] == keys)
 
     def _folded(self, i: Longs, j: Longs, r: Array, far: float) -> Inside:
-        """Whether places of cells (n,) may be nearer than `far` to those of others that are not near in the surface."""
+        """Whether places of cells (n,) may be nearer than `far` to those of others that are not
+        near in the surface.
+        """
         found, nodes = np.zeros(len(i), dtype=bool), self._cells.nodes
         (_, radii), (_, wide) = self._spheres(r), self._spheres(self._r0)
         for some in np.array_split(np.arange(len(i)), 1 + len(i) * nodes.shape[1] ** 2 // MANY):
@@ -145,7 +166,9 @@ class Facing:
         return found
 
     def _near_cells(self, u: Array, reach: float) -> tuple[Longs, Longs]:
-        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes move little."""
+        """Pairs of a cell with points of this rank and any cell near by; they are kept while nodes
+        move little.
+        """
         if reach in self._tracked:
             then, margin, pairs = self._tracked[reach]
             moved = 2 * float(np.linalg.norm(u - then, axis=1).max(initial=0.0))
@@ -153,14 +176,18 @@ class Facing:
                 return pairs
         centres, radii = self._spheres(self._r0 + u)
         margin = reach + MARGIN * float(radii.mean())
-        pairs = self._fit(*near_pairs(centres, radii, margin, self._own_cells), margin, self._r0 + u)
+        pairs = self._fit(
+            *near_pairs(centres, radii, margin, self._own_cells), margin, self._r0 + u
+        )
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
     def held_gap(self, held: Longs, u: Array) -> float:
-        """The least one, over R, between faces at nodes that supports hold, at a displacement of all nodes.
+        """The least one, over R, between faces at nodes that supports hold, at a displacement of
+        all nodes.
 
-        Of those that may touch and are no neighbours undeformed; infinite without, or if the shell thins.
+        Of those that may touch and are no neighbours undeformed; infinite without, or if the shell
+        thins.
         """
         if self._faces and not self._faces.constant:
             return np.inf
@@ -172,13 +199,21 @@ class Facing:
         return between_held(held, self._cells.nodes, self._r0, u, self.half, may)
 
     def found(
-        self, u: Array, reach: float, points: Points | None = None, *, faces: bool = True, least: bool = False
+        self,
+        u: Array,
+        reach: float,
+        points: Points | None = None,
+        *,
+        faces: bool = True,
+        least: bool = False,
     ) -> Places:
         """The places that points, those of the rule if none are given, face at a displacement,
         within a distance of faces or mid-surfaces; with `least` those of each point's least
         distance, and some others."""
         points = points or self._rule
-        return self._facing(points, self.places_in(points, u, self.placed(u, faces=faces), reach, least=least))
+        return self._facing(
+            points, self.places_in(points, u, self.placed(u, faces=faces), reach, least=least)
+        )
 
     def least_distance(self, u: Array, far: float, points: Points | None = None) -> float:
         """The least distance of any point at a displacement; `far` if none is nearer.
@@ -204,14 +239,19 @@ class Facing:
         count, number = scipy.sparse.csgraph.connected_components(joined, directed=False)
         sizes, (_, first) = np.bincount(number), np.unique(number, return_index=True)
         faced = np.array(
-            [np.bincount(number[self._allowed(np.full(n, i), np.arange(n))], minlength=count) for i in first]
+            [
+                np.bincount(number[self._allowed(np.full(n, i), np.arange(n))], minlength=count)
+                for i in first
+            ]
         )
         near = np.zeros((count, count), dtype=bool)
         near[number[self._beside // n], number[self._beside % n]] = True
         alike = faced == sizes
         return number, alike & alike.T & ~near & ~np.eye(count, dtype=bool)
 
-    def _limits(self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float) -> Limits:
+    def _limits(
+        self, asked: Longs, x: Array, r: Array, pairs: tuple[Longs, Longs], cell: Longs, most: float
+    ) -> Limits:
         """How far the nearest place of a surface that is apart is at most: its nearest node within
         `most` is one.
 
@@ -227,16 +267,25 @@ class Facing:
         near = np.zeros(len(self._cells.nodes), dtype=bool)
         near[pairs[1]] = True
         for each in np.unique(surface):
-            nodes, mine = np.unique(self._cells.nodes[near & apart[each][number]]), asked[surface == each]
+            nodes, mine = (
+                np.unique(self._cells.nodes[near & apart[each][number]]),
+                asked[surface == each],
+            )
             if len(nodes):
-                away, _ = scipy.spatial.cKDTree(r[nodes, :3]).query(x[mine, :3], distance_upper_bound=most)
+                away, _ = scipy.spatial.cKDTree(r[nodes, :3]).query(
+                    x[mine, :3], distance_upper_bound=most
+                )
                 reach[mine] = away + varies + 2 * SAME * self._h
         return Limits(apart[number[pairs[0]], number[pairs[1]]], reach)
 
-    def places_in(self, points: Points, u: Array, r: Array, reach: float, *, least: bool = False) -> Places:
+    def places_in(
+        self, points: Points, u: Array, r: Array, reach: float, *, least: bool = False
+    ) -> Places:
         """The places of all cells nearest to points, within a distance at a displacement; r as of
         `placed`."""
-        thicker = highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
+        thicker = (
+            highest(r[:, 3][self._cells.nodes], self._cells.lebesgue) if r.shape[1] > 3 else 0.0
+        )
         of_faces, reach = reach, reach + 2 * thicker
         i, j = self._near_cells(u, reach)
         order, cell_of = points.by_cell
@@ -250,7 +299,9 @@ class Facing:
         near = self._is_beside(i * len(self._cells.nodes) + j)
         undeformed = Undeformed(near, self._undeformed, self._known[1], BESIDE)
         limits = self._limits(asked, x, r, (i, j), points.cell[asked], reach) if least else None
-        return places_near(self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed, limits)[1]
+        return places_near(
+            self._cells, r, x, (j, first, number, order), reach, of_faces, undeformed, limits
+        )[1]
 
     def of_far_cells(self, points: Points, at: Places) -> Places:
         """Those in cells that are not near in the surface: others are not cut along each other."""
@@ -258,8 +309,12 @@ class Facing:
 
     def thickness(self, points: Points, at: Places) -> Array:
         """The mean undeformed thickness (n,) at points and their places, over R."""
-        (_, there), *_ = jets(self._cells.element, at.X, self.half[self._cells.nodes[at.cell]][..., None], 0)
-        here = np.sum(points.shape[at.point] * self.half[self._cells.nodes[points.cell[at.point]]], axis=1)
+        (_, there), *_ = jets(
+            self._cells.element, at.X, self.half[self._cells.nodes[at.cell]][..., None], 0
+        )
+        here = np.sum(
+            points.shape[at.point] * self.half[self._cells.nodes[points.cell[at.point]]], axis=1
+        )
         return np.asarray(here + there[:, 0])
 
     def _facing(self, points: Points, at: Places) -> Places:
@@ -275,10 +330,14 @@ class Facing:
         for side in range(3):
             beyond = cells.across[at.cell, side]
             asked = on[:, side] & (beyond >= 0)
-            there = np.minimum(np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0))
+            there = np.minimum(
+                np.searchsorted(keys, at.point * number + beyond), max(len(keys) - 1, 0)
+            )
             listed = keys[there] == at.point * number + beyond
             nearer = at.distance[there] < at.distance - SAME * self._h
-            folded = at.above & self._is_beside(beside + beyond)  # what goes on there is not looked at
+            folded = at.above & self._is_beside(
+                beside + beyond
+            )  # what goes on there is not looked at
             stays &= ~asked | (listed & ~nearer) | folded
         at = at.of(stays)
         if not len(at.point):
@@ -299,10 +358,12 @@ class Facing:
         return at.of(at.distance < least + SAME * self._h)
 
     def left_to_edges(self, points: Points, at: Places, normals: Array) -> Inside:
-        """Which places (n,) do not count: those of points inside a surface that face an edge of another one, steeply.
+        """Which places (n,) do not count: those of points inside a surface that face an edge of
+        another one, steeply.
 
-        The edge's own points are there too. Those of the face see a line, which is narrower than they are apart: it
-        would be held back where it slides over one of them. Places of one point and direction are as the nearest.
+        The edge's own points are there too. Those of the face see a line, which is narrower than
+        they are apart: it would be held back where it slides over one of them. Places of one point
+        and direction are as the nearest.
 
         Parameters
         ----------
@@ -315,23 +376,34 @@ class Facing:
         return np.asarray(np.repeat(left, np.diff([*first, len(at.point)])))
 
     def press_alone(self, points: Points, nearest: Places, normals: Array) -> Inside:
-        """Which points, given with their nearest places, press on a face whose own points are left to this edge."""
+        """Which points, given with their nearest places, press on a face whose own points are left
+        to this edge.
+        """
         on_edge, steep = self._at_edges(points, nearest, normals)
         return np.asarray(steep & ~on_edge)
 
     def _at_edges(self, points: Points, nearest: Places, normals: Array) -> tuple[Inside, Inside]:
-        """Which nearest places are on an edge, and which are in a cell that is steep to their point's."""
+        """Which nearest places are on an edge, and which are in a cell that is steep to their
+        point's.
+        """
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         along = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
         on_edge = along & (on_side & (self._cells.across[nearest.cell] < 0)).any(axis=1)
-        in_corner = on_side.sum(axis=1) == 2  # where an edge goes on from one cell to another, or turns
+        in_corner = (
+            on_side.sum(axis=1) == 2
+        )  # where an edge goes on from one cell to another, or turns
         on_edge |= in_corner & (~on_side & self._cells.on_edge[nearest.cell]).any(axis=1)
         level = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
         return np.asarray(on_edge), np.asarray(level < STEEP)
 
 
 def between_held(
-    held: Longs, nodes: Longs, r0: Array, u: Array, half: Array, may: Callable[[Longs, Longs], Inside]
+    held: Longs,
+    nodes: Longs,
+    r0: Array,
+    u: Array,
+    half: Array,
+    may: Callable[[Longs, Longs], Inside],
 ) -> float:
     """The least gap between faces at some nodes at a displacement, see `Facing.held_gap`.
 
@@ -344,7 +416,12 @@ def between_held(
     """
     cell_of = np.zeros(len(r0), dtype=np.int64)
     cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
-    cells, before, after, thickness = cell_of[held], r0[held], (r0 + u)[held], half[held][:, None] + half[held]
+    cells, before, after, thickness = (
+        cell_of[held],
+        r0[held],
+        (r0 + u)[held],
+        half[held][:, None] + half[held],
+    )
     i, j = np.nonzero(scipy.spatial.distance.cdist(before, before) > (1 - SAME) * thickness)
     near = np.linalg.norm(after[i] - after[j], axis=1) - thickness[i, j]
     counts = near < 0
@@ -354,5 +431,8 @@ def between_held(
 
 def nowhere() -> Places:
     """No places."""
-    nothing, (X, free, distance, way) = np.zeros(0, dtype=np.int64), (np.zeros((0, *each)) for each in SHAPES)
+    nothing, (X, free, distance, way) = (
+        np.zeros(0, dtype=np.int64),
+        (np.zeros((0, *each)) for each in SHAPES),
+    )
     return Places(nothing, nothing, X, free, distance, nothing, way, nothing > 0)

@@ -1,9 +1,11 @@
-"""The force of a contact between shells in a step in time: its mean along the straight way between two displacements.
+"""The force of a contact between shells in a step in time: its mean along the straight way between
+two displacements.
 
-Contact sets in and ceases within a step, so that its force at one place of the step would create energy. The force of a
-point, and its derivative, are those of Simpson's rule along the way. Where that passes a kink of the penalty, factors
-give the point's force the work that its energy changes by, and its derivative that of this quotient: for one place in a
-straight motion these are the mean pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
+Contact sets in and ceases within a step, so that its force at one place of the step would create
+energy. The force of a point, and its derivative, are those of Simpson's rule along the way. Where
+that passes a kink of the penalty, factors give the point's force the work that its energy changes
+by, and its derivative that of this quotient: for one place in a straight motion these are the mean
+pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,7 +48,9 @@ class Look:
     second: Array | None = None
     slope: Array | None = None
 
-    def of(self, point: NDArray[np.int64], penalty: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def of(
+        self, point: NDArray[np.int64], penalty: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Array]:
         """The penalty of places of points with its derivatives, as they count."""
         if self.first is None or self.second is None:
             return penalty
@@ -72,8 +76,12 @@ class Along:
     piece: Array
 
     @classmethod
-    def of(cls, count: int, point: NDArray[np.int64], deep: Array, moves: Array, k: float, soft: float) -> "Along":
-        """Of places of some of `count` points with penetrations, which grow by `moves` along the whole way."""
+    def of(
+        cls, count: int, point: NDArray[np.int64], deep: Array, moves: Array, k: float, soft: float
+    ) -> "Along":
+        """Of places of some of `count` points with penetrations, which grow by `moves` along the
+        whole way.
+        """
         value, first, second = penalty(deep, k, soft)
         moves = np.where(np.abs(moves) > ROUNDING * soft, moves, 0.0)
         each = value, first * moves, second * moves**2, np.digitize(deep, (0.0, soft)).astype(float)
@@ -90,7 +98,9 @@ class Kept(Generic[Of]):
         """What is found at a place, a sequence of arrays and numbers."""
         for i, (place, found) in enumerate(self._found):
             if all(map(np.array_equal, place, at)):
-                self._found.append(self._found.pop(i))  # the begin of a step is there at each iteration
+                self._found.append(
+                    self._found.pop(i)
+                )  # the begin of a step is there at each iteration
                 return found
         new = find()
         self._found = [*self._found[1 - len(SIMPSON) :], ([np.array(each) for each in at], new)]
@@ -127,7 +137,8 @@ class InSteps(Protocol):
 
 
 def looks_of_step(contact: InSteps, begin: Array, end: Array, part: float) -> list[Look]:
-    """The looks whose sum is the force at a part of a step: the mean one, and what generalised alpha dissipates.
+    """The looks whose sum is the force at a part of a step: the mean one, and what generalised
+    alpha dissipates.
 
     The tangent is by the displacement at that part.
     """
@@ -151,7 +162,12 @@ def looks_of_step(contact: InSteps, begin: Array, end: Array, part: float) -> li
         more = {0.0: -late, 1.0: late}.get(t, 0.0)
         slope, second = ((t * (weight * of + more)) / part for of in (of_force, of_bend))
         made.append(
-            Look(u, np.asarray(weight * of_force + more), np.asarray(second if t else of_begin), np.asarray(slope))
+            Look(
+                u,
+                np.asarray(weight * of_force + more),
+                np.asarray(second if t else of_begin),
+                np.asarray(slope),
+            )
         )
     return made
 
@@ -182,7 +198,9 @@ class Number:
 
 
 class ContactTerm:
-    """What the contacts of a pair are as terms, on surfaces and on meridians; `_entries` are those at one look."""
+    """What the contacts of a pair are as terms, on surfaces and on meridians; `_entries` are those
+    at one look.
+    """
 
     amplitude = None
     column = ""
@@ -231,15 +249,25 @@ class ContactTerm:
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
-        """The parameters that the thickness of its faces depends on, with its derivatives among theirs."""
+        """The parameters that the thickness of its faces depends on, with its derivatives among
+        theirs.
+        """
         grown = self._faces.grown if self._faces else None
-        return {name: with_growth(p, self._present, self._add) for name, p in parameters.items() if p.constant is grown}
+        return {
+            name: with_growth(p, self._present, self._add)
+            for name, p in parameters.items()
+            if p.constant is grown
+        }
 
     def _on_nodes(self, forces: Array) -> Array:
-        return on_nodes(self._faces, self._at, forces)  # which stands at the forces' displacement since they were found
+        return on_nodes(
+            self._faces, self._at, forces
+        )  # which stands at the forces' displacement since they were found
 
     def _forces(self) -> Array:
-        """The derivative (nodes, dim) of this rank's energy by the places of all nodes, or by H too."""
+        """The derivative (nodes, dim) of this rank's energy by the places of all nodes, or by H
+        too.
+        """
         raise NotImplementedError
 
     def _entries(self) -> Entries:

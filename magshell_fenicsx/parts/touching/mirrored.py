@@ -1,8 +1,9 @@
 """Contact where a half or a sector is modelled: its points face the cells of all images too.
 
-Images move as the model does, with their matrices Q: the unknowns of all are u' = P u. The points on the modelled cells
-have their part of the energy, Pi(u'), so that the forces are P^T Pi,u' and the tangent is P^T Pi,u'u' P. Of additions v
-that are antisymmetric to a plane the mirrored half has -Q v.
+Images move as the model does, with their matrices Q: the unknowns of all are u' = P u. The points
+on the modelled cells have their part of the energy, Pi(u'), so that the forces are P^T Pi,u' and
+the tangent is P^T Pi,u'u' P. Of additions v that are antisymmetric to a plane the mirrored half has
+-Q v.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,8 @@ class Images:
     count
         Of the nodes that are modelled.
     parity
-        Mirrored copies have so many times the image of a displacement: 1, or -1 of antisymmetric ones.
+        Mirrored copies have so many times the image of a displacement: 1, or -1 of antisymmetric
+        ones.
     """
 
     images: Sequence[Image]
@@ -44,7 +46,9 @@ class Images:
     def matrix(self) -> scipy.sparse.csr_array:
         """P (3 copies count, 3 count)."""
         turns = [image.Q * (self.parity if image.sign < 0 else 1.0) for image in self.images]
-        return scipy.sparse.vstack([scipy.sparse.kron(scipy.sparse.eye_array(self.count), Q) for Q in turns]).tocsr()
+        return scipy.sparse.vstack(
+            [scipy.sparse.kron(scipy.sparse.eye_array(self.count), Q) for Q in turns]
+        ).tocsr()
 
     def moved(self, u: Array) -> Array:
         """Displacements (copies count, 3) of those (count, 3) that are modelled."""
@@ -78,7 +82,9 @@ class Images:
         )
 
     def shared(self, x: Array, on_planes: Longs) -> Longs:
-        """Numbers (copies, n) of the places (n, 3) of all copies, which share those on their planes."""
+        """Numbers (copies, n) of the places (n, 3) of all copies, which share those on their
+        planes.
+        """
         images, extent = [image.of(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
@@ -95,7 +101,11 @@ class Images:
         """Those of a tangent of what is modelled, of one of all copies."""
         rows, columns, values = whole
         size = self.matrix.shape[0]
-        K = self.matrix.T @ scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr() @ self.matrix
+        K = (
+            self.matrix.T
+            @ scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
+            @ self.matrix
+        )
         i, j, v = scipy.sparse.find(K)
         return i.astype(np.int64), j.astype(np.int64), v
 
@@ -108,7 +118,8 @@ class Mirrored(Touching):
     part
         Number of the first degree of freedom of this rank, and how many it has.
     given
-        What a `Touching` asks for, with the cells and nodes of all copies; its own are all of their unknowns.
+        What a `Touching` asks for, with the cells and nodes of all copies; its own are all of their
+        unknowns.
     """
 
     def __init__(self, images: Images, part: tuple[int, int], *given: Any) -> None:
@@ -116,7 +127,9 @@ class Mirrored(Touching):
         self._images, self._part = images, part
 
     def antisymmetric(self) -> "Mirrored":
-        """The same term for additions to u that are antisymmetric to the plane, at a symmetric state."""
+        """The same term for additions to u that are antisymmetric to the plane, at a symmetric
+        state.
+        """
         other = copy(self)
         other._images = replace(self._images, parity=-1.0)
         return other

@@ -1,10 +1,12 @@
-"""The places of a mid-surface that are nearest to some of its points: the cells near by from a tree, then Newton.
+"""The places of a mid-surface that are nearest to some of its points: the cells near by from a
+tree, then Newton.
 
-A point of a surface is near the material around itself, which it does not touch. So a cell counts only if the way to it
-within the undeformed surface is long.
+A point of a surface is near the material around itself, which it does not touch. So a cell counts
+only if the way to it within the undeformed surface is long.
 
-Where the thickness varies, or changes with the state, vectors have a fourth component: half of it less h/2, of x with
-the other sign. The distance is then that of the faces and h: |x - y| of the three, and the fourth of x - y.
+Where the thickness varies, or changes with the state, vectors have a fourth component: half of it
+less h/2, of x with the other sign. The distance is then that of the faces and h: |x - y| of the
+three, and the fourth of x - y.
 """
 
 from collections.abc import Iterator
@@ -24,10 +26,16 @@ from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
-BESIDE = 4.8  # thicknesses of the way along sides to what a point cannot touch; it is at most 1.2 times as long
+# thicknesses of the way along sides to what a point cannot touch; it is at most 1.2 times as long
+BESIDE = 4.8
 BULGE = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
-BETWEEN = 1.6  # of a cell's radius over the parts of its side: no place of it is farther from all those of a lattice
-LATTICES = 4, 12  # parts of a cell's sides, between which the search for the nearest place begins: coarse, then fine
+# of a cell's radius over the parts of its side: no place of it is farther from all those of a
+# lattice
+BETWEEN = 1.6
+LATTICES = (
+    4,
+    12,
+)  # parts of a cell's sides, between which the search for the nearest place begins: coarse, then fine
 BETWEEN_PLACES = 1.05  # of a sum of shape functions at places of a lattice, that everywhere
 STRIP = 500  # vertices from which ways are searched together
 FOLLOWING = 2  # Newton's steps after a small change
@@ -69,7 +77,10 @@ class Cells:
     def across(self) -> Longs:
         """(cells, 3): the cell across the side opposite to each corner; -1 at the boundary."""
         pairs = np.sort(
-            np.stack([self.corners[:, [1, 2]], self.corners[:, [0, 2]], self.corners[:, [0, 1]]], 1), axis=2
+            np.stack(
+                [self.corners[:, [1, 2]], self.corners[:, [0, 2]], self.corners[:, [0, 1]]], 1
+            ),
+            axis=2,
         )
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
         order = np.argsort(keys.ravel(), kind="stable")
@@ -88,10 +99,14 @@ class Cells:
         return np.asarray(there[self.corners])
 
     def turns(self, r0: Array, cosine: float) -> NDArray[np.bool_]:
-        """(cells, 3): whether an edge of the undeformed surface turns at each corner, by more than an angle."""
+        """(cells, 3): whether an edge of the undeformed surface turns at each corner, by more than
+        an angle.
+        """
         cell, side = np.nonzero(self.across < 0)
         D = self.element.tabulate(1, CORNERS)[1:, :, :, 0]
-        onward = np.zeros((int(self.corners.max()) + 1, 3))  # of an even edge the two ways from a vertex cancel
+        onward = np.zeros(
+            (int(self.corners.max()) + 1, 3)
+        )  # of an even edge the two ways from a vertex cancel
         along = CORNERS[(side + 2) % 3] - CORNERS[(side + 1) % 3]
         for corner, sign in (((side + 1) % 3, 1.0), ((side + 2) % 3, -1.0)):
             way = np.einsum("kd,dkn,kni->ki", along, D[:, corner], r0[self.nodes[cell]])
@@ -102,8 +117,12 @@ class Cells:
 
     @cached_property
     def lattices(self) -> list[tuple[Array, Array]]:
-        """Places (m, 2) spread over the reference cell, and the shape functions there; coarse ones and fine ones."""
-        spread = [np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n for n in LATTICES]
+        """Places (m, 2) spread over the reference cell, and the shape functions there; coarse ones
+        and fine ones.
+        """
+        spread = [
+            np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n for n in LATTICES
+        ]
         return [(X, self.element.tabulate(0, X)[0, :, :, 0]) for X in spread]
 
     @cached_property
@@ -118,20 +137,27 @@ class Cells:
 
     @cached_property
     def monomials(self) -> Array:
-        """(monomials, functions): polynomials x^(n-j) y^j, n up to the degree, j from 0 to n, from values at nodes."""
+        """(monomials, functions): polynomials x^(n-j) y^j, n up to the degree, j from 0 to n, from
+        values at nodes.
+        """
         x, y = self.element.points.T
-        return np.linalg.inv([x ** (n - j) * y**j for n in range(self.element.degree + 1) for j in range(n + 1)]).T
+        return np.linalg.inv(
+            [x ** (n - j) * y**j for n in range(self.element.degree + 1) for j in range(n + 1)]
+        ).T
 
     def near_in_surface(self, r0: Array, far: Array) -> Longs:
         """See `near_along_sides`; both are of all nodes."""
         x, reach = np.zeros((int(self.corners.max()) + 1, 3)), np.zeros(int(self.corners.max()) + 1)
-        x[self.corners], reach[self.corners] = self.at_corners @ r0[self.nodes], far[self.nodes] @ self.at_corners.T
+        x[self.corners], reach[self.corners] = (
+            self.at_corners @ r0[self.nodes],
+            far[self.nodes] @ self.at_corners.T,
+        )
         return near_along_sides(self.corners, x, reach)
 
 
 def near_along_sides(corners: Longs, x: Array, reach: Array) -> Longs:
-    """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than the mean of the
-    reach at its ends.
+    """Keys i * cells + j, ascending, of the cells between which the way along sides is shorter than
+    the mean of the reach at its ends.
 
     Parameters
     ----------
@@ -143,16 +169,22 @@ def near_along_sides(corners: Longs, x: Array, reach: Array) -> Longs:
     count, (n, per_cell) = len(x), corners.shape
     farthest = float(reach.max())
     a, b = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    ways = scipy.sparse.coo_array((np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)).tocsr()
+    ways = scipy.sparse.coo_array(
+        (np.ones(len(a)), (np.minimum(a, b), np.maximum(a, b))), (count, count)
+    ).tocsr()
     ways = ways.tocoo()
     lengths = np.linalg.norm(x[ways.row] - x[ways.col], axis=1)
     graph = scipy.sparse.coo_array((lengths, (ways.row, ways.col)), (count, count)).tocsr()
     axis = int(np.ptp(x, axis=0).argmax())
     order = np.argsort(x[:, axis], kind="stable")
     near = list[tuple[Longs, Longs]]()
-    for some in np.array_split(order, max(1, count // STRIP)):  # a way that short leaves a strip by no more
+    for some in np.array_split(
+        order, max(1, count // STRIP)
+    ):  # a way that short leaves a strip by no more
         low, high = x[some[0], axis] - farthest, x[some[-1], axis] + farthest
-        around = order[np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")]
+        around = order[
+            np.searchsorted(x[order, axis], low) : np.searchsorted(x[order, axis], high, "right")
+        ]
         inside = np.flatnonzero(np.isin(around, some))
         reached = dijkstra(graph[around][:, around], directed=False, indices=inside, limit=farthest)
         row, column = np.nonzero(reached <= (reach[around[inside], None] + reach[around]) / 2)
@@ -176,11 +208,13 @@ class Places:
     X
         (n, 2) in the reference cell.
     free
-        (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a side, none in a corner.
+        (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a
+        side, none in a corner.
     distance
         (n,).
     side
-        (n,): places in one direction from their point have one number, less than `WAYS`; 0 that of the nearest.
+        (n,): places in one direction from their point have one number, less than `WAYS`; 0 that of
+        the nearest.
     way
         (n, 3) direction to the point.
     above
@@ -198,7 +232,9 @@ class Places:
 
     @property
     def firsts(self) -> Longs:
-        """Where each point and direction begins, of places in the order of points, directions and distances."""
+        """Where each point and direction begins, of places in the order of points, directions and
+        distances.
+        """
         return np.flatnonzero(np.diff(WAYS * self.point + self.side, prepend=-1))
 
     def of(self, which: Any) -> "Places":
@@ -215,7 +251,8 @@ class Undeformed:
     near
         (pairs,) whether the cells are near in the surface; only there places are asked.
     r, x
-        (nodes, 4) and (n, 4) places of nodes and points, with half the thickness, of points with the other sign.
+        (nodes, 4) and (n, 4) places of nodes and points, with half the thickness, of points with
+        the other sign.
     apart
         How far a place is at least, over the mean of both thicknesses.
     """
@@ -243,7 +280,9 @@ class Limits:
 
 
 def highest(values: Array, lebesgue: float) -> float:
-    """A bound of polynomials with values (cells, functions) at nodes; Lebesgue's constant is that of the element."""
+    """A bound of polynomials with values (cells, functions) at nodes; Lebesgue's constant is that
+    of the element.
+    """
     most, least = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
     return float(((most + least + lebesgue * (most - least)) / 2).max(initial=-np.inf))
 
@@ -265,7 +304,8 @@ def places_near(
     undeformed: Undeformed | None = None,
     limits: Limits | None = None,
 ) -> tuple[Longs, Places]:
-    """The places of cells nearest to points that are nearer than `within`, with the numbers of their pairs.
+    """The places of cells nearest to points that are nearer than `within`, with the numbers of
+    their pairs.
 
     Where the search begins is the nearest place of a lattice. Compiled, see nearest.c.
 
@@ -276,7 +316,8 @@ def places_near(
     x
         (n, 3) points, or (n, 4).
     pairs
-        Of a cell with points: the cells, the first of the points in the last array, and how many there are.
+        Of a cell with points: the cells, the first of the points in the last array, and how many
+        there are.
     reach
         Between points and mid-surfaces.
     """
@@ -301,12 +342,19 @@ def places_near(
     given = p(*of_pairs, limit.reach, order, _padded(x), _padded(where.x))
     count = lib.nearest(every, len(cell), *given, reach, within, where.apart, *p(*made))
     X, free, distance, way = (each[:count] for each in made[2:6])
-    point, pair, above, none = point[:count], pair[:count], made[6][:count], np.zeros(count, dtype=np.int64)
+    point, pair, above, none = (
+        point[:count],
+        pair[:count],
+        made[6][:count],
+        np.zeros(count, dtype=np.int64),
+    )
     return pair, Places(point, cell[pair], X, free, distance, none, way, above)
 
 
 def places_of(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
-    """Those (n, 3) of points with shape functions (n, functions) in cells (n,), with nodes at r; or (n, 4) of both."""
+    """Those (n, 3) of points with shape functions (n, functions) in cells (n,), with nodes at r; or
+    (n, 4) of both.
+    """
     x = np.empty((len(cell), 4))
     arrays = _pointers(cell, cells.nodes, shape, _padded(r * SIGNS[: r.shape[1]]), x)
     library()[1].places(*shape.shape, *arrays)
@@ -315,12 +363,17 @@ def places_of(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
     kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
-    return [library()[0].from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each)) for each in arrays]
+    return [
+        library()[0].from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each))
+        for each in arrays
+    ]
 
 
 def _padded(vectors: Array) -> Array:
     """Those of three components with a fourth one."""
-    return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 4 - vectors.shape[-1]))], axis=-1)
+    return np.concatenate(
+        [vectors, np.zeros((*vectors.shape[:-1], 4 - vectors.shape[-1]))], axis=-1
+    )
 
 
 @cache
@@ -330,7 +383,9 @@ def library() -> tuple[Any, Any]:
 
 
 def followed(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -> Array:
-    """The same places of triangles that have changed a little, in the same free directions, also beyond a side."""
+    """The same places of triangles that have changed a little, in the same free directions, also
+    beyond a side.
+    """
     for _ in range(FOLLOWING):
         (_, y), *more = jets(cells.element, X, nodal)
         g, A = slopes(straight(x - y), *(each for _, each in more))
@@ -348,10 +403,14 @@ def straight(off: Array) -> Array:
     return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
 
-def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array) -> tuple[Array, Array]:
-    """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2, 2).
+def slopes(
+    off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array
+) -> tuple[Array, Array]:
+    """The gradient (n, 2) of half the square of the distance by the place, and its Hessian (n, 2,
+    2).
 
-    With a fourth component both are |x - y| times those of the distance, the Hessian where the gradient is zero.
+    With a fourth component both are |x - y| times those of the distance, the Hessian where the
+    gradient is zero.
     """
 
     def dot(a: Array, b: Array) -> Array:
@@ -359,13 +418,17 @@ def slopes(off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array)
 
     z1, z2 = y1 * SIGNS[: y1.shape[1]], y2 * SIGNS[: y2.shape[1]]
     mixed = dot(y1, z2) - dot(off, y12)
-    A = np.stack([dot(y1, z1) - dot(off, y11), mixed, mixed, dot(y2, z2) - dot(off, y22)], axis=1).reshape(-1, 2, 2)
+    A = np.stack(
+        [dot(y1, z1) - dot(off, y11), mixed, mixed, dot(y2, z2) - dot(off, y22)], axis=1
+    ).reshape(-1, 2, 2)
     return -np.stack([dot(off, y1), dot(off, y2)], axis=1), A
 
 
 def _reduced(free: Array, A: Array, g: Array) -> Array:
     """A^-1 g in the free directions."""
-    return np.asarray(np.einsum("nij,nj->ni", free, np.einsum("nij,nj->ni", inverse(free, A), _along(free, g))))
+    return np.asarray(
+        np.einsum("nij,nj->ni", free, np.einsum("nij,nj->ni", inverse(free, A), _along(free, g)))
+    )
 
 
 def _along(free: Array, g: Array) -> Array:
@@ -378,7 +441,9 @@ def inverse(free: Array, A: Array) -> Array:
     reduced = np.einsum("nji,njk,nkl->nil", free, A, free)
     reduced[:, 0, 0] += none[:, 0]
     reduced[:, 1, 1] += none[:, 1]
-    turned = np.stack([reduced[:, 1, 1], -reduced[:, 0, 1], -reduced[:, 1, 0], reduced[:, 0, 0]], axis=1)
+    turned = np.stack(
+        [reduced[:, 1, 1], -reduced[:, 0, 1], -reduced[:, 1, 0], reduced[:, 0, 0]], axis=1
+    )
     return np.asarray(turned.reshape(-1, 2, 2) / determinant(reduced)[:, None, None])
 
 
@@ -404,13 +469,17 @@ def near_pairs(centres: Array, radii: Array, reach: float, own: Longs) -> tuple[
             fits = (near["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[fits], j[fits]))
     nothing = np.zeros(0, dtype=np.int64)
-    i, j = (np.concatenate([nothing, *each]).astype(np.int64) for each in zip((nothing, nothing), *pairs, strict=True))
+    i, j = (
+        np.concatenate([nothing, *each]).astype(np.int64)
+        for each in zip((nothing, nothing), *pairs, strict=True)
+    )
     return i, j
 
 
 @dataclass(frozen=True)
 class Joined:
-    """Places of a point in one direction, in neighbouring cells, as one: a fold between cells has no jump then.
+    """Places of a point in one direction, in neighbouring cells, as one: a fold between cells has
+    no jump then.
 
     Attributes
     ----------
@@ -440,4 +509,6 @@ class Joined:
         group = np.repeat(np.arange(len(first)), counts)
         size = np.exp((at.distance[first][group] - at.distance) / blur)
         total = np.bincount(group, size, len(first))
-        return cls(first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1)
+        return cls(
+            first, group, at.distance[first] - blur * np.log(total), size / total[group], counts > 1
+        )

@@ -1,17 +1,20 @@
-"""Contact of shells with one axis on their meridians: the same penalty of the same gap as `touching`, for curves.
+"""Contact of shells with one axis on their meridians: the same penalty of the same gap as
+`touching`, for curves.
 
-A point x of one curve has the nearest place y of the other. Both curves have points, so that each has half of the
-penalty. With d = |x - y|, n = (x - y)/d, F = d^2/2, A = F,ss = |y'|^2 - (x - y) . y'' and changes D = dx - dy:
+A point x of one curve has the nearest place y of the other. Both curves have points, so that each
+has half of the penalty. With d = |x - y|, n = (x - y)/d, F = d^2/2, A = F,ss = |y'|^2 - (x - y) .
+y'' and changes D = dx - dy:
 
     d,uu = [D . D - (n . D)^2 - C_s^2/A - C_theta^2/B]/d,   C_s = -D . y' - (x - y) . dy',   B = rho_x rho_y
 
-Where the thickness varies d is the least of |x - y| - H(y), less H(x), plus h, with half the thickness H. Then n . y'
-is -H', C_s has y' less its part along n, and A is |y'|^2 - (x - y) . y'' - H'^2 - |x - y| H''. H less h/2 is a third
-component of places.
+Where the thickness varies d is the least of |x - y| - H(y), less H(x), plus h, with half the
+thickness H. Then n . y' is -H', C_s has y' less its part along n, and A is |y'|^2 - (x - y) . y'' -
+H'^2 - |x - y| H''. H less h/2 is a third component of places.
 
-Along e_theta the nearest place moves as it does along the curve. A wave (U cos, V sin, W cos) of m theta moves it by
-C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves it stays. The points are those of a
-rule on each cell. At a free end one is next to the end, which an edge stands on.
+Along e_theta the nearest place moves as it does along the curve. A wave (U cos, V sin, W cos) of m
+theta moves it by C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves
+it stays. The points are those of a rule on each cell. At a free end one is next to the end, which
+an edge stands on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +30,17 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, Grown, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
-from magshell_fenicsx.parts.touching.curves import SAME, SIGNS, Around, Close, Curves, Faced, distances, nowhere, slopes
+from magshell_fenicsx.parts.touching.curves import (
+    SAME,
+    SIGNS,
+    Around,
+    Close,
+    Curves,
+    Faced,
+    distances,
+    nowhere,
+    slopes,
+)
 from magshell_fenicsx.parts.touching.faces import slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import STEEP, between_held
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
@@ -42,7 +55,8 @@ Inside = NDArray[np.bool_]
 
 
 class MeridianTouching(ContactTerm):
-    """The energy of the contact of a pair on the meridian; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+    """The energy of the contact of a pair on the meridian; an `assembly.terms.Term` and
+    `assembly.coupled.Coupled`.
 
     Parameters
     ----------
@@ -59,7 +73,8 @@ class MeridianTouching(ContactTerm):
     shape
         The fields that the gap depends on.
     faces
-        How far they are from the meridian where the thickness varies, or changes with the state; None where it is h.
+        How far they are from the meridian where the thickness varies, or changes with the state;
+        None where it is h.
     """
 
     def __init__(
@@ -91,7 +106,9 @@ class MeridianTouching(ContactTerm):
         self._grown = 0.0
         self._places = nowhere()
         self._looked_at = Kept[tuple[Array, Faced]]()
-        self._about: tuple[Faced, Array] | None = None  # another scene's places, and their penetrations
+        self._about: tuple[Faced, Array] | None = (
+            None  # another scene's places, and their penetrations
+        )
         self._close = Close(self._rule, self._nodes, sides, curves.element, self._around)
 
     # as a term
@@ -119,10 +136,16 @@ class MeridianTouching(ContactTerm):
 
     def _entries(self) -> Entries:
         entries = self._by_parts()
-        return self._faces.entries(self._at, entries, self._forces()[:, -1]) if self._faces else entries
+        return (
+            self._faces.entries(self._at, entries, self._forces()[:, -1])
+            if self._faces
+            else entries
+        )
 
     def _joined(self, H: Array, nodes: Longs, of_place: list[int]) -> Entries:
-        """Blocks (n, dofs, dofs) by (U, V, W, H) at nodes (n, functions), of some of these and H, where it varies."""
+        """Blocks (n, dofs, dofs) by (U, V, W, H) at nodes (n, functions), of some of these and H,
+        where it varies.
+        """
         parts = [*of_place, 3] if self._faces else of_place
         which = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, parts))
         dofs = unknowns(nodes, len(self._r0), len(parts), len(of_place))
@@ -140,11 +163,16 @@ class MeridianTouching(ContactTerm):
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
     def _touching_cells(self) -> Longs:
-        both = [np.column_stack([self._rule.cell[at.point], at.cell]) for at in of_each(self, self._pressed)]
+        both = [
+            np.column_stack([self._rule.cell[at.point], at.cell])
+            for at in of_each(self, self._pressed)
+        ]
         return np.asarray(np.unique(np.concatenate(both), axis=0))
 
     def entries_of_waves(self, m: float) -> Entries:
-        """The same of the second variation along waves, by the coefficients (U + V, V, W), as `shells.waves` has it."""
+        """The same of the second variation along waves, by the coefficients (U + V, V, W), as
+        `shells.waves` has it.
+        """
         rows, columns, values = self._joined(*self._second(m), [0, 1, 2])
         if self._rings:
             given = self._at, (rows, columns, values), self._forces()[:, -1]
@@ -152,7 +180,10 @@ class MeridianTouching(ContactTerm):
         for _ in range(2):  # with P = U + V, U is P - V
             of_U = columns % 3 == 0
             values = np.concatenate([values, -values[of_U]])
-            rows, columns = np.concatenate([columns, columns[of_U] + 1]), np.concatenate([rows, rows[of_U]])
+            rows, columns = (
+                np.concatenate([columns, columns[of_U] + 1]),
+                np.concatenate([rows, rows[of_U]]),
+            )
         return rows, columns, values / 2
 
     def by_field(
@@ -171,8 +202,19 @@ class MeridianTouching(ContactTerm):
         at = self._pressed()
         each, one = np.arange(len(at.point)), np.ones(len(at.point))
         joined = Joined(each, each, at.distance, one, one == 0)
-        of_all = self._curves, self._r0, self._at, self._faces, self._rule, at, joined, self._penalty(at)
-        return PresentMeridian(*of_all, self._forces(), self._by_parts, self._entries, self._geometry)
+        of_all = (
+            self._curves,
+            self._r0,
+            self._at,
+            self._faces,
+            self._rule,
+            at,
+            joined,
+            self._penalty(at),
+        )
+        return PresentMeridian(
+            *of_all, self._forces(), self._by_parts, self._entries, self._geometry
+        )
 
     # what is seen
 
@@ -184,7 +226,10 @@ class MeridianTouching(ContactTerm):
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach."""
         u = self._now()
-        x, (one, other) = self._x_of(r := self._placed(u)), (np.unique(self._nodes[side]) for side in self._sides)
+        x, (one, other) = (
+            self._x_of(r := self._placed(u)),
+            (np.unique(self._nodes[side]) for side in self._sides),
+        )
         first, to_nodes = self._rule.first, self._far
         if not self._around:  # no place is farther than nodes
             ways = [x[first][:, None] - r[other], x[~first][:, None] - r[one]]
@@ -233,7 +278,8 @@ class MeridianTouching(ContactTerm):
             )
 
     def of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The mean pressure over E h/R^2, the least gap over R within the reach, and which are pressed all over.
+        """The mean pressure over E h/R^2, the least gap over R within the reach, and which are
+        pressed all over.
 
         Of all cells; see `Touching`.
         """
@@ -242,19 +288,30 @@ class MeridianTouching(ContactTerm):
         area, size = np.bincount(cell, weight, count), weight[at.point] * self._penalty(at)[1]
         at_end, steep = self._at_ends(at)
         part = np.where(steep & ~at_end, 0.5, 1.0)
-        force = np.bincount(cell[at.point], part * size, count) + np.bincount(at.cell, (1 - part) * size, count)
+        force = np.bincount(cell[at.point], part * size, count) + np.bincount(
+            at.cell, (1 - part) * size, count
+        )
         gap = np.full(count, self._far - self._h)
         near = self._found(self._now(), self._far)
         np.minimum.at(gap, cell[near.point], near.distance - self._h)
         pressed = np.bincount(cell[np.unique(at.point)], weight[np.unique(at.point)], count)
-        return force / np.where(area > 0, area, 1.0), gap, (area > 0) & (pressed > EVERYWHERE * area)
+        return (
+            force / np.where(area > 0, area, 1.0),
+            gap,
+            (area > 0) & (pressed > EVERYWHERE * area),
+        )
 
     def through(self, u: Array, v: Array) -> bool:
-        """Whether points pass through a curve on the straight way between two displacements (nodes, 2).
+        """Whether points pass through a curve on the straight way between two displacements (nodes,
+        2).
 
-        Between two looks none moves, relative to another, by more than a part of the least thickness.
+        Between two looks none moves, relative to another, by more than a part of the least
+        thickness.
         """
-        moved, least = v - u, 2 * min(float(self._half_at(each)[self._touched].min()) for each in (0 * u, u, v))
+        moved, least = (
+            v - u,
+            2 * min(float(self._half_at(each)[self._touched].min()) for each in (0 * u, u, v)),
+        )
         moved = moved - [0.0, moved[:, 1].mean()]
         looks = int(np.ceil(2 * np.linalg.norm(moved, axis=1).max() / (PART * least)))
         ways = (u + k / looks * (v - u) for k in range(1, looks))
@@ -282,7 +339,11 @@ class MeridianTouching(ContactTerm):
     # geometry
 
     def _now(self) -> Array:
-        return self.look.u if self.look else np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
+        return (
+            self.look.u
+            if self.look
+            else np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
+        )
 
     def _pressed(self) -> Faced:
         """The places that are pressed at the present state."""
@@ -291,7 +352,9 @@ class MeridianTouching(ContactTerm):
             self._at, at = np.array(u), self._about[0]
             return self._followed(at) if len(at.point) else at
         if grown != self._grown or not np.array_equal(u, self._at):
-            self._at, self._places = self._looked_at.of((u, grown), lambda: self._facing(np.array(u)))
+            self._at, self._places = self._looked_at.of(
+                (u, grown), lambda: self._facing(np.array(u))
+            )
             self._grown = grown
         return self._places
 
@@ -325,7 +388,9 @@ class MeridianTouching(ContactTerm):
         return replace(at, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
 
     def _placed(self, u: Array, *, faces: bool = True) -> Array:
-        """All nodes (nodes, 3), with half the thickness less h/2, or nothing, as the third component."""
+        """All nodes (nodes, 3), with half the thickness less h/2, or nothing, as the third
+        component.
+        """
         return np.column_stack([self._r0 + u, (self._half_at(u) - self._h / 2) * faces])
 
     def _half_at(self, u: Array) -> Array:
@@ -349,10 +414,11 @@ class MeridianTouching(ContactTerm):
         return self._curves.nearest(at.of(at.distance < of_faces), x, nodal, self._around)
 
     def _left_to_edges(self, at: Faced) -> Inside:
-        """Which places do not count: those of points inside a shell that face the end of another one, steeply.
+        """Which places do not count: those of points inside a shell that face the end of another
+        one, steeply.
 
-        The end's own point is there too; see `facing.Facing.left_to_edges`. Normals are undeformed ones, so that the
-        energy is a function of the state.
+        The end's own point is there too; see `facing.Facing.left_to_edges`. Normals are undeformed
+        ones, so that the energy is a function of the state.
         """
         at_end, steep = self._at_ends(at)
         return np.asarray(at_end & steep & ~self._rule.on_edge[at.point])
@@ -366,7 +432,9 @@ class MeridianTouching(ContactTerm):
 
     def _geometry(self, at: Faced) -> tuple[Array, Array, Array, Longs]:
         """Distances, normals, and beta (n, functions of both cells) with its nodes."""
-        nodes = np.concatenate([self._nodes[self._rule.cell[at.point]], self._nodes[at.cell]], axis=1)
+        nodes = np.concatenate(
+            [self._nodes[self._rule.cell[at.point]], self._nodes[at.cell]], axis=1
+        )
         r = self._r0 + self._at
         N, shape = self._rule.shape[at.point], self._curves.table(0, at.X)[0]
         beta = np.concatenate([N, -shape], axis=1)
@@ -381,7 +449,10 @@ class MeridianTouching(ContactTerm):
         d, n, beta, nodes = self._geometry(at)
         off, (count, functions) = d[:, None] * n, beta.shape
         half, weight, r = functions // 2, self._rule.weight[at.point] / 2, self._placed(self._at)
-        jets, (shape, along) = self._curves.jets(at.X, r[self._nodes[at.cell]]), self._curves.table(1, at.X)
+        jets, (shape, along) = (
+            self._curves.jets(at.X, r[self._nodes[at.cell]]),
+            self._curves.table(1, at.X),
+        )
         A = slopes(self._x_of(r)[at.point], jets)[1]
         y, across = jets[0], jets[1, :, :2] - np.sum(jets[1, :, :2] * n, axis=1)[:, None] * n
         rows = np.zeros((4, *beta.shape, 4))
@@ -397,7 +468,10 @@ class MeridianTouching(ContactTerm):
         turn[:, half:, 2] += m * off[:, 1:] * shape
         turn[:, half:, 3] += m * d[:, None] * shape
         B, bent = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
-        inverse = [np.where(can, 1 / np.where(can, each, 1.0), 0.0) for can, each in ((at.free, A), (B > 0, B))]
+        inverse = [
+            np.where(can, 1 / np.where(can, each, 1.0), 0.0)
+            for can, each in ((at.free, A), (B > 0, B))
+        ]
         flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
         factors = np.column_stack([weight * second, -bent, -bent * inverse[0], -bent * inverse[1]])
         H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
@@ -411,7 +485,9 @@ class PresentMeridian(Present):
     """A contact on a meridian at a state."""
 
     def of_weights(self, tables: Array, places: Array) -> Array:
-        slopes = tables[1][..., None] * (places[1] / np.sum(places[1] ** 2, axis=1)[:, None])[:, None]
+        slopes = (
+            tables[1][..., None] * (places[1] / np.sum(places[1] ** 2, axis=1)[:, None])[:, None]
+        )
         slopes[..., 0] += tables[0] / places[0, :, :1]
         return np.asarray(slopes)
 
@@ -434,10 +510,21 @@ def touchings(
     MeshError
         If shells of a pair overlap undeformed.
     """
-    V, made, placed = r0.function_space, list[MeridianTouching](), np.array(r0.x.array.reshape(-1, 2))
+    V, made, placed = (
+        r0.function_space,
+        list[MeridianTouching](),
+        np.array(r0.x.array.reshape(-1, 2)),
+    )
     element, nodes = V.element.basix_element, V.dofmap.list.astype(np.int64)
-    curves, named = Curves(element, nodes, placed, h), {WHOLE: np.ones(len(nodes), dtype=bool), **patches}
-    thinning, times, faces = np.broadcast_to(np.asarray(thins) > 0, (len(nodes), 1))[:, 0], np.ones(nodes.shape), None
+    curves, named = (
+        Curves(element, nodes, placed, h),
+        {WHOLE: np.ones(len(nodes), dtype=bool), **patches},
+    )
+    thinning, times, faces = (
+        np.broadcast_to(np.asarray(thins) > 0, (len(nodes), 1))[:, 0],
+        np.ones(nodes.shape),
+        None,
+    )
     if thickness is not None:
         times = thickness.x.array[thickness.function_space.dofmap.list]
     if thickness is not None or thinning.any():
@@ -449,6 +536,8 @@ def touchings(
     shape = Shape(r0, thickness, nodes, slice(None))
     for pair in pairs:
         one, other = (named[name] for name in pair.names)
-        made.append(MeridianTouching(pair, curves, placed, u, (one, other), h, degree, shape, faces))
+        made.append(
+            MeridianTouching(pair, curves, placed, u, (one, other), h, degree, shape, faces)
+        )
         made[-1].refuse_overlap()
     return made

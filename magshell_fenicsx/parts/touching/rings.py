@@ -1,12 +1,13 @@
 """How far the faces of a meridian are from it where the thickness varies or changes: see `faces`.
 
-The area at a node, over 2 pi, is J = rho |r'|; on the axis, where that is zero, rho' |r'| stands for it. With b = U,
-a = r' . (U', W') and q the part of (U', W') across r' its derivatives along (U, W) are
+The area at a node, over 2 pi, is J = rho |r'|; on the axis, where that is zero, rho' |r'| stands
+for it. With b = U, a = r' . (U', W') and q the part of (U', W') across r' its derivatives along (U,
+W) are
 
     J,u = |r'| b + rho a/|r'|,    J,uu = rho q^2/|r'| + 2 a b/|r'|.
 
-Along a wave (U cos, V sin, W cos) of m theta the first has b = U + m V and varies with cos; twice the mean of the
-second is, with P = m U + V and f = rho V' - rho' P - m z' W,
+Along a wave (U cos, V sin, W cos) of m theta the first has b = U + m V and varies with cos; twice
+the mean of the second is, with P = m U + V and f = rho V' - rho' P - m z' W,
 
     rho (q^2 + V'^2)/|r'| + 2 a b/|r'| + |r'| (P^2 + m^2 W^2)/rho - f^2/(rho |r'|).
 """
@@ -43,12 +44,16 @@ class Rings(Faces):
         self._along, rho = curves.at_nodes, r0[curves.nodes, 0]
         slope = np.einsum("qk,ck->cq", self._along, rho)
         on_axis = (np.abs(rho) < SAME)[..., None]
-        self._values = np.where(on_axis, np.sign(slope)[..., None] * self._along, np.eye(rho.shape[1]))
+        self._values = np.where(
+            on_axis, np.sign(slope)[..., None] * self._along, np.eye(rho.shape[1])
+        )
         self._on_axis = on_axis[..., 0]
         super().__init__(curves, r0, h, thickness, thins, np.arange(len(r0)), grown)
 
     def waves(self, m: float) -> "Rings":
-        """The same for waves (U, V, W) of m theta at a displacement (U, W), with what H changes by as cos m theta."""
+        """The same for waves (U, V, W) of m theta at a displacement (U, W), with what H changes by
+        as cos m theta.
+        """
         other = copy(self)
         other._m, other._parts = m, 3
         return other
@@ -86,11 +91,16 @@ class Rings(Faces):
     def _area_slopes(self, u: Array, some: Longs) -> Array:
         rho, speed, a, b = self._changes(u, some)
         slopes = self._of(speed[..., None, None] * b + (rho / speed)[..., None, None] * a)
-        return np.where(self._on_axis[some][..., None], 0.0, slopes) if self._m else slopes  # one value all around
+        return (
+            np.where(self._on_axis[some][..., None], 0.0, slopes) if self._m else slopes
+        )  # one value all around
 
     def _bends(self, u: Array, some: Longs, w: Array) -> Array:
         rho, speed, a, b = self._changes(u, some)
-        m, (rho1, z1) = self._m or 0.0, np.moveaxis(self._section(self._r0 + u, some)[1], -1, 0)[..., None]
+        m, (rho1, z1) = (
+            self._m or 0.0,
+            np.moveaxis(self._section(self._r0 + u, some)[1], -1, 0)[..., None],
+        )
         q, p, c, f, v = np.zeros((5, *a.shape))
         value = self._values[some]
         q[..., 0], q[..., 2] = (each * self._along / speed[..., None] for each in (-z1, rho1))

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 WHOLE = "shell"
 STIFF = 1e6  # of the penalty, over D/(R h)^2, as that of a plane
-Both = Annotated[list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)]
+Both = Annotated[
+    list[Annotated[str, Field(min_length=1, max_length=100)]], Field(min_length=2, max_length=2)
+]
 
 
 class PairSection(Section):
@@ -34,7 +36,9 @@ class PairSection(Section):
 
 GivenPair = Annotated[
     Annotated[Both, Tag("a pair")] | Annotated[PairSection, Tag("a pair with keys")],
-    Discriminator(lambda data: "a pair with keys" if isinstance(data, dict | PairSection) else "a pair"),
+    Discriminator(
+        lambda data: "a pair with keys" if isinstance(data, dict | PairSection) else "a pair"
+    ),
 ]
 Pairs = Annotated[list[GivenPair], Field(max_length=20)]
 
@@ -79,13 +83,17 @@ class Pair:
 
     @property
     def cuts(self) -> str:
-        """Name in a state of the number of the displacement at which its cells were cut along each other."""
+        """Name in a state of the number of the displacement at which its cells were cut along each
+        other.
+        """
         return f"cuts between {self.names[0]} and {self.names[1]}"
 
     @property
     def words(self) -> str:
         """What it is, in messages."""
-        return "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
+        return (
+            "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
+        )
 
 
 class ShellContact(KeyAbility[Sequence[GivenPair]]):
@@ -103,7 +111,11 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        return {"pairs": pairs(self.given, context.shell.poisson_ratio, several.moduli if several else {})}
+        return {
+            "pairs": pairs(
+                self.given, context.shell.poisson_ratio, several.moduli if several else {}
+            )
+        }
 
 
 def pairs(given: Sequence[GivenPair], nu: float, moduli: Mapping[str, float]) -> tuple[Pair, ...]:
@@ -126,7 +138,11 @@ def pairs(given: Sequence[GivenPair], nu: float, moduli: Mapping[str, float]) ->
 
 def _of_shells(name: str, values: Mapping[str, float]) -> list[float]:
     """The values of all shells, of the shell with this name, or of the shell that has this patch."""
-    return [value for shell, value in values.items() if name in (WHOLE, shell) or name.startswith(f"{shell}_")]
+    return [
+        value
+        for shell, value in values.items()
+        if name in (WHOLE, shell) or name.startswith(f"{shell}_")
+    ]
 
 
 def refuse_unfit_pairs(given: Sequence[GivenPair], context: Context) -> None:
@@ -140,13 +156,23 @@ def refuse_unfit_pairs(given: Sequence[GivenPair], context: Context) -> None:
     seen, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
     for i, pair in enumerate(map(names_in, given)):
         if frozenset(pair) in seen:
-            raise ValueError(f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once")
+            raise ValueError(
+                f"contact.{i}: {' and '.join(pair)}: a pair that stands twice; give each once"
+            )
         seen.add(frozenset(pair))
         for name in pair:
-            if shells and name not in (WHOLE, *shells) and not name.startswith(tuple(f"{each}_" for each in shells)):
-                raise ValueError(f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}")
+            if (
+                shells
+                and name not in (WHOLE, *shells)
+                and not name.startswith(tuple(f"{each}_" for each in shells))
+            ):
+                raise ValueError(
+                    f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}"
+                )
             if name != WHOLE and not isinstance(context.shell, MeshSurface):
-                raise ValueError(f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file")
+                raise ValueError(
+                    f"contact.{i}: {name}: allowed: {WHOLE}; parts are the patches of a mesh file"
+                )
     if len(seen) > 1 and frozenset({WHOLE}) in seen:
         raise ValueError(f"contact: {WHOLE} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface")
@@ -157,7 +183,9 @@ def refuse_unfit_pairs(given: Sequence[GivenPair], context: Context) -> None:
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
     if step.load.multiplies(step, context):
         said = f"{step.key}.kind: {step.kind}"
-        raise ValueError(f"{said}: with contact, undeformed gaps would change: take steps along a path")
+        raise ValueError(
+            f"{said}: with contact, undeformed gaps would change: take steps along a path"
+        )
 
 
 def account(context: Context, loads: "Loads") -> Account:

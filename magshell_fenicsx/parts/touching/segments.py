@@ -1,14 +1,17 @@
-"""Points of a quadrature that respects the cells of both surfaces: a cell is cut along the sides of those it faces.
+"""Points of a quadrature that respects the cells of both surfaces: a cell is cut along the sides of
+those it faces.
 
-The forces of a pressure on the other surface are integrals of its shape functions, which have kinks at the sides of its
-cells. A rule on the cells of one surface integrates across them: the forces of a uniform pressure are then not those of
-one. So the corners of what a cell faces are projected on its plane, and each part of the cell that faces one other cell
-is cut into triangles with a rule of their own. M. A. Puso and T. A. Laursen, Computer Methods in Applied Mechanics and
-Engineering 193 (2004) 601-629.
+The forces of a pressure on the other surface are integrals of its shape functions, which have kinks
+at the sides of its cells. A rule on the cells of one surface integrates across them: the forces of
+a uniform pressure are then not those of one. So the corners of what a cell faces are projected on
+its plane, and each part of the cell that faces one other cell is cut into triangles with a rule of
+their own. M. A. Puso and T. A. Laursen, Computer Methods in Applied Mechanics and Engineering 193
+(2004) 601-629.
 
-The cuts are those at an earlier state, whose number stands in a state as part of its history. So the points stay where
-they are on their surface while a state is solved: energy, forces and tangent are exact derivatives of each other, and
-need none of the cuts. Where surfaces slide, `touching.Touching.recut` makes the cuts anew.
+The cuts are those at an earlier state, whose number stands in a state as part of its history. So
+the points stay where they are on their surface while a state is solved: energy, forces and tangent
+are exact derivatives of each other, and need none of the cuts. Where surfaces slide,
+`touching.Touching.recut` makes the cuts anew.
 
 Two curved surfaces touch in a zone that may be narrower than the distance of the points. Its force
 then sits on single points and goes along with their material, so that a mode which slides there
@@ -33,16 +36,23 @@ Inside = NDArray[np.bool_]
 CELL = 0.5  # area of the reference cell
 NOTHING = 1e-12  # an area in it that is none
 LARGE = 0.1  # an area in it, on which the rule is that of a whole cell
-SNAP = 0.01  # a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
+# a barycentric coordinate that becomes zero, so that sides that nearly meet leave no slivers
+SNAP = 0.01
 CLOSE = 1e-9  # between corners that are one
-CORNER = 0.01  # of the thickness: how far a corner's point is before it, or cells that meet opposite would share it
+# of the thickness: how far a corner's point is before it, or cells that meet opposite would share
+# it
+CORNER = 0.01
 INSIDE = -1  # a triangle that is not on an edge
 TURN = 0.97  # the cosine of an angle by which an edge turns, at corners that have points
 NOBODY = -1  # the cell that a part of a cell faces where none is
-ALONG = np.array([1.0, 2**0.5, 3**0.5])  # a direction in which no two corners are level: it orders them on any ranks
+ALONG = np.array(
+    [1.0, 2**0.5, 3**0.5]
+)  # a direction in which no two corners are level: it orders them on any ranks
 DIGITS = 6  # bytes of the hash of a displacement in the number of its cuts
 LEVELS = 16  # more divisions the number of cuts cannot tell: a float has these and the hash exactly
-CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])  # in the reference triangle
+CORNERS_AND_CENTROID = np.array(
+    [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]]
+)  # in the reference triangle
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,9 @@ class Points:
     @classmethod
     def joined(cls, parts: Sequence["Points"]) -> "Points":
         """All of several."""
-        return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
+        return cls(
+            *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls))
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +135,9 @@ class Triangles:
         in the middle."""
         half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
         inside = np.full_like(self.ends, INSIDE)
-        at_begin, at_end = (np.where(self.ends == INSIDE, INSIDE, self.ends & corner) for corner in (1, 2))
+        at_begin, at_end = (
+            np.where(self.ends == INSIDE, INSIDE, self.ends & corner) for corner in (1, 2)
+        )
         quarters = (
             (self.first, half1, half2, inside),
             (self.first + half1, half1, half2, at_begin),
@@ -153,7 +167,9 @@ class Pieces:
     @classmethod
     def cells(cls, cell: Longs) -> "Pieces":
         """Cells as they are, facing nobody."""
-        return cls(cell, np.full(len(cell), NOBODY), np.array(np.broadcast_to(CORNERS, (len(cell), 3, 2))))
+        return cls(
+            cell, np.full(len(cell), NOBODY), np.array(np.broadcast_to(CORNERS, (len(cell), 3, 2)))
+        )
 
     def of(self, which: Longs | Inside) -> "Pieces":
         """Some of them."""
@@ -171,18 +187,21 @@ class Pieces:
         """These and others."""
         most = max(self.corners.shape[1], other.corners.shape[1])
         wider = [((0, 0), (0, most - each.corners.shape[1]), (0, 0)) for each in (self, other)]
-        corners = [np.pad(each.corners, by, "edge") for each, by in zip((self, other), wider, strict=True)]
+        corners = [
+            np.pad(each.corners, by, "edge") for each, by in zip((self, other), wider, strict=True)
+        ]
         cell, faces = ([getattr(self, name), getattr(other, name)] for name in ("cell", "faces"))
         return Pieces(np.concatenate(cell), np.concatenate(faces), np.concatenate(corners))
 
     def triangles(self, open_sides: Inside, turns: Inside) -> Triangles:
-        """Those of the centroids and each side; a triangle with one side on an edge of the surface, or none, is one by
-        itself. So they do not depend on which corner is the first.
+        """Those of the centroids and each side; a triangle with one side on an edge of the surface,
+        or none, is one by itself. So they do not depend on which corner is the first.
 
         Parameters
         ----------
         open_sides, turns
-            (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge turns in the corner.
+            (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge
+            turns in the corner.
         """
         c, after = self.corners, np.roll(self.corners, -1, axis=1)
         apart = np.linalg.norm(c - after, axis=2) > CLOSE
@@ -200,9 +219,16 @@ class Pieces:
         three = np.take_along_axis(c[whole], own[..., None], axis=1)
         at_end = np.take_along_axis(ends[whole], own, axis=1)
         apex = np.where((at_end != INSIDE).any(axis=1), (at_end.argmax(axis=1) + 2) % 3, 0)[:, None]
-        first, a, b = (np.take_along_axis(three, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3))
-        alone = Triangles(self.cell[whole], self.faces[whole], first, a - first, b - first, at_end.max(axis=1))
-        both = [np.concatenate([getattr(part, each.name) for part in (alone, fans)]) for each in fields(Triangles)]
+        first, a, b = (
+            np.take_along_axis(three, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3)
+        )
+        alone = Triangles(
+            self.cell[whole], self.faces[whole], first, a - first, b - first, at_end.max(axis=1)
+        )
+        both = [
+            np.concatenate([getattr(part, each.name) for part in (alone, fans)])
+            for each in fields(Triangles)
+        ]
         return Triangles(*both)
 
     def cut(self, a: Array, b: Array) -> "Pieces":
@@ -214,7 +240,9 @@ class Pieces:
         crossed = left * after < 0
         part = left / np.where(crossed, left - after, 1.0)
         count, m = left.shape
-        ends = np.stack([self.corners, self.corners + part[..., None] * (to - self.corners)], axis=2)
+        ends = np.stack(
+            [self.corners, self.corners + part[..., None] * (to - self.corners)], axis=2
+        )
         apart = (to != self.corners).any(axis=2)
         there = np.stack([(left >= 0) & apart, crossed], axis=2).reshape(count, 2 * m)
         most = max(3, int(there.sum(axis=1).max(initial=0)))
@@ -280,10 +308,14 @@ class Segments:
             self._turns &= np.abs(plane.beyond(corners)) > CLOSE
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         inside, at_edge = covers(inner_rule(degrees[0])[0]), covers(ending_rule(degrees[0])[0])
-        self.within: Array = BULGE * sides * np.where((cells.across < 0).any(axis=1), max(inside, at_edge), inside)
+        self.within: Array = (
+            BULGE * sides * np.where((cells.across < 0).any(axis=1), max(inside, at_edge), inside)
+        )
         self.rule = Points.joined(self._on(self._triangles(Pieces.cells(own))))
 
-    def points(self, near: Places, r: Array, divisions: int, gaps: Callable[[Points], Array]) -> Points:
+    def points(
+        self, near: Places, r: Array, divisions: int, gaps: Callable[[Points], Array]
+    ) -> Points:
         """All points of this rank.
 
         Parameters
@@ -328,22 +360,34 @@ class Segments:
         """The points on triangles that are divided so often."""
         c, along = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
         side = np.linalg.norm(np.einsum("na,nai->ni", along, c[:, 1:] - c[:, :1]), axis=1)
-        corner = np.minimum(np.exp2(np.round(np.log2(self._before / side))), 1 / 64)  # of few values, so of few rules
+        corner = np.minimum(
+            np.exp2(np.round(np.log2(self._before / side))), 1 / 64
+        )  # of few values, so of few rules
         small = triangles.size * 4**divisions <= 2 * LARGE
         kind = np.stack([small, triangles.ends, np.where(triangles.ends > 0, corner, 0)], axis=1)
         made, (kinds, number) = list[Points](), np.unique(kind, axis=0, return_inverse=True)
         for k, (small, ends, part) in enumerate(kinds):
             degree = self._degrees[int(small)]
-            rule = inner_rule(degree) if ends == INSIDE else ending_rule(degree, int(ends), float(part))
+            rule = (
+                inner_rule(degree)
+                if ends == INSIDE
+                else ending_rule(degree, int(ends), float(part))
+            )
             made.append(self._by_rule(triangles.of(number.ravel() == k), *rule, divisions))
         return made
 
     def _by_rule(self, triangles: Triangles, X: Array, weights: Array, divisions: int) -> Points:
-        at = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None] + X[:, 1:] * triangles.e2[:, None]
+        at = (
+            triangles.first[:, None]
+            + X[:, :1] * triangles.e1[:, None]
+            + X[:, 1:] * triangles.e2[:, None]
+        )
         cell, faces = (np.repeat(each, len(X)) for each in (triangles.cell, triangles.faces))
         table = self._cells.element.tabulate(1, at.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
-        weight = np.outer(triangles.size, weights).ravel() * np.linalg.norm(np.cross(a1, a2), axis=1)
+        weight = np.outer(triangles.size, weights).ravel() * np.linalg.norm(
+            np.cross(a1, a2), axis=1
+        )
         on_edge = np.outer(triangles.ends != INSIDE, X.sum(axis=1) > 1 - 2 * BEFORE).ravel()
         return Points(cell, table[0], weight, faces, on_edge, np.full(len(cell), divisions))
 
@@ -410,7 +454,9 @@ class Cuts:
     def at(self, u: Array, divisions: int) -> tuple[Points, Array]:
         """Those of a displacement."""
         r = self._r0 + u
-        points = self._segments.points(self._near(u), r, divisions, lambda points: self._gaps(points, u))
+        points = self._segments.points(
+            self._near(u), r, divisions, lambda points: self._gaps(points, u)
+        )
         return points, self._segments.normals(r)
 
     def numbered(self, u: Array, divisions: int) -> float:
@@ -440,7 +486,8 @@ def sides_of(triangles: Array) -> tuple[Array, Array]:
 def cut_along(triangles: Pieces) -> Pieces:
     """Reference cells cut along the sides of triangles that they face.
 
-    Where these neither overlap nor leave a part of the cell, the pieces are what the cell has in common with each.
+    Where these neither overlap nor leave a part of the cell, the pieces are what the cell has in
+    common with each.
     """
     cells, number = np.unique(triangles.cell, return_inverse=True)
     a, b = sides_of(triangles.corners)
@@ -461,7 +508,9 @@ def cut_along(triangles: Pieces) -> Pieces:
 
 
 def _one_by_one(triangles: Pieces, cells: Longs) -> tuple[Pieces, Pieces]:
-    """What cells have in common with triangles, the later ones without the earlier ones; and what is left."""
+    """What cells have in common with triangles, the later ones without the earlier ones; and what
+    is left.
+    """
     triangles = triangles.of(np.argsort(triangles.cell, kind="stable"))
     first = np.searchsorted(triangles.cell, cells)
     number = np.searchsorted(triangles.cell, cells, "right") - first
@@ -476,7 +525,11 @@ def _one_by_one(triangles: Pieces, cells: Longs) -> tuple[Pieces, Pieces]:
         for k in range(3):
             common = common.cut(a[:, k], b[:, k])
         met = area(common.corners) > NOTHING
-        inside, rest, within = inside.beside(common.of(met)), rest.of(~has).beside(asked.of(~met)), asked.of(met)
+        inside, rest, within = (
+            inside.beside(common.of(met)),
+            rest.of(~has).beside(asked.of(~met)),
+            asked.of(met),
+        )
         for k in range(3):
             rest = rest.beside(within.cut(b[met, k], a[met, k]).some())
             within = within.cut(a[met, k], b[met, k])

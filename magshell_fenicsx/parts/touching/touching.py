@@ -1,19 +1,22 @@
-"""Contact of a shell with itself or of its parts with each other: the penalty of the gap between their faces.
+"""Contact of a shell with itself or of its parts with each other: the penalty of the gap between
+their faces.
 
-Each mid-surface has points of a quadrature. The gap of a point x is |x - y| - h with the nearest place y of the other
-mid-surface: the faces are half a thickness from both. Both surfaces have points, so that each has half of the penalty.
-A gap is a function of the state alone, and has no side: see `through` for steps that would pass through. The points are
-those of a rule on each cell; where cells face others, they are on parts that each face one of them, see `segments`.
+Each mid-surface has points of a quadrature. The gap of a point x is |x - y| - h with the nearest
+place y of the other mid-surface: the faces are half a thickness from both. Both surfaces have
+points, so that each has half of the penalty. A gap is a function of the state alone, and has no
+side: see `through` for steps that would pass through. The points are those of a rule on each cell;
+where cells face others, they are on parts that each face one of them, see `segments`.
 
 With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
 
     d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),   A = F,ab
 
-where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact Mechanics,
-Springer 2006, sec. 4.1 and 9.
+where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact
+Mechanics, Springer 2006, sec. 4.1 and 9.
 
-Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of |x - y| - H(y), less H(x),
-plus h, so that |x - y| need not be the least. Of shells that get thinner H follows from the displacement (`Faces`).
+Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of |x -
+y| - H(y), less H(x), plus h, so that |x - y| need not be the least. Of shells that get thinner H
+follows from the displacement (`Faces`).
 """
 
 from collections.abc import Callable
@@ -28,7 +31,14 @@ from magshell_fenicsx.assembly.coupled import Entries, pairs_of
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
-from magshell_fenicsx.parts.touching.faces import Faces, between, geometry, hessians, slope_of, unknowns
+from magshell_fenicsx.parts.touching.faces import (
+    Faces,
+    between,
+    geometry,
+    hessians,
+    slope_of,
+    unknowns,
+)
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
 from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
@@ -40,10 +50,14 @@ REACH = 4.0  # thicknesses: farther places are not looked for
 AHEAD = 1.0  # of the thickness: cells that are nearer than that have room in the tangent
 EVERYWHERE = 1 - 1e-9  # of the area of a cell, but for rounding
 CHUNK = 1000  # blocks of a tangent at a time
-ASTRAY = 0.1  # of the force, on points that face another cell than where the cuts were made: then they are made anew
+# of the force, on points that face another cell than where the cuts were made: then they are made
+# anew
+ASTRAY = 0.1
 MOST_DIVISIONS = 8  # of triangles in a zone of contact: each halves the distance of its points
 PART = 0.25  # of the thickness: how far points move between two looks at a step
-NEARER = 0.5  # of the thickness: a smaller distance between mid-surfaces is one of those that pass through each other
+# of the thickness: a smaller distance between mid-surfaces is one of those that pass through each
+# other
+NEARER = 0.5
 
 
 class Touching(ContactTerm):
@@ -58,15 +72,18 @@ class Touching(ContactTerm):
     h
         Thickness over R: that of the penalty and of the search where it varies.
     r0, u
-        All nodes (nodes, 3) undeformed, and their displacement at present; the latter is collective.
+        All nodes (nodes, 3) undeformed, and their displacement at present; the latter is
+        collective.
     own, local
-        Number of the first degree of freedom and of the first cell of this rank; how many it has, of cells with ghosts.
+        Number of the first degree of freedom and of the first cell of this rank; how many it has,
+        of cells with ghosts.
     nodes
         Of both parts.
     shape
         The fields that the gap depends on.
     faces
-        How far they are from the mid-surface where the thickness varies, or changes with the state; None where it is h.
+        How far they are from the mid-surface where the thickness varies, or changes with the state;
+        None where it is h.
     """
 
     def __init__(
@@ -101,13 +118,19 @@ class Touching(ContactTerm):
         self._looked_at = Kept[tuple[Places, Places, Joined]]()
         self._cells_at = Kept[tuple[Array, Array, NDArray[np.bool_]]]()
         self._about: Expanded | None = None
-        self._made: tuple[Places | None, float, Entries] = None, 0.0, (np.zeros(0, np.int64),) * 2 + (np.zeros(0),)
+        self._made: tuple[Places | None, float, Entries] = (
+            None,
+            0.0,
+            (np.zeros(0, np.int64),) * 2 + (np.zeros(0),),
+        )
 
     # as a term
 
     @property
     def history(self) -> dict[str, tuple[Number, float]]:
-        """See `FiniteElementSystem`; without a number of its own, a state has the cuts of the undeformed surfaces."""
+        """See `FiniteElementSystem`; without a number of its own, a state has the cuts of the
+        undeformed surfaces.
+        """
         return super().history | {self.pair.cuts: (self.cuts, 0.0)}
 
     def energy(self) -> float:
@@ -121,7 +144,9 @@ class Touching(ContactTerm):
         if places is at and k == self.stiffness.value and not self.look:
             return made
         entries = self._by_parts()
-        entries = self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        entries = (
+            self._faces.entries(self._at, entries, self._forces()[:, 3]) if self._faces else entries
+        )
         if not self.look:
             self._made = at, self.stiffness.value, entries
         return entries
@@ -138,7 +163,9 @@ class Touching(ContactTerm):
         ahead = self._h + AHEAD * (self._far - self._h) / (REACH - 1)
         at = self._facing.places_in(self._points, u, self._facing.placed(u), ahead)
         keys = np.unique(self._points.cell[at.point] * number + at.cell)
-        nodes = np.concatenate([self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1)
+        nodes = np.concatenate(
+            [self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1
+        )
         return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
     def by_field(
@@ -152,7 +179,9 @@ class Touching(ContactTerm):
         if name == "thickness":
             of_cells = self._comm.allreduce(self._in_modelled(by_factor(now, weights)))
             return field, of_cells[self._shape.own, :, None]
-        return field, self._shape.shared(self._comm.allreduce(self._on_modelled(by_place(now, weights))))
+        return field, self._shape.shared(
+            self._comm.allreduce(self._on_modelled(by_place(now, weights)))
+        )
 
     def _present(self) -> Present:
         places, joined, pressed = self._pressed()
@@ -183,7 +212,9 @@ class Touching(ContactTerm):
             part = slice(some[0], after[0] if len(after) else len(keys))
             some_at = at.of(part)
             geometry, placed = self._geometry(some_at), self._facing.placed(self._at)
-            H = hessians(self._cells, some_at, geometry, placed, (weight[part], first[part], second[part]))
+            H = hessians(
+                self._cells, some_at, geometry, placed, (weight[part], first[part], second[part])
+            )
             nodes = geometry[3]
             sums = np.add.reduceat(H, some - some[0], axis=0)
             dofs = unknowns(nodes[some - some[0]], len(self._r0), self._parts)
@@ -198,7 +229,11 @@ class Touching(ContactTerm):
             jointly = several[joined.group]
             _, n, beta, nodes = self._geometry(whole.of(jointly))
             slopes = joined.weight[jointly, None, None] * slope_of(n, beta, self._parts)
-            of_joined = self._points.weight[whole.point[joined.first]] / 2 * (bend - of_group / (BLUR * self._h))
+            of_joined = (
+                self._points.weight[whole.point[joined.first]]
+                / 2
+                * (bend - of_group / (BLUR * self._h))
+            )
             i, j, v = between(slopes, nodes, joined.group[jointly], of_joined, len(self._r0))
             rows, columns, values = [*rows, i], [*columns, j], [*values, v]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
@@ -208,7 +243,9 @@ class Touching(ContactTerm):
     def force(self) -> float:
         """The sum of the pressures over the contact, over E h R; collective."""
         at, joined, (_, first, _) = self._pressed()
-        return float(self._comm.allreduce(float(self._points.weight[at.point[joined.first]] @ first / 2)))
+        return float(
+            self._comm.allreduce(float(self._points.weight[at.point[joined.first]] @ first / 2))
+        )
 
     def least_gap(self) -> float:
         """Over R; nan where no places face each other within the reach; collective."""
@@ -224,7 +261,11 @@ class Touching(ContactTerm):
     def depth(self) -> float:
         """The same over the undeformed thickness there."""
         at, *_ = self._pressed()
-        deep = (self._h - at.distance) / self._facing.thickness(self._points, at) if len(at.point) else at.distance
+        deep = (
+            (self._h - at.distance) / self._facing.thickness(self._points, at)
+            if len(at.point)
+            else at.distance
+        )
         return float(self._comm.allreduce(float(deep.max(initial=0.0)), MPI.MAX))
 
     def deepest(self) -> tuple[float, Array]:
@@ -243,22 +284,29 @@ class Touching(ContactTerm):
         self._pressed()
         if self._about:
             return self._found_of_cells()
-        return self._cells_at.of((self._at, self.cuts.value, self._grown, self.stiffness.value), self._found_of_cells)
+        return self._cells_at.of(
+            (self._at, self.cuts.value, self._grown, self.stiffness.value), self._found_of_cells
+        )
 
     def _found_of_cells(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The mean pressure over E h/R, the least gap over R within the reach, and which are pressed all over.
+        """The mean pressure over E h/R, the least gap over R within the reach, and which are
+        pressed all over.
 
         Of local cells.
 
-        Where an edge alone presses on a face, half of its points' forces acts on each, as the energy has it. Of ghosts
-        the pressure is zero and the gap the reach. Collective.
+        Where an edge alone presses on a face, half of its points' forces acts on each, as the
+        energy has it. Of ghosts the pressure is zero and the gap the reach. Collective.
         """
         at, joined, (_, first, _) = self._pressed()
         points, (start, count) = self._points, self._local
         nearest = at.of(joined.first)
-        alone = self._facing.press_alone(points, nearest, self._cuts.points(self.cuts.value, self._now())[1])
+        alone = self._facing.press_alone(
+            points, nearest, self._cuts.points(self.cuts.value, self._now())[1]
+        )
         size = points.weight[nearest.point] * first
-        faced = np.bincount(nearest.cell, size / 2 * alone, len(self._cells.nodes)).astype(np.float64)
+        faced = np.bincount(nearest.cell, size / 2 * alone, len(self._cells.nodes)).astype(
+            np.float64
+        )
         pushed = self._comm.allreduce(self._in_modelled(faced[:, None])[:, 0])[self._shape.own]
         weight, p, gap = np.ones(count), np.zeros(count), np.full(count, self._far - self._h)
         np.add.at(weight, points.cell - start, points.weight)
@@ -283,11 +331,15 @@ class Touching(ContactTerm):
         return 2 * min(float(each[self._touched].min()) for each in half)
 
     def meet(self, u: Array, v: Array) -> bool:
-        """Whether any cells come near each other between two displacements of all nodes; collective."""
+        """Whether any cells come near each other between two displacements of all nodes;
+        collective.
+        """
         return self._facing.near_on_way(self._of_copies(u), self._of_copies(v))
 
     def gap(self, u: Array) -> float:
-        """The least one of uncut cells, over R, at a displacement of all nodes, as far as the reach; collective."""
+        """The least one of uncut cells, over R, at a displacement of all nodes, as far as the
+        reach; collective.
+        """
         return self._facing.least_distance(self._of_copies(u), self._far) - self._h
 
     def held_gap(self, held: Longs, u: Array) -> float:
@@ -295,9 +347,11 @@ class Touching(ContactTerm):
         return self._facing.held_gap(held, self._of_copies(u))
 
     def through(self, u: Array, v: Array) -> bool:
-        """Whether points pass through a surface on the straight way between two displacements of all nodes; collective.
+        """Whether points pass through a surface on the straight way between two displacements of
+        all nodes; collective.
 
-        Between two looks none moves, relative to another, by more than a part of the least thickness.
+        Between two looks none moves, relative to another, by more than a part of the least
+        thickness.
         """
         return self.passes(self._of_copies(u), self._of_copies(v))
 
@@ -330,19 +384,24 @@ class Touching(ContactTerm):
         moves = -np.einsum("nki,nki->n", slope_of(n, beta, self._parts), moved[nodes])
         moves = np.bincount(joined.group, joined.weight * moves, len(joined.first))
         point, k = at.point[joined.first], self.stiffness.value
-        return Along.of(len(self._points.weight), point, self._h - joined.distance, moves, k, SOFT * self._h)
+        return Along.of(
+            len(self._points.weight), point, self._h - joined.distance, moves, k, SOFT * self._h
+        )
 
     def recut(self) -> float | None:
-        """The number of the present displacement, if cuts there are better than those of the state; collective.
+        """The number of the present displacement, if cuts there are better than those of the state;
+        collective.
 
-        The measure is the part of the force on points that do not face what they faced where the cuts were made, or
-        face an edge that was steep there and is no more, or the other way round.
+        The measure is the part of the force on points that do not face what they faced where the
+        cuts were made, or face an edge that was steep there and is no more, or the other way round.
         """
         u = self._now()
         at, *_ = self._pressed()
         now = self._segments.normals(self._r0 + u)
         turned = self._force(self._points, at.of(self._facing.left_to_edges(self._points, at, now)))
-        turned += self._force(self._points, self._left.of(~self._facing.left_to_edges(self._points, self._left, now)))
+        turned += self._force(
+            self._points, self._left.of(~self._facing.left_to_edges(self._points, self._left, now))
+        )
         astray = self._astray(self._points, at, turned)
         if astray <= ASTRAY:
             return None
@@ -386,7 +445,9 @@ class Touching(ContactTerm):
         where triangles are divided less often than in the zone of contact."""
         elsewhere = points.faces[at.point] != at.cell
         other = at.of(elsewhere | (points.divisions[at.point] < self._divisions))
-        whole, part = self._comm.allreduce(np.array([self._force(points, at), self._force(points, other) + turned]))
+        whole, part = self._comm.allreduce(
+            np.array([self._force(points, at), self._force(points, other) + turned])
+        )
         return float(part / whole) if whole else float(part > 0)
 
     def _force(self, points: Points, at: Places) -> float:
@@ -399,7 +460,9 @@ class Touching(ContactTerm):
         """The places in all cells that may press on cells of this rank at a displacement."""
         far = self._h + self._segments.within
         near = self._facing.places_in(self._rule, u, self._facing.placed(u), float(far.max()))
-        return self._facing.of_far_cells(self._rule, near.of(near.distance < far[self._rule.cell[near.point]]))
+        return self._facing.of_far_cells(
+            self._rule, near.of(near.distance < far[self._rule.cell[near.point]])
+        )
 
     def _gaps(self, points: Points, u: Array) -> Array:
         """The gaps (n,) of points at a displacement over R, as far as they are looked for."""
@@ -426,7 +489,9 @@ class Touching(ContactTerm):
         return forces
 
     def _forces(self) -> Array:
-        """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes, 4)."""
+        """The derivative (nodes, 3) of this rank's energy by the places of all nodes, or (nodes,
+        4).
+        """
         at, joined, (_, first, _) = self._pressed()
         forces = np.zeros((len(self._r0), self._parts))
         if len(at.point):
@@ -446,11 +511,17 @@ class Touching(ContactTerm):
         points, normals = self._cuts.points(self.cuts.value, u)
         if points is not self._points or grown != self._grown or not np.array_equal(u, self._at):
             self._points, self._grown, self._at = points, grown, np.array(u)
-            kept = self._looked_at.of((u, self.cuts.value, grown), lambda: self._faced(points, normals, u))
+            kept = self._looked_at.of(
+                (u, self.cuts.value, grown), lambda: self._faced(points, normals, u)
+            )
             self._places, self._left, self._joined = kept
         joined = self._joined
         pressed = penalty(self._h - joined.distance, self.stiffness.value, SOFT * self._h)
-        return self._places, joined, self.look.of(self._places.point[joined.first], pressed) if self.look else pressed
+        return (
+            self._places,
+            joined,
+            self.look.of(self._places.point[joined.first], pressed) if self.look else pressed,
+        )
 
     def _faced(self, points: Points, normals: Array, u: Array) -> tuple[Places, Places, Joined]:
         """The places that count, those left to edges, and how the former are joined."""

@@ -1,7 +1,8 @@
 """A mesh for the branch on which a run goes on in another model, and the error at the branch's end.
 
-The bifurcation has the mesh of the first model. The larger model has one of its own, found in the same rounds for the
-load of the branch where it ends, at the same volume or displacement; or the displacement there at the same load.
+The bifurcation has the mesh of the first model. The larger model has one of its own, found in the
+same rounds for the load of the branch where it ends, at the same volume or displacement; or the
+displacement there at the same load.
 """
 
 from mpi4py import MPI
@@ -42,7 +43,8 @@ def branched(
 
 
 def branch_error(chosen: Adapted, record: Record) -> float:
-    """The estimated relative error of the result at the end of a branch on the mesh chosen for it; collective.
+    """The estimated relative error of the result at the end of a branch on the mesh chosen for it;
+    collective.
 
     Raises
     ------

@@ -1,4 +1,6 @@
-"""The mesh that a tolerance chooses: its degree, refinement, sizes and layers, and what was estimated on the way."""
+"""The mesh that a tolerance chooses: its degree, refinement, sizes and layers, and what was
+estimated on the way.
+"""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +32,8 @@ class Sampled:
     points, sizes
         (n, 2) of the chart and (n,).
     precision
-        With which gmsh integrates them along edges: they have steps, and its 1e-9 would take 300 000 calls.
+        With which gmsh integrates them along edges: they have steps, and its 1e-9 would take 300
+        000 calls.
     """
 
     points: Array
@@ -72,7 +75,9 @@ def equidistributed(
     expected = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
     change *= np.clip((reduction / expected) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
     change = 2 ** (np.round(STEPS * np.log2(change)) / STEPS)
-    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least)), float(np.mean(change**-2))
+    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least)), float(
+        np.mean(change**-2)
+    )
 
 
 def _smoothed(centres: Array, wish: Array) -> Array:
@@ -85,7 +90,8 @@ def _smoothed(centres: Array, wish: Array) -> Array:
 class Choice:
     """A degree and a mesh; without `size` the elements have the default sizes over `refinement`.
 
-    With `size`, `refinement` only records the mean refinement relative to the default. `layers` are those of a solid.
+    With `size`, `refinement` only records the mean refinement relative to the default. `layers` are
+    those of a solid.
     """
 
     degree: int
@@ -125,11 +131,13 @@ class Adapted:
     asked
         The problem with the tolerance.
     choice, best
-        The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least error.
+        The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least
+        error.
     rounds
         All rounds in order.
     branch
-        The same of the larger model in which the run goes on; None if it does not, or no mesh is found for it.
+        The same of the larger model in which the run goes on; None if it does not, or no mesh is
+        found for it.
     """
 
     asked: Problem
@@ -139,7 +147,8 @@ class Adapted:
     branch: "Adapted | None" = None
 
     def account(self, result: float | None, on_branch: float | None = None) -> dict[str, Any]:
-        """The entry of summary.json; without an estimate if the run ended at another result than the rounds.
+        """The entry of summary.json; without an estimate if the run ended at another result than
+        the rounds.
 
         The chosen mesh may be a cheaper one than that of the best estimate, which is there too.
 
@@ -166,13 +175,19 @@ class Adapted:
         return {"error_estimate": estimate, "rounds": [asdict(r) for r in self.rounds]}
 
     def to_json(self) -> bytes:
-        """All except the problem, in full precision, so that a resumed run has the same mesh on any number of ranks."""
+        """All except the problem, in full precision, so that a resumed run has the same mesh on any
+        number of ranks.
+        """
         return json.dumps(self._plain()).encode()
 
     def _plain(self) -> dict[str, Any]:
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
-        own = {"best": self.rounds.index(self.best), "rounds": [asdict(r) for r in self.rounds], "size": sizes}
+        own = {
+            "best": self.rounds.index(self.best),
+            "rounds": [asdict(r) for r in self.rounds],
+            "size": sizes,
+        }
         return own | ({"branch": self.branch._plain()} if self.branch else {})
 
     @classmethod
@@ -186,4 +201,6 @@ class Adapted:
         best, size = rounds[values["best"]], values["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
         branch = cls._of(asked, values["branch"]) if values.get("branch") else None
-        return cls(asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds, branch)
+        return cls(
+            asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds, branch
+        )

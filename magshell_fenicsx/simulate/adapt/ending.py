@@ -1,8 +1,8 @@
 """The end of a run, and the same end on another mesh without computing the path.
 
-Fields are carried between meshes of one case by the polynomials of each cell. `transfer` smooths, and scales between
-shells of different shape. Here source and target have the same chart, and to a higher degree on the same mesh it is
-exact.
+Fields are carried between meshes of one case by the polynomials of each cell. `transfer` smooths,
+and scales between shells of different shape. Here source and target have the same chart, and to a
+higher degree on the same mesh it is exact.
 """
 
 from dataclasses import dataclass, field
@@ -44,10 +44,15 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
     Raises
     ------
     NotCarried
-        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its shell in `source`,
-        or one of several shells has no chart.
+        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its
+        shell in `source`, or one of several shells has no chart.
     """
-    fields, comm, x, values = CellFields.of(source), target.comm, _chart(target), gathered(source, u)
+    fields, comm, x, values = (
+        CellFields.of(source),
+        target.comm,
+        _chart(target),
+        gathered(source, u),
+    )
     if x.shape[1] > target.model.V.mesh.topology.dim:
         raise NotCarried("a mesh file has no chart")
     moved, worst = np.zeros((len(x), values.shape[2])), (0.0, list[float]())
@@ -60,7 +65,9 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
             worst = max(worst, (float(beside.max()), x[own][np.argmax(beside)].tolist()))
     away, place = max(comm.allgather(worst))
     if away > BESIDE:
-        raise NotCarried(f"the place {place} of the chart is {away:.2g} cells beside the other mesh")
+        raise NotCarried(
+            f"the place {place} of the chart is {away:.2g} cells beside the other mesh"
+        )
     return target.model.system.held(moved.ravel())
 
 
@@ -70,11 +77,15 @@ def _chart(scene: Scene) -> Array:
 
 
 def gathered(scene: Scene, u: Vector) -> Array:
-    """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank; collective."""
+    """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank;
+    collective.
+    """
     system, V = scene.model.system, scene.model.V
     topology = V.mesh.topology
     cells = V.dofmap.list[: topology.index_map(topology.dim).size_local]
-    return np.concatenate(system.comm.allgather(system.with_ghosts(u).reshape(-1, V.dofmap.bs)[cells]))
+    return np.concatenate(
+        system.comm.allgather(system.with_ghosts(u).reshape(-1, V.dofmap.bs)[cells])
+    )
 
 
 class CellFields:
@@ -95,11 +106,15 @@ class CellFields:
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
-            own_nodes = model.midsurface.charted_by_shell(V)[: V.mesh.topology.index_map(2).size_local]
+            own_nodes = model.midsurface.charted_by_shell(V)[
+                : V.mesh.topology.index_map(2).size_local
+            ]
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             x = chart(scene)
-            nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[..., : x.shape[1]]
+            nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[
+                ..., : x.shape[1]
+            ]
         return cls(nodes, scene.model.V.element.basix_element)
 
     def some(self, cells: NDArray[np.bool_]) -> "CellFields":
@@ -134,7 +149,9 @@ class CellFields:
             for tried in candidates.T:
                 xi_tried, off = self._in_cells(x[far], tried)
                 better = far[off < beside[far]]
-                cells[better], xi[better], beside[better] = (a[off < beside[far]] for a in (tried, xi_tried, off))
+                cells[better], xi[better], beside[better] = (
+                    a[off < beside[far]] for a in (tried, xi_tried, off)
+                )
             if count == len(self.nodes):
                 break
             enough = INSIDE if count <= CANDIDATES else BESIDE
@@ -142,7 +159,9 @@ class CellFields:
         return cells, xi, np.where(beside > INSIDE, beside, 0.0)
 
     def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Positions of points in the reference cells of given cells, and distances; inf if Newton's method fails."""
+        """Positions of points in the reference cells of given cells, and distances; inf if Newton's
+        method fails.
+        """
         xi = self._as_if_straight(x, cells)
         beside = np.full(len(x), np.inf)
         near = np.flatnonzero(_beside(xi) < FAR)
@@ -154,7 +173,10 @@ class CellFields:
             rest = x - np.einsum("np,npd->nd", table[0], nodes)
             step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), rest)
             inside = inside + step
-        xi[near], beside[near] = inside, np.where(np.abs(step).max(axis=1) < INSIDE, _beside(inside), np.inf)
+        xi[near], beside[near] = (
+            inside,
+            np.where(np.abs(step).max(axis=1) < INSIDE, _beside(inside), np.inf),
+        )
         return xi, beside
 
     def table(self, derivatives: int, xi: Array) -> Array:
@@ -191,15 +213,17 @@ class Ending:
     Attributes
     ----------
     kind
-        A fold or a target can be computed directly; a target with another conjugate held ("held") and another
-        instability need the path.
+        A fold or a target can be computed directly; a target with another conjugate held ("held")
+        and another instability need the path.
     name
         The amplitude that varied.
     value
-        The result of the run: the amplitude at an instability. At a target, the amplitude if the conjugate
-        displacement is prescribed (force at a depth, pressure at a volume), else the conjugate displacement.
+        The result of the run: the amplitude at an instability. At a target, the amplitude if the
+        conjugate displacement is prescribed (force at a depth, pressure at a volume), else the
+        conjugate displacement.
     tangent
-        Tangent of the path in u; at a fold the null vector. It is the weight of an error of u in the value.
+        Tangent of the path in u; at a fold the null vector. It is the weight of an error of u in
+        the value.
     held
         The prescribed conjugate displacement; None if the load is prescribed.
     """
@@ -241,7 +265,8 @@ class History:
             self.last = record
 
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
-        """The first instability; the last one with `until: bifurcation`; the last target with a target.
+        """The first instability; the last one with `until: bifurcation`; the last target with a
+        target.
 
         Of a run that goes on in another model, or along a branch, the bifurcation where it begins.
 
@@ -264,11 +289,17 @@ class History:
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
         if not self.located:
-            none = "there is no instability up to the target" if steps and steps[-1].load.bound else ""
+            none = (
+                "there is no instability up to the target" if steps and steps[-1].load.bound else ""
+            )
             raise NoResult(stopped or none or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]
-        departures = [record for record in self._departures(scene) if record.step == in_last[0].step]
-        return _instability(departures[0] if departures else in_last[-1 if until == "bifurcation" else 0])
+        departures = [
+            record for record in self._departures(scene) if record.step == in_last[0].step
+        ]
+        return _instability(
+            departures[0] if departures else in_last[-1 if until == "bifurcation" else 0]
+        )
 
     @property
     def handed_over(self) -> bool:
@@ -278,7 +309,9 @@ class History:
     def _departures(self, scene: Scene) -> list[Record]:
         """The bifurcations of steps that leave the path there."""
         steps = scene.problem.programme
-        return [r for r in self.located if r.label == "bifurcation" and leaves_path(steps[r.step - 1])]
+        return [
+            r for r in self.located if r.label == "bifurcation" and leaves_path(steps[r.step - 1])
+        ]
 
 
 def _instability(end: Record) -> Ending:
@@ -286,7 +319,9 @@ def _instability(end: Record) -> Ending:
         raise NoResult("an instability of a turning field is not a single load")
     own_fold = end.label == "fold" and not end.mode
     value = end.point.state.mu[end.amplitude]
-    return Ending("fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du)
+    return Ending(
+        "fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du
+    )
 
 
 def by_path(scene: Scene) -> Ending:
@@ -309,7 +344,8 @@ def by_path(scene: Scene) -> Ending:
 
 
 def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
-    """The end of a scene by Newton's method from the end on another mesh; if this fails, by the path.
+    """The end of a scene by Newton's method from the end on another mesh; if this fails, by the
+    path.
 
     Raises
     ------
@@ -320,7 +356,9 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
 
 
 def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
-    """The end of a scene by Newton's method from the end on another mesh; None if it fails, or needs a path."""
+    """The end of a scene by Newton's method from the end on another mesh; None if it fails, or
+    needs a path.
+    """
     if near.kind in ("held", "instability"):
         return None
     try:
@@ -330,7 +368,11 @@ def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
     guess = with_cuts_here(scene, State(u, dict(near.state.mu)))
     for _ in range(MOST_CHANGED):
         is_fold = near.kind == "fold"
-        end = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
+        end = (
+            _fold(scene, Guess(guess, tangent), near.name)
+            if is_fold
+            else _equilibrium(scene, guess, near)
+        )
         if end is None or (own := of_its_own(scene, end.state)) is None:
             return end
         guess, tangent = own, end.tangent
@@ -347,7 +389,9 @@ def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
 
 def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
-    row: Row = GivenLoad(name, guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    row: Row = (
+        GivenLoad(name, guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    )
     outcome = newton.solve(guess, name, row)
     if not outcome.converged:
         return None
@@ -358,12 +402,22 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
 
 def at_target(scene: Scene, record: Record) -> Ending:
     """The end of a run at a target of the record's step, or of a branch after so many points."""
-    system, state, step = scene.newton.system, record.point.state, scene.problem.programme[record.step - 1].load
+    system, state, step = (
+        scene.newton.system,
+        record.point.state,
+        scene.problem.programme[record.step - 1].load,
+    )
     target = step.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
-    held = -system.potential(state.u, state.mu, name) if by_conjugate and record.amplitude not in FIELDS else None
-    kind: Literal["target", "held"] = "held" if any(how != "load" for how in step.hold.values()) else "target"
+    held = (
+        -system.potential(state.u, state.mu, name)
+        if by_conjugate and record.amplitude not in FIELDS
+        else None
+    )
+    kind: Literal["target", "held"] = (
+        "held" if any(how != "load" for how in step.hold.values()) else "target"
+    )
     return Ending(kind, name, _value(system, state, name, held), state, record.point.du, held)
 
 

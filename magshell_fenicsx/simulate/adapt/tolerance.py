@@ -1,17 +1,20 @@
-"""A mesh for a tolerance of the result: rounds of error estimation and remeshing that need only one path.
+"""A mesh for a tolerance of the result: rounds of error estimation and remeshing that need only one
+path.
 
-    (a) Compute the whole path on a coarse mesh of degree 3, then its end with the degree that suits the tolerance.
-    (b) Compute the end with one degree more; the change of the result estimates the error.
-    (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of it.
-    (d) Else make a mesh on which all cells have equal shares in the error (`indicators`) and the expected error is 0.55
+    (a) Compute the whole path on a coarse mesh of degree 3, then its end with the degree that suits
+    the tolerance. (b) Compute the end with one degree more; the change of the result estimates the
+    error. (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of
+    it. (d) Else make a mesh on which all cells have equal shares in the error (`indicators`) and
+    the expected error is 0.55
         of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
 
-Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where cells cost nothing,
-on a grid and on a surface of few cells the error may be far below a loose tolerance.
+Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where
+cells cost nothing, on a grid and on a surface of few cells the error may be far below a loose
+tolerance.
 
-A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with smaller elements, and
-with one more layer. The two changes of the result estimate the two parts of the error, as if it fell with the square of
-the size; the part that is too large is refined.
+A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with
+smaller elements, and with one more layer. The two changes of the result estimate the two parts of
+the error, as if it fell with the square of the size; the part that is too large is refined.
 """
 
 from collections.abc import Callable
@@ -30,7 +33,15 @@ from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.problem.sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round, equidistributed
-from magshell_fenicsx.simulate.adapt.ending import CellFields, Ending, NoResult, by_path, carry, from_near, gathered
+from magshell_fenicsx.simulate.adapt.ending import (
+    CellFields,
+    Ending,
+    NoResult,
+    by_path,
+    carry,
+    from_near,
+    gathered,
+)
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -42,7 +53,11 @@ PART = 0.4  # each part of the estimated error over the tolerance
 MOST_ROUNDS = 6
 MOST_LAYERS = 9
 Say = Callable[[str], None]
-DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
+DEGREES = (
+    (3e-3, 3),
+    (2e-4, 4),
+    (0.0, 5),
+)  # the fastest degree for tolerances down to the first number
 CHEAP = 3  # degree of the path
 SAFETY = 1.25  # factor of the estimate for the error of the finer solution
 AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
@@ -55,11 +70,12 @@ Solved = tuple[Scene, Ending]
 def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
     """Share of each cell in the error of the result, up to a common factor; collective.
 
-    The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement. Its first
-    variation with the residual is therefore the path's tangent z: J - J_h = a(e_u, e_z) up to higher order, with the
-    tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10,
-    2001). In each cell this is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a
-    solution of higher degree on the same mesh.
+    The result J of a run is an amplitude on a path of stationary points, or its conjugate
+    displacement. Its first variation with the residual is therefore the path's tangent z: J - J_h =
+    a(e_u, e_z) up to higher order, with the tangent stiffness a and the errors e of u and z (dual
+    weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10, 2001). In each cell this is at
+    most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a solution of
+    higher degree on the same mesh.
 
     Parameters
     ----------
@@ -81,7 +97,8 @@ def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tupl
 
 
 class _TangentEnergy:
-    """Membrane and bending energy of the linearised strains of a variation, cell by cell: half the second derivative.
+    """Membrane and bending energy of the linearised strains of a variation, cell by cell: half the
+    second derivative.
 
     With the deformed a_i, n and a_i,j: dE_ij = sym(a_i . v,_j), dK_ij = n . (v,_ij - G^k_ij v,_k).
     """
@@ -96,11 +113,15 @@ class _TangentEnergy:
         normal = np.cross(first[..., 0, :], first[..., 1, :])
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._a, self._raise, self._strain = first, np.linalg.inv(metric0), (metric - metric0) / 2
-        places = np.einsum("qp,npc->nqc", self._table[0], gathered(scene, model.r0.x.array[: model.system.size]))
+        places = np.einsum(
+            "qp,npc->nqc", self._table[0], gathered(scene, model.r0.x.array[: model.system.size])
+        )
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
         own = None
         if (made_of := getattr(model, "made_of", None)) is not None:
-            rows = made_of.x.array.reshape(-1, 4)[: made_of.function_space.dofmap.index_map.size_local]
+            rows = made_of.x.array.reshape(-1, 4)[
+                : made_of.function_space.dofmap.index_map.size_local
+            ]
             own = np.concatenate(scene.comm.allgather(rows))
         self._law = scene.problem.material.law_in(own).at(places, a1, a2, np.cross(a1, a2))
         self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
@@ -115,14 +136,18 @@ class _TangentEnergy:
         K = np.einsum("...c,...ijc->...ij", self._normal, turned)
         E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
         slope = work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
-        bent = (law.bending(self._strain, S, self._raise) for S in (K, -K))  # without what is linear, of plies
+        bent = (
+            law.bending(self._strain, S, self._raise) for S in (K, -K)
+        )  # without what is linear, of plies
         density = slope / 2 + sum(bent) / 2
         return np.asarray((density * self._area) @ self._weights)
 
     def _derivatives(self, v: Vector) -> tuple[Array, Array]:
         """First (cells, points, i, 3) and second (cells, points, i, j, 3) in the reference cell."""
         d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
-        second = np.stack([np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3)
+        second = np.stack(
+            [np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3
+        )
         return np.stack([d[1], d[2]], axis=-2), second
 
 
@@ -150,37 +175,55 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
         if judged.estimate <= tolerance or refinement >= FINEST:
             break
         if plane > PART * tolerance:
-            refinement = round(refinement * float(np.clip((plane / (PART * tolerance)) ** 0.5, SLOWEST, FASTEST)), 3)
+            refinement = round(
+                refinement * float(np.clip((plane / (PART * tolerance)) ** 0.5, SLOWEST, FASTEST)),
+                3,
+            )
             refinement = min(refinement, FINEST)
         layers += through > PART * tolerance and layers < MOST_LAYERS
     if not tried:
         raise NoResult("the first mesh is too large")
     best, choice = min(tried, key=lambda t: t[0].estimate)
     if best.estimate > tolerance:
-        say(f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}")
+        say(
+            f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}"
+        )
     return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
-def _round(problem: Problem, comm: MPI.Comm, refinement: float, layers: int) -> tuple[Round, float, float]:
-    """The result on one mesh, and the relative errors by the size of its elements and by its layers."""
+def _round(
+    problem: Problem, comm: MPI.Comm, refinement: float, layers: int
+) -> tuple[Round, float, float]:
+    """The result on one mesh, and the relative errors by the size of its elements and by its
+    layers.
+    """
 
     def result(refinement: float, layers: int) -> tuple[float, int, int]:
         scene = Choice(SOLID_DEGREE, refinement, layers=layers).scene(problem, comm)
         return by_path(scene).value, scene.cells, scene.model.system.dofs
 
     value, cells, dofs = result(refinement, layers)
-    finer, thicker = result(min(FINER * refinement, FINEST), layers)[0], result(refinement, layers + 1)[0]
+    finer, thicker = (
+        result(min(FINER * refinement, FINEST), layers)[0],
+        result(refinement, layers + 1)[0],
+    )
     scale = max(abs(finer), np.finfo(float).tiny)
     plane = abs(finer - value) / scale / (1 - FINER**-2)
     through = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
-    return Round(SOLID_DEGREE, refinement, cells, dofs, value, plane + through, layers), plane, through
+    return (
+        Round(SOLID_DEGREE, refinement, cells, dofs, value, plane + through, layers),
+        plane,
+        through,
+    )
 
 
-def adapted(problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
+def adapted(
+    problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None
+) -> Adapted:
     """Find a mesh on which the relative error of the result is below `mesh.tolerance`; collective.
 
-    The result is `Ending.value`: k_d or the critical amplitude at an instability; at the last target the load, or the
-    displacement conjugate to a prescribed load. It should not be zero.
+    The result is `Ending.value`: k_d or the critical amplitude at an instability; at the last
+    target the load, or the displacement conjugate to a prescribed load. It should not be zero.
 
     Parameters
     ----------
@@ -228,7 +271,9 @@ def rounds(
         coarse = moved(problem, choice, coarse)
     tried: list[tuple[Round, Choice]] = []
     while True:
-        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
+        doing(
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating"
+        )
         fine = moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
         judged = _judged(choice, coarse, fine)
         tried.append((judged, choice))
@@ -236,18 +281,26 @@ def rounds(
             f"tolerance {tolerance:g}{of}: degree {judged.degree}, {judged.cells} cells, {judged.dofs} unknowns: "
             f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
         )
-        least = 0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance  # what is cheap is not made worse
+        least = (
+            0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance
+        )  # what is cheap is not made worse
         if least <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
             break
         another = _remeshed(choice, coarse, fine, AIM * tolerance / judged.estimate)
         if another is None:
             break
-        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")
+        doing(
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving"
+        )
         choice, coarse = another, moved(problem, another, fine)
     within = [t for t in tried if t[0].estimate <= tolerance]
-    best, choice = min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
+    best, choice = (
+        min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
+    )
     if not within:
-        say(f"warning: no mesh was found for the tolerance{of}; the least estimated error is {best.estimate:.1e}")
+        say(
+            f"warning: no mesh was found for the tolerance{of}; the least estimated error is {best.estimate:.1e}"
+        )
     return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
@@ -275,7 +328,9 @@ def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
 def _judged(choice: Choice, coarse: Solved, fine: Solved) -> Round:
     (scene, low), (_, high) = coarse, fine
     estimate = estimated(low.value, high.value)
-    return Round(choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate)
+    return Round(
+        choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate
+    )
 
 
 def estimated(low: float, high: float) -> float:
@@ -284,7 +339,9 @@ def estimated(low: float, high: float) -> float:
 
 
 def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) -> Choice | None:
-    """The same degree on another mesh, with the error times `reduction`; None if no other mesh is possible."""
+    """The same degree on another mesh, with the error times `reduction`; None if no other mesh is
+    possible.
+    """
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
     if scene.problem.axisymmetric or scene.problem.given or isinstance(scene.problem.shape, Grid):
@@ -297,7 +354,9 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     if reduction > 1 and scene.cells <= FEW:
         return None
     centres, shares = indicators(coarse, fine)
-    size, more = equidistributed(scene.problem.size, centres, shares, order, reduction, scene.problem.material.h)
+    size, more = equidistributed(
+        scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
+    )
     if not _fits(fine[0], 2 * fine[0].model.system.dofs * more):  # twice, since this is an estimate
         return None
     return Choice(degree, round(choice.refinement * more**0.5, 3), size)
@@ -306,7 +365,9 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
 def _fits(scene: Scene, unknowns: float) -> bool:
     """Whether a finer mesh fits into the memory of all ranks; collective."""
     try:
-        refuse_beyond_memory(replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size)
+        refuse_beyond_memory(
+            replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size
+        )
     except CaseError:
         return not scene.comm.allreduce(1)
     return not scene.comm.allreduce(0)

@@ -4,14 +4,16 @@ With R(x; p) = 0 for the state x under the loading device in use, and K = R_x,
 
     dJ/dp = J_p + w . R_p,    K^T w = -J_x
 
-takes one solve for all parameters. For the amplitude at a fold w = -phi/(phi . R_mu) with the left null vector phi.
-Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 for its second variation, and
+takes one solve for all parameters. For the amplitude at a fold w = -phi/(phi . R_mu) with the left
+null vector phi. Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 for
+its second variation, and
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 
-The equations of vibrations and of energy barriers are contracted at several displacements: `Place`. So are those of
-states under a conjugate q that a step holds: it is q = -Pi_mu of the state where the step began, which p changes too.
-So are loads that a step leaves and was not controlled by, as a force at a depth.
+The equations of vibrations and of energy barriers are contracted at several displacements: `Place`.
+So are those of states under a conjugate q that a step holds: it is q = -Pi_mu of the state where
+the step began, which p changes too. So are loads that a step leaves and was not controlled by, as a
+force at a depth.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -52,20 +54,23 @@ NONE: Begins = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Place:
-    """A state at which w . R + c Pi + sum_i c_i dPi/dmu_i, functions of (u, mu; p), are differentiated by p.
+    """A state at which w . R + c Pi + sum_i c_i dPi/dmu_i, functions of (u, mu; p), are
+    differentiated by p.
 
     Attributes
     ----------
     w
         At supports that of a reaction, otherwise zero there.
     rows
-        c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are held.
+        c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are
+        held.
     energy, potentials
         c, and c_i of what J itself contains.
     follows
         Amplitudes of the rows whose conjugates are those of a later place.
     steps
-        How many steps of the programme led to this place, where a later step began; None: all of the record's.
+        How many steps of the programme led to this place, where a later step began; None: all of
+        the record's.
     driven
         Amplitudes that have changed since.
     gas
@@ -120,7 +125,8 @@ class Adjoint:
     by_mu
         dJ/dmu_i where J contains the amplitude itself.
     by_itself
-        What J of a scene and a state is by p alone; None if energies and potentials of the places say it.
+        What J of a scene and a state is by p alone; None if energies and potentials of the places
+        say it.
     directions
         Vectors whose energies J contains.
     value
@@ -130,15 +136,18 @@ class Adjoint:
     free
         The amplitude that J is; "" where it is given.
     scale
-        Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
+        Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp;
+        "": it has none.
     left
-        Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
+        Amplitudes that are loads as an earlier step has left them, which was not controlled by
+        them.
     slope
         What J is of a room, with its own derivatives by a field.
     forms, deflections
         As of a `Functional`.
     about
-        The state about which contact between shells is a polynomial at all places; None: about each place's own.
+        The state about which contact between shells is a polynomial at all places; None: about each
+        place's own.
     """
 
     scene: Scene
@@ -171,11 +180,13 @@ class Adjoint:
         return self.places[0].state
 
 
-def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NONE) -> Adjoint:
+def adjoint_of_instability(
+    scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NONE
+) -> Adjoint:
     """The adjoint of the amplitude where a fold or a neutral wave is.
 
-    A fold takes no factorisation but its own, a wave one of the tangent and one of its second variation; a conjugate
-    that the step holds takes one where the step began.
+    A fold takes no factorisation but its own, a wave one of the tangent and one of its second
+    variation; a conjugate that the step holds takes one where the step began.
 
     Raises
     ------
@@ -186,7 +197,8 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
         return _of_wave(scene, record)
     if record.label != "fold":
         raise CaseError(
-            f"instability: this is a {record.label} {record.mode}".rstrip() + ": only of folds, and of waves"
+            f"instability: this is a {record.label} {record.mode}".rstrip()
+            + ": only of folds, and of waves"
         )
     fold = fold or fold_at(scene, record)
     stage = stage_at(scene, record)
@@ -197,7 +209,9 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     w = stage.device.displacement(left) if stage.device else left
     place = Place(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
-    return with_begins(Adjoint(scene, [place], value=fold.value, gas=gas, free=fold.name), record, begins)
+    return with_begins(
+        Adjoint(scene, [place], value=fold.value, gas=gas, free=fold.name), record, begins
+    )
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -206,19 +220,31 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric
     if model.tees:
-        raise CaseError(f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half")
+        raise CaseError(
+            f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half"
+        )
     system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
     refuse_meeting(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})
     rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
-    value = state.mu[record.amplitude] - Q.value / rate  # what locating it has left, to second order
+    value = (
+        state.mu[record.amplitude] - Q.value / rate
+    )  # what locating it has left, to second order
     along = Direction(phi, m, stiffness=float(-1 / rate))
-    return Adjoint(scene, [Place(state, -w / rate)], directions=[along], value=float(value), free=record.amplitude)
+    return Adjoint(
+        scene,
+        [Place(state, -w / rate)],
+        directions=[along],
+        value=float(value),
+        free=record.amplitude,
+    )
 
 
-def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:
+def variation(
+    model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]
+) -> Functional:
     """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
     terms, system, mu = model.waves.along(phi, m), model.system, state.mu
     rates = {name: by_amplitude(model, terms, name, mu) for name in names}
@@ -228,7 +254,9 @@ def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: It
         for term in terms:
             term.add_residual(by_u, factor_of(term.amplitude, mu))
         value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
-        by_mu = {name: sum((c * term.energy() for term, c in each), 0.0) for name, each in rates.items()}
+        by_mu = {
+            name: sum((c * term.energy() for term, c in each), 0.0) for name, each in rates.items()
+        }
         return Functional(value, system.held(by_u), by_mu)
 
     return system.at(state).of(present)
@@ -237,20 +265,33 @@ def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: It
 def by_amplitude(
     model: Observed, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
 ) -> list[tuple[FormTerm, float]]:
-    """The derivatives of energies by an amplitude that multiplies some of them and may enter others; with factors."""
+    """The derivatives of energies by an amplitude that multiplies some of them and may enter
+    others; with factors.
+    """
     factors = [(term, 1.0) for term in terms if term.amplitude == name]
     p = model.system.parameters[name].constant if name in model.system.parameters else None
     for term in terms:
         if p in term.form.constants():
-            slope = FormTerm(f"{term.name} by {name}", derived(term.form, p), model.u, KernelLog(), term.amplitude)
+            slope = FormTerm(
+                f"{term.name} by {name}",
+                derived(term.form, p),
+                model.u,
+                KernelLog(),
+                term.amplitude,
+            )
             factors.append((slope, factor_of(term.amplitude, mu)))
     return factors
 
 
 def adjoint(
-    scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None, begins: Begins = NONE
+    scene: Scene,
+    record: Record,
+    of: str | Target,
+    hold: Mapping[str, str] | None = None,
+    begins: Begins = NONE,
 ) -> Adjoint:
-    """The adjoint of a result at a regular state; one factorisation and one solve, and these of a step's begin again.
+    """The adjoint of a result at a regular state; one factorisation and one solve, and these of a
+    step's begin again.
 
     Raises
     ------
@@ -262,7 +303,9 @@ def adjoint(
     result = functional(scene, state, column)
     held = held_at(scene, record, state, hold)
     if free := [name for name in result.by_mu if name not in held and not result.slope]:
-        raise CaseError(f"{free[0]}: is a load here, which no parameter changes: hold its conjugate")
+        raise CaseError(
+            f"{free[0]}: is a load here, which no parameter changes: hold its conjugate"
+        )
     w, rows = solved(scene, state, result, held)
     by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
     if result.reaction is not None:
@@ -286,9 +329,11 @@ def adjoint(
 
 
 def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
-    """An adjoint at a record with the places where steps began whose state it depends on; collective.
+    """An adjoint at a record with the places where steps began whose state it depends on;
+    collective.
 
-    It depends on conjugates that a step holds, and on loads as a step has left them by which it was not controlled.
+    It depends on conjugates that a step holds, and on loads as a step has left them by which it was
+    not controlled.
 
     Raises
     ------
@@ -298,7 +343,10 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     scene, places, left = adjoint.scene, list(adjoint.places), set[str]()
     part: Adjoint | None = adjoint
     at = 0  # of the place at the record
-    loads, driven = dict[str, float](), set[str]()  # dJ/dmu of loads as earlier steps have left them
+    loads, driven = (
+        dict[str, float](),
+        set[str](),
+    )  # dJ/dmu of loads as earlier steps have left them
     while record.step:
         place, step, system = (
             part.places[0] if part else None,
@@ -307,21 +355,31 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         )
         earlier = scene.problem.programme[: record.step - 1]
         driven |= _driven(step, record.point.state.mu)
-        held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if place else {}
+        held = (
+            {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
+            if place
+            else {}
+        )
         if record.step not in begins:
             if held:
-                raise CaseError(f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step")
+                raise CaseError(
+                    f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step"
+                )
             break
         begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
         if begin.scene and begin.scene is not scene:
             if held or loads:
                 names = ", ".join({*held, *loads})
-                raise CaseError(f"{names}: as they were before {step.key}, in another model: no gradient")
+                raise CaseError(
+                    f"{names}: as they were before {step.key}, in another model: no gradient"
+                )
             break
         before = system.placed(begin.point.state)
         held_before = held_at(scene, begin, before)
         if part and place:
-            drawn = {name for each in earlier for name in (each.name, *held_by_step(each))} & place.state.mu.keys()
+            drawn = {
+                name for each in earlier for name in (each.name, *held_by_step(each))
+            } & place.state.mu.keys()
             for name in drawn - place.rows.keys() - driven:
                 loads[name] = loads.get(name, 0.0) + by_load(part, name)
         for name, row in held.items():
@@ -331,7 +389,9 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                 share, slope = enclosed(scene, law.gas, before).by_begin(place.state.mu[name])
                 c[name], by_mu[name] = -row * share, row * slope
                 continue
-            now, then = (system.potential(state.u, state.mu, name) for state in (place.state, before))
+            now, then = (
+                system.potential(state.u, state.mu, name) for state in (place.state, before)
+            )
             if abs(now - then) > SAME * max(abs(now), abs(scene.conjugate_unit(name))):
                 raise CaseError(
                     f"{step.key}.hold.{name}: no gradient, as it is not held from the last point before the step"
@@ -349,7 +409,9 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                 slope_u += c_i * system.load(before.u, before.mu, name)
             w, rows = solved(scene, before, Functional(0.0, slope_u, by_mu, c), held_before)
             gas = with_gas(held_before)
-            own = Place(before, w, rows, potentials=c, steps=begin.step, driven=frozenset(driven), gas=gas)
+            own = Place(
+                before, w, rows, potentials=c, steps=begin.step, driven=frozenset(driven), gas=gas
+            )
             at = len(places)
             places.append(own)
             part = Adjoint(scene, [own])
@@ -397,7 +459,9 @@ def with_gas(held: Held) -> bool:
     return any(callable(q) for q in held.values())
 
 
-def solved(scene: Scene, state: State, of: Functional, held: Held) -> tuple[Vector, dict[str, float]]:
+def solved(
+    scene: Scene, state: State, of: Functional, held: Held
+) -> tuple[Vector, dict[str, float]]:
     """w of a number, and of the rows of the device; one factorisation and one solve."""
     system: System = scene.model.system
     device = Device(system, held, dict.fromkeys(held, system.length)) if held else None
@@ -405,7 +469,10 @@ def solved(scene: Scene, state: State, of: Functional, held: Held) -> tuple[Vect
     factors = (scene.newton.on(device) if device else scene.newton).factor_at(whole)
     slope = of.by_u
     if device:
-        slope = device.joined(of.by_u, {name: of.by_mu.get(name, 0.0) + mixed(scene, state, of, name) for name in held})
+        slope = device.joined(
+            of.by_u,
+            {name: of.by_mu.get(name, 0.0) + mixed(scene, state, of, name) for name in held},
+        )
     w = factors.solve_transposed(-slope) if factors.skewed else factors.solve(-slope)
     return np.array(device.displacement(w) if device else w), device.rates(w) if device else {}
 
@@ -413,7 +480,9 @@ def solved(scene: Scene, state: State, of: Functional, held: Held) -> tuple[Vect
 def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
     """What the potentials and the reaction in J change by with an amplitude."""
     system = scene.model.system
-    changes = sum(c * system.curvature(state.u, state.mu, i, name) for i, c in of.potentials.items())
+    changes = sum(
+        c * system.curvature(state.u, state.mu, i, name) for i, c in of.potentials.items()
+    )
     if of.reaction is not None:
         changes += dot(system.comm, of.reaction, system.load(state.u, state.mu, name, held=False))
     return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
@@ -431,7 +500,9 @@ def held_at(
             held[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, how in (hold or {}).items():
         if name not in state.mu or how not in ("load", "conjugate"):
-            raise CaseError(f"hold: {name}: {how}: allowed are load and conjugate of {', '.join(state.mu)}")
+            raise CaseError(
+                f"hold: {name}: {how}: allowed are load and conjugate of {', '.join(state.mu)}"
+            )
         if how == "conjugate":
             held[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held

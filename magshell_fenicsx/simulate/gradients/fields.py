@@ -1,8 +1,9 @@
-"""Derivatives by a field, at the nodes of all cells at once, and as densities per area; those of the mass.
+"""Derivatives by a field, at the nodes of all cells at once, and as densities per area; those of
+the mass.
 
-Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its magnitude, the factor
-of the thickness, the natural curvature in the case's frame, and a deviation w0 of the drawn shape along the normal of
-the perfect one. Of a deviation see `shape`.
+Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its
+magnitude, the factor of the thickness, the natural curvature in the case's frame, and a deviation
+w0 of the drawn shape along the normal of the perfect one. Of a deviation see `shape`.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +31,13 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
-from magshell_fenicsx.simulate.gradients.shape import following, of_measures, of_normals, of_widths, rates
+from magshell_fenicsx.simulate.gradients.shape import (
+    following,
+    of_measures,
+    of_normals,
+    of_widths,
+    rates,
+)
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms, touch_as_in
 from magshell_fenicsx.simulate.transfer import transfer
@@ -40,7 +47,9 @@ if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
+Projection = Callable[
+    [Scene, fem.Function, Array, Array, Array], Array
+]  # of field, forces, places, normals -> forces
 MASS = "mass"
 
 
@@ -80,18 +89,34 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     model, kind = scene.model, FIELDS[name]
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
-        raise CaseError(f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude")
+        raise CaseError(
+            f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude"
+        )
     knowing = [term for term in model.system.terms if isinstance(term, KnowsFields)]
-    if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
-        raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
+    if name == "deviation" and (
+        model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
+    ):
+        raise CaseError(
+            "deviation: no gradient beside bodies, or in a field that is known at points of space"
+        )
 
-    def part(number: int, place: Place, chosen: str | OfPlacement) -> tuple[fem.Function, list[Array]]:
+    def part(
+        number: int, place: Place, chosen: str | OfPlacement
+    ) -> tuple[fem.Function, list[Array]]:
         """The field, of a name or itself, and what a place gives, whose state is set."""
         if origin:
             touch_as_in(origin.scene, scene, origin.places[number].state)
         shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
         coefficient = chosen if isinstance(chosen, str) else chosen.name
-        f = next((c for s in shares for c in s.term.form.coefficients() if c is chosen or c.name == chosen), None)
+        f = next(
+            (
+                c
+                for s in shares
+                for c in s.term.form.coefficients()
+                if c is chosen or c.name == chosen
+            ),
+            None,
+        )
         known = [of for term in knowing if (of := _known(term, place, w, coefficient))]
         f = f or next((of for of, _ in known), None)
         if f is None and slope and slope.field is not None and coefficient == slope.field.name:
@@ -103,7 +128,11 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         forces = [each for _, each in known] + [summed(shares, f, model.u, w, model.kernels)]
         if slope and slope.by_field is not None and slope.field is not None and not number:
             forces += [slope.by_field] if coefficient == slope.field.name else []
-        if model.thin and chosen == "r0" and (by_vertices := of_widths(model, shares, w)) is not None:
+        if (
+            model.thin
+            and chosen == "r0"
+            and (by_vertices := of_widths(model, shares, w)) is not None
+        ):
             forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
         if chosen == "r0":
             forces[-1] += of_normals(adjoint, place, first=not number)
@@ -125,11 +154,17 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     if model.thin and name == "deviation":
-        shares = [share for i, place in enumerate(adjoint.places) for share in _shares(adjoint, i, place, name)]
+        shares = [
+            share
+            for i, place in enumerate(adjoint.places)
+            for share in _shares(adjoint, i, place, name)
+        ]
         for field in following([share.term for share in shares]):
             if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
                 _, by_rate = of(field)
-                each = (np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals))
+                each = (
+                    np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
+                )
                 forces = forces + np.stack(list(each), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
 
@@ -139,20 +174,36 @@ def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Shar
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
     of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
-    shares = [Share(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0) for t, m in of_terms]
+    shares = [
+        Share(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0)
+        for t, m in of_terms
+    ]
     shares += _of_parameters(scene, place, name)
-    for held in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:  # as many of its unit
-        share = -c[held] * scene.model.system.potential(place.state.u, mu, held) / scene.model.load_size[held]
+    for held in (
+        place.rows.keys() & scene.model.load_sizes.keys() - place.follows
+    ):  # as many of its unit
+        share = (
+            -c[held]
+            * scene.model.system.potential(place.state.u, mu, held)
+            / scene.model.load_size[held]
+        )
         shares += [Share(t, share, 0.0) for t in scene.model.size_terms(held)]
     if not number:
-        shares += [Share(t, c * factor_of(t.amplitude, mu), 0.0) for t, c in (*along(scene, adjoint), *adjoint.forms)]
+        shares += [
+            Share(t, c * factor_of(t.amplitude, mu), 0.0)
+            for t, c in (*along(scene, adjoint), *adjoint.forms)
+        ]
     return shares
 
 
-def _known(term: KnowsFields, place: Place, w: fem.Function, name: str) -> tuple[fem.Function, Array] | None:
+def _known(
+    term: KnowsFields, place: Place, w: fem.Function, name: str
+) -> tuple[fem.Function, Array] | None:
     """What a term gives that knows its derivatives by a field itself."""
     mu = factor_of(term.amplitude, place.state.mu)
-    return term.by_field(name, w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu)
+    return term.by_field(
+        name, w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu
+    )
 
 
 def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
@@ -163,7 +214,8 @@ def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
         u, w = (transfer(adjoint.scene, other, v) for v in (place.state.u, place.w))
         places.append(replace(place, state=State(u, mu | dict(place.state.mu)), w=w))
     directions = [
-        d if d.wave is not None else replace(d, phi=transfer(adjoint.scene, other, d.phi)) for d in adjoint.directions
+        d if d.wave is not None else replace(d, phi=transfer(adjoint.scene, other, d.phi))
+        for d in adjoint.directions
     ]
     return replace(adjoint, scene=other, places=places, directions=directions)
 
@@ -190,7 +242,8 @@ def _as_form(scene: Scene, slope: Slope) -> FormTerm:
 
 
 def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Function) -> Array:
-    """By the thickness at the places where bodies start from the shell's face, which lifts them; collective.
+    """By the thickness at the places where bodies start from the shell's face, which lifts them;
+    collective.
 
     To lift a body is to lower the whole shell for this body alone.
     """
@@ -198,25 +251,38 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     assert model.thin  # on which no bodies press
     axes = model.axes
     slopes = np.zeros(
-        (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)
+        (
+            domain.topology.index_map(domain.topology.dim).size_local,
+            f.function_space.element.space_dimension,
+        )
     )
     for contact in scene.problem.loads.contacts:
         if contact.start is None or contact.lift is None:
             continue
-        of_body = [share for share in shares if share.term.name.startswith(f"contact {contact.body}")]
-        forces = domain.comm.allreduce(summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1)))
+        of_body = [
+            share for share in shares if share.term.name.startswith(f"contact {contact.body}")
+        ]
+        forces = domain.comm.allreduce(
+            summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1))
+        )
         if (at_start := _basis_at(model, f, contact.start[axes])) is not None:
             slopes[at_start[0]] -= float(forces @ contact.lift[axes]) * at_start[1]
     return slopes[..., None]
 
 
-def _basis_at(model: "ShellModel | MeridianModel", f: fem.Function, x: Array) -> tuple[int, Array] | None:
-    """The cell of a place of the surface and its basis functions' values there; None on other ranks; collective.
+def _basis_at(
+    model: "ShellModel | MeridianModel", f: fem.Function, x: Array
+) -> tuple[int, Array] | None:
+    """The cell of a place of the surface and its basis functions' values there; None on other
+    ranks; collective.
 
     In the cell it is the nearest place on the plane of the corners.
     """
     element, nodes = f.function_space.element.basix_element, model.V.element.basix_element.points
-    corners = [int(np.abs(nodes - corner).sum(axis=1).argmin()) for corner in basix.geometry(element.cell_type)]
+    corners = [
+        int(np.abs(nodes - corner).sum(axis=1).argmin())
+        for corner in basix.geometry(element.cell_type)
+    ]
     topology, comm = f.function_space.mesh.topology, f.function_space.mesh.comm
     cells = model.V.dofmap.list[: topology.index_map(topology.dim).size_local, corners]
     first, *others = np.moveaxis(model.r0.x.array.reshape(-1, len(x))[cells], 1, 0)
@@ -253,22 +319,40 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         return Scene(replace(problem, thickness=Thickness()), scene.comm)
     loads, natural = problem.loads, problem.loads.natural
     if name == "curvature" and (natural is None or natural.curvature is None):
-        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.problem.context, problem.azimuth))
+        bent = Natural(
+            np.zeros(3),
+            natural.stretch if natural else None,
+            frame(scene.problem.context, problem.azimuth),
+        )
         return Scene(replace(problem, loads=replace(loads, natural=bent)), scene.comm)
     magnetic = loads.magnetic
-    if adjoint.directions and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
+    if (
+        adjoint.directions
+        and FIELDS[name].coefficient == "Br"
+        and magnetic
+        and not callable(magnetic.remanent)
+    ):
         even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
         return Scene(replace(problem, loads=replace(loads, magnetic=even)), scene.comm)
     return scene
 
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
-    """The terms with the field as a coefficient; a remanence that is the same everywhere is no field in the model's."""
-    parts = ((term.forms if isinstance(term, LinearTerm) else (term,)) for term in scene.model.system.terms)
+    """The terms with the field as a coefficient; a remanence that is the same everywhere is no
+    field in the model's.
+    """
+    parts = (
+        (term.forms if isinstance(term, LinearTerm) else (term,))
+        for term in scene.model.system.terms
+    )
     terms: list[Term] = [part for each in parts for part in each]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
-        terms = list(magnetic_terms(scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))))
+        terms = list(
+            magnetic_terms(
+                scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+            )
+        )
     return [term for term in terms if isinstance(term, FormTerm)]
 
 
@@ -286,8 +370,12 @@ def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normal
     return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
 
 
-def _curvatures(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """By kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from those by the tensor in space."""
+def _curvatures(
+    scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array
+) -> Array:
+    """By kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from those by the
+    tensor in space.
+    """
     natural = scene.problem.loads.natural
     assert natural
     return natural.in_frame(forces[..., :6], places, normals)
@@ -299,7 +387,9 @@ def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, norma
 
 
 def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]:
-    """The places of the perfect shell, of which deviations are functions, and its normals, from the drawn one's."""
+    """The places of the perfect shell, of which deviations are functions, and its normals, from the
+    drawn one's.
+    """
     model, outward = scene.model, scene.problem.outward
     assert model.thin
     drawn = model.meridian.embedding if model.axisymmetric else scene.problem.embedding
@@ -307,7 +397,9 @@ def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]
         known = model.at_nodes(outward)[: len(normals)]
         normals = np.where(np.isfinite(known), known, normals)
     w0 = getattr(drawn, "w0", None)
-    return places if w0 is None else places - model.at_nodes(w0)[: len(places), :, None] * normals, normals
+    return places if w0 is None else places - model.at_nodes(w0)[
+        : len(places), :, None
+    ] * normals, normals
 
 
 FIELDS = {
@@ -324,34 +416,52 @@ def mass(scene: Scene) -> Adjoint:
     state = scene.unloaded()
 
     def of(there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
-        t, over, log, u = there.model.thickness, there.model.over_area(), there.model.kernels, there.model.u
+        t, over, log, u = (
+            there.model.thickness,
+            there.model.over_area(),
+            there.model.kernels,
+            there.model.u,
+        )
         if t is None:
             return 1.0, []
-        rho = fem.Constant(t.function_space.mesh, 1.0) if there.model.made_of is None else there.model.made_of[2]
-        terms = FormTerm("mass", over(rho * t[0]), u, log), FormTerm("area", over(rho * 1.0), u, log)
+        rho = (
+            fem.Constant(t.function_space.mesh, 1.0)
+            if there.model.made_of is None
+            else there.model.made_of[2]
+        )
+        terms = (
+            FormTerm("mass", over(rho * t[0]), u, log),
+            FormTerm("area", over(rho * 1.0), u, log),
+        )
         value, area = (scene.comm.allreduce(term.energy()) for term in terms)
         return value / area, [(terms[0], 1 / area), (terms[1], -value / area**2)]
 
     value, forms = of(scene)
     still = Place(state, 0.0 * state.u)
-    return Adjoint(scene, [still], by_itself=lambda there, _: of(there)[0], value=value, forms=forms)
+    return Adjoint(
+        scene, [still], by_itself=lambda there, _: of(there)[0], value=value, forms=forms
+    )
 
 
 def density(scene: Scene, gradient: FieldGradient) -> Array:
-    """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes, components); collective.
+    """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes,
+    components); collective.
 
-    With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the vertices,
+    With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the
+    vertices,
 
         g_v = sum(f H_v)/int(H_v dA)
 
-    is what J changes by where the field changes by one over a unit of area, averaged over about a cell. The sum of
-    g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
+    is what J changes by where the field changes by one over a unit of area, averaged over about a
+    cell. The sum of g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
     """
     V, nodes = scene.model.V, gradient.field.function_space.element.basix_element.points
     H = fem.functionspace(V.mesh, ("Lagrange", 1))
     hat, count = H.element.basix_element, len(gradient.forces)
     area = fem.Function(H)
-    form = scene.model.kernels.compile("area of a vertex", scene.model.over_area()(ufl.TestFunction(H)))
+    form = scene.model.kernels.compile(
+        "area of a vertex", scene.model.over_area()(ufl.TestFunction(H))
+    )
     fem.assemble_vector(area.x.array, form)
     _added(area)
     shares = np.einsum("cnk,nv->cvk", gradient.forces, hat.tabulate(0, nodes)[0, :, :, 0])

@@ -14,7 +14,13 @@ from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, adjoint_of_instability, along, by_load
+from magshell_fenicsx.simulate.gradients.adjoint import (
+    Adjoint,
+    Place,
+    adjoint_of_instability,
+    along,
+    by_load,
+)
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
@@ -27,31 +33,41 @@ from magshell_fenicsx.simulate.touch import pressed_as_at
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
-STRAIGHT = 1e-3  # of a difference: what it changes by over a step where one of second order is exact to some 1e-8
+# of a difference: what it changes by over a step where one of second order is exact to some 1e-8
+STRAIGHT = 1e-3
 BOTH, FOUR = (-1, 1), (-2, -1, 1, 2)  # places of differences of second and fourth order, in steps
 ONE_SIDE = ((0, 1, 2, 3, 4), (0, -1, -2, -3, -4))  # where numbers on the other side are not allowed
 Gradient: TypeAlias = float | FieldGradient
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
-    if name in adjoint.places[0].follows or all(name in {*place.rows, *place.driven} for place in adjoint.places):
+    if name in adjoint.places[0].follows or all(
+        name in {*place.rows, *place.driven} for place in adjoint.places
+    ):
         raise CaseError(f"{name}: is unknown here, as its conjugate is held")
     if name in adjoint.left:
-        raise CaseError(f"{name}: is a load here as an earlier step has left it, which was not controlled by it")
+        raise CaseError(
+            f"{name}: is a load here as an earlier step has left it, which was not controlled by it"
+        )
     return by_load(adjoint, name)
 
 
 def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
     """By a central difference of the contracted equations, on the same mesh: nothing is solved.
 
-    `others` keeps the scenes with other values of this number, for further results of the same scene.
+    `others` keeps the scenes with other values of this number, for further results of the same
+    scene.
     """
     others = {} if others is None else others
     scene = adjoint.scene
     value = number_of(scene.problem.context, key)
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
-    if scene.model.contacts and any(place.follows for place in adjoint.places) and key.startswith("shell."):
+    if (
+        scene.model.contacts
+        and any(place.follows for place in adjoint.places)
+        and key.startswith("shell.")
+    ):
         raise CaseError(
             f"{key}: has no derivative where a conjugate is held beside a body: the first contact shifts it"
         )
@@ -80,11 +96,13 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
 
 
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
-    """df/dp at a value by a difference of numbers that are allowed; a change is small against `size`.
+    """df/dp at a value by a difference of numbers that are allowed; a change is small against
+    `size`.
 
-    At a held displacement an energy or a pressing body is far stiffer in a number than the equilibrium: by a natural
-    stretch e the energy changes by E h R^2 of e^2, and its derivative may be 1e-4 of that. A difference of second order
-    then has the third derivative in it. Where the values are not straight over a step, it is one of fourth order.
+    At a held displacement an energy or a pressing body is far stiffer in a number than the
+    equilibrium: by a natural stretch e the energy changes by E h R^2 of e^2, and its derivative may
+    be 1e-4 of that. A difference of second order then has the third derivative in it. Where the
+    values are not straight over a step, it is one of fourth order.
     """
     step, refused, at = STEP * size, list[CaseError](), cache(f)
 
@@ -114,7 +132,9 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
         return 0.0
     problem = adjoint.scene.problem
     value, size = number_of(problem.context, key), size_of(problem.context, key)
-    return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value, size)
+    return _slope(
+        lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value, size
+    )
 
 
 def _moved(scene: Scene, other: Scene, state: State) -> State:
@@ -122,7 +142,9 @@ def _moved(scene: Scene, other: Scene, state: State) -> State:
 
 
 def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
-    """The residual and the rows of a place in another scene; what is held stays the same number of its unit."""
+    """The residual and the rows of a place in another scene; what is held stays the same number of
+    its unit.
+    """
     system, own_state = other.model.system, place.state
     change = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
     targets = goals(scene, other, "conjugate", place.steps)
@@ -137,7 +159,9 @@ def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
 def _own(other: Scene, place: Place, state: State) -> float:
     """What J itself contains of a place."""
     system = other.model.system
-    value = sum(c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items())
+    value = sum(
+        c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items()
+    )
     if place.energy:
         value += place.energy / other.model.multiplicity * sum(other.energies(state).values())
     return float(value)
@@ -158,23 +182,24 @@ def gradient(
     Parameters
     ----------
     of
-        "instability": the amplitude of a record that is a fold or, on a meridian, a neutral wave ("knockdown" and
-        "critical_field" are names of it, also "buckling_pressure_Pa" and "critical_field_mT"); a column of path.csv
-        (named points, w_over_h, reactions, volume_change, the load where it is not held, energy; those with units too);
-        "omega2_1", "omega2_2", ...: the squared natural frequencies, ascending, and "hertz_1", ...; "barrier": the
-        energy barrier of a last step with until: zero; or a function from undeformed places (n, 3) over R to wanted
-        ones: the mean square distance to them.
+        "instability": the amplitude of a record that is a fold or, on a meridian, a neutral wave
+        ("knockdown" and "critical_field" are names of it, also "buckling_pressure_Pa" and
+        "critical_field_mT"); a column of path.csv (named points, w_over_h, reactions,
+        volume_change, the load where it is not held, energy; those with units too); "omega2_1",
+        "omega2_2", ...: the squared natural frequencies, ascending, and "hertz_1", ...; "barrier":
+        the energy barrier of a last step with until: zero; or a function from undeformed places (n,
+        3) over R to wanted ones: the mean square distance to them.
     by
         One of these, or several: amplitudes ("lambda_m", ...), keys of the case with a number
-        ("magnetic.remanent.polar"), and fields:
-        "remanence" (vectors over |B^r|, of a meridian along e_rho, e_theta, e_z), "magnitude" (a factor of it),
-        "thickness" (over h), "curvature" (the natural one over 1/R in the case's frame: 11, 22, 12) and "deviation"
-        (w0 over R, along the outward normal of the perfect shell).
+        ("magnetic.remanent.polar"), and fields: "remanence" (vectors over |B^r|, of a meridian
+        along e_rho, e_theta, e_z), "magnitude" (a factor of it), "thickness" (over h), "curvature"
+        (the natural one over 1/R in the case's frame: 11, 22, 12) and "deviation" (w0 over R, along
+        the outward normal of the perfect shell).
     fold
         Of `fold_at`, if it is known.
     hold
-        Amplitude -> "load" or "conjugate": what stays while p changes. By default what the record's step holds, and
-        the displacement where that is its control.
+        Amplitude -> "load" or "conjugate": what stays while p changes. By default what the record's
+        step holds, and the displacement where that is its control.
     begin
         Of a barrier, and of a step that holds conjugates: the last record before the step.
 
@@ -190,7 +215,9 @@ def gradient(
         If Newton's method for the fold fails.
     """
     if isinstance(of, str) and of in FOLDS and record.amplitude != FOLDS[of]:
-        raise CaseError(f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}")
+        raise CaseError(
+            f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}"
+        )
     begins = {record.step: begin} if begin else {}
     if of == "instability" or (isinstance(of, str) and of in FOLDS):
         adjoint = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
@@ -200,7 +227,9 @@ def gradient(
 
 
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
-    """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number` for `others`."""
+    """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number`
+    for `others`.
+    """
     size = adjoint.size
     with pressed_as_at(adjoint.scene, adjoint.about):
         if by in FIELDS:

@@ -5,7 +5,12 @@ from dataclasses import replace
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities import registry as quantities
-from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, adjoint_of_instability
+from magshell_fenicsx.simulate.gradients.adjoint import (
+    NONE,
+    Adjoint,
+    Begins,
+    adjoint_of_instability,
+)
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
@@ -29,7 +34,11 @@ class Lost(RuntimeError):
 def located(records: Sequence[Record], amplitude: str) -> list[Record]:
     """Where the path loses its stability in an amplitude."""
     in_amplitude = [r for r in records if r.amplitude == amplitude and not r.branch]
-    return [r for r in in_amplitude if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)]
+    return [
+        r
+        for r in in_amplitude
+        if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)
+    ]
 
 
 def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
@@ -56,7 +65,9 @@ def refuse_unitless(scene: Scene, of: str) -> None:
         If it has none.
     """
     sizes = scene.sizes
-    if of in SCALES and (SCALES[of] not in sizes.of or (of.endswith("_mT") and sizes.field != "mT")):
+    if of in SCALES and (
+        SCALES[of] not in sizes.of or (of.endswith("_mT") and sizes.field != "mT")
+    ):
         bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[of])
         raise CaseError(f"{of}: the case has no such unit; {bare} has none")
 
@@ -70,9 +81,15 @@ def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
         If the path ends at an instability: there the amplitude alone has a gradient.
     """
     column = in_units(scene, end.point.state, of)[0] if isinstance(of, str) else ""
-    load = end.amplitude in FOLDS.values() and column in (end.amplitude, quantities.amplitude(end.amplitude).column)
+    load = end.amplitude in FOLDS.values() and column in (
+        end.amplitude,
+        quantities.amplitude(end.amplitude).column,
+    )
     if end.label in ("fold", "bifurcation") and not load:
-        allowed = ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude) or "none"
+        allowed = (
+            ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude)
+            or "none"
+        )
         raise Lost(
             f"the path ends at a {end.label}, which moves with what varies: only its load has a gradient ({allowed})"
         )
@@ -89,7 +106,8 @@ def as_asked(adjoint: Adjoint, of: object) -> Adjoint:
 def instabilities(
     scene: Scene, records: Sequence[Record], of: str, most: int = MOST, begins: Begins = NONE
 ) -> list[tuple[str, Adjoint]]:
-    """The instabilities of a path by name, the lowest first, and what their derivatives are contracted with.
+    """The instabilities of a path by name, the lowest first, and what their derivatives are
+    contracted with.
 
     Parameters
     ----------
@@ -104,12 +122,18 @@ def instabilities(
         If there is none, or the lowest one has no gradient.
     """
     amplitude = FOLDS[of]
-    ascending = sorted(located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude))
+    ascending = sorted(
+        located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude)
+    )
     by_name = list[tuple[str, Adjoint]]()
-    for record in [r for r in ascending if load(r, amplitude) <= BESIDE * load(ascending[0], amplitude)][:most]:
+    for record in [
+        r for r in ascending if load(r, amplitude) <= BESIDE * load(ascending[0], amplitude)
+    ][:most]:
         name = record.mode or record.label
         try:
-            by_name.append((name, as_asked(adjoint_of_instability(scene, record, begins=begins), of)))
+            by_name.append(
+                (name, as_asked(adjoint_of_instability(scene, record, begins=begins), of))
+            )
         except CaseError as e:
             if not by_name:
                 raise Lost(str(e)) from None

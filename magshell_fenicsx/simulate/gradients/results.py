@@ -1,4 +1,5 @@
-"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history.
+"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a
+history.
 
 Before anything is built names alone say what a problem will have.
 """
@@ -56,14 +57,17 @@ def refuse_no_barrier(problem: Problem) -> None:
         raise CaseError("barrier: needs a last step with until: zero")
 
 
-def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE) -> Adjoint:
+def adjoint_of_barrier(
+    scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE
+) -> Adjoint:
     """The adjoint of the barrier between the begin and the end of the last step.
 
     Both are in equilibrium without the probing force, so that the energy changes by p alone,
 
         dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
 
-    with the conjugates q_i that the probing holds: they are those of its begin, where one solve is for them.
+    with the conjugates q_i that the probing holds: they are those of its begin, where one solve is
+    for them.
 
     Raises
     ------
@@ -80,11 +84,15 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
         if callable(conjugate):
             raise CaseError(f"barrier: {name}: no gradient while a gas is held")
         change[name] = whole * (after.mu[name] - before.mu[name])
-    slope = -np.sum([c * system.load(before.u, before.mu, name) for name, c in change.items()], axis=0)
+    slope = -np.sum(
+        [c * system.load(before.u, before.mu, name) for name, c in change.items()], axis=0
+    )
     q = {name: -c for name, c in change.items()}
     w, rows = 0.0 * before.u, dict[str, float]()
     if change:
-        w, rows = solved(scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before))
+        w, rows = solved(
+            scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before)
+        )
     at_begin = Place(before, w, rows, -whole, q, steps=begin.step)
     earlier = with_begins(Adjoint(scene, [at_begin]), begin, begins)
     still, unknown = 0.0 * after.u, dict.fromkeys(held, 0.0)
@@ -95,7 +103,9 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
     return Adjoint(scene, places, value=value, left=names)
 
 
-def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:
+def refuse_no_result(
+    scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()
+) -> None:
     """See before a history that the results at a key have gradients; `more` are allowed there too.
 
     Raises
@@ -122,7 +132,8 @@ def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Se
 def adjoint_at_end(
     scene: Scene, history: History, of: str | Target, hold: Mapping[str, str] | None = None
 ) -> tuple[str, Adjoint]:
-    """The kind of a result ("" of most) at the last point of a history, and its adjoint; collective.
+    """The kind of a result ("" of most) at the last point of a history, and its adjoint;
+    collective.
 
     Raises
     ------
@@ -177,7 +188,13 @@ class Expected(Scene):
         field = loads.magnetic
         across = ACROSS[: len(field.across)] if field else ()
         driven = ("lambda_m", *across, *(motion.name for motion in field.turns)) if field else ()
-        names = [*(["pressure"] if loads.pressure else []), *driven, *loads.forces, *loads.dead, *self._own_amplitudes]
+        names = [
+            *(["pressure"] if loads.pressure else []),
+            *driven,
+            *loads.forces,
+            *loads.dead,
+            *self._own_amplitudes,
+        ]
         names += [*self.motions, *self.sources, *self.model.contacts]
         return State(np.zeros(0), dict.fromkeys(names, 0.0))
 
@@ -187,7 +204,8 @@ class Expected(Scene):
 
 
 def refuse_unknown_results(problem: Problem, designed: Mapping[str, str]) -> None:
-    """See that the results and parameters of gradients, and the results of a design, are there, by the names alone.
+    """See that the results and parameters of gradients, and the results of a design, are there, by
+    the names alone.
 
     Parameters
     ----------

@@ -1,13 +1,14 @@
 """Derivatives by the drawn shape beside those by the placement that densities contain.
 
-A case with another deviation has other places and normals, and all that is said by them: remanence, thickness and
-natural shape by formulas, loads per area and length, those on an edge in all, and cells of another width. The
-derivative is the sum of those by the placement r0, by the width of the cells, and by each field f that follows from r0,
+A case with another deviation has other places and normals, and all that is said by them: remanence,
+thickness and natural shape by formulas, loads per area and length, those on an edge in all, and
+cells of another width. The derivative is the sum of those by the placement r0, by the width of the
+cells, and by each field f that follows from r0,
 
     dJ/dw0 = n . (dJ/dr0 + dJ/dx) + dJ/df : df/dw0,
 
-where df/dw0 are differences: f in a cell follows from the nodes of this cell alone, so that a node of all cells is
-moved at once. Cells are as wide as the flat triangles between their vertices x.
+where df/dw0 are differences: f in a cell follows from the nodes of this cell alone, so that a node
+of all cells is moved at once. Cells are as wide as the flat triangles between their vertices x.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,22 +32,30 @@ Array = NDArray[np.float64]
 STEP = 1e-4  # of h: of a node
 
 
-def of_measures(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function) -> list[Share]:
+def of_measures(
+    model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function
+) -> list[Share]:
     """What terms add that have been divided by an integral over what they act on; collective."""
     added, comm, v = list[Share](), model.V.mesh.comm, fem.Function(model.V)
     for share in shares:
         if share.term.over is None:
             continue
         v.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
-        along = model.kernels.compile(f"{share.term.name} along", ufl.replace(share.term.form, {model.u: v}))
+        along = model.kernels.compile(
+            f"{share.term.name} along", ufl.replace(share.term.form, {model.u: v})
+        )
         over = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
         value, size = (comm.allreduce(each) for each in (fem.assemble_scalar(along), over.energy()))
         added.append(Share(over, -value / size, 0.0))
     return added
 
 
-def of_widths(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function) -> Array | None:
-    """The derivatives (cells, vertices, 3) by the vertices of flat cells, whose widths are in energies of edges."""
+def of_widths(
+    model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function
+) -> Array | None:
+    """The derivatives (cells, vertices, 3) by the vertices of flat cells, whose widths are in
+    energies of edges.
+    """
     if model.axisymmetric:  # where the placement says how wide they are
         return None
     domain = model.V.mesh
@@ -60,12 +69,20 @@ def of_widths(model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem
         form = share.term.form
         on_edges = any(each.integral_type() != "cell" for each in form.integrals())
         if on_edges and (other := ufl.replace(form, moved)) != form:
-            wide.append(Share(FormTerm(share.term.name, other, model.u, model.kernels), share.energy, share.work))
+            wide.append(
+                Share(
+                    FormTerm(share.term.name, other, model.u, model.kernels),
+                    share.energy,
+                    share.work,
+                )
+            )
     return summed(wide, x, model.u, w, model.kernels) if wide else None
 
 
 def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
-    """The derivatives (own cells, nodes, 3) by normals at points, along which forces and deflections are."""
+    """The derivatives (own cells, nodes, 3) by normals at points, along which forces and
+    deflections are.
+    """
     model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
     if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
@@ -75,7 +92,9 @@ def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
         along.append((force.point, model.force_unit * energy, model.force_unit * mu[name]))
     total: Array | float = 0.0
     for point, of_u, of_w in along:
-        v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(place.w, point)
+        v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(
+            place.w, point
+        )
         at = model.midsurface.points[point], v, model.midsurface.beside(point)
         total = total + by_vertex_normal(model.r0, *at)
     return total
@@ -88,7 +107,8 @@ def following(terms: Sequence[FormTerm]) -> list[OfPlacement]:
 
 
 def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array) -> Iterator[Array]:
-    """What a field (own cells, nodes, size) changes by as each node of all cells moves along its normal; collective.
+    """What a field (own cells, nodes, size) changes by as each node of all cells moves along its
+    normal; collective.
 
     `normals` (own cells, nodes, 3) are those of own cells.
     """

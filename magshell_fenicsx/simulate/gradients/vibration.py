@@ -4,13 +4,14 @@ With K phi = lambda M phi, phi . M phi = 1, about the state x with R(x; p) = 0,
 
     dlambda/dp = phi . K_p phi - lambda phi . M_p phi + w . R_p,    R_x^T w = -(phi . K phi)_x.
 
-phi . K phi is the second derivative of the energy along phi. Its derivatives are differences of the residual's
-between u + e phi and u - e phi, which needs no third derivative of the energy:
+phi . K phi is the second derivative of the energy along phi. Its derivatives are differences of the
+residual's between u + e phi and u - e phi, which needs no third derivative of the energy:
 
     (phi . K phi)_p = phi . (R_p(u + e phi) - R_p(u - e phi))/(2 e),
 
-here of fourth order, and those by u are differences of K phi. Membrane forces are cubic in u: without bending they are
-exact. Of waves around a meridian the second variation is a form of its own.
+here of fourth order, and those by u are differences of K phi. Membrane forces are cubic in u:
+without bending they are exact. Of waves around a meridian the second variation is a form of its
+own.
 """
 
 import math
@@ -86,7 +87,9 @@ def refuse_no_vibration(problem: Problem, of: str) -> None:
         If it has no density.
     """
     if of.startswith("hertz") and problem.time_unit is None:
-        raise CaseError(f"{of}: needs shell.density and shell.youngs_modulus; without them take omega2{of[5:]}")
+        raise CaseError(
+            f"{of}: needs shell.density and shell.youngs_modulus; without them take omega2{of[5:]}"
+        )
 
 
 def vibration(scene: Scene, state: State, of: str) -> Vibration:
@@ -94,8 +97,11 @@ def vibration(scene: Scene, state: State, of: str) -> Vibration:
     return vibrations(scene, state, of)[0]
 
 
-def vibrations(scene: Scene, state: State, of: str, *, beside: float = 1.0, most: int = 1) -> list[Vibration]:
-    """The vibration of a name such as "omega2_1", and the next ones; collective. Overwrites the model's tangent.
+def vibrations(
+    scene: Scene, state: State, of: str, *, beside: float = 1.0, most: int = 1
+) -> list[Vibration]:
+    """The vibration of a name such as "omega2_1", and the next ones; collective. Overwrites the
+    model's tangent.
 
     Parameters
     ----------
@@ -110,7 +116,9 @@ def vibrations(scene: Scene, state: State, of: str, *, beside: float = 1.0, most
         If it cannot be computed.
     """
     if seen_on(scene.model).model is not scene.model:
-        raise Lost(f"{of}: a sector has the modes of its own planes alone: take symmetry: half or none")
+        raise Lost(
+            f"{of}: a sector has the modes of its own planes alone: take symmetry: half or none"
+        )
     number = int(of.partition("_")[2])
     count = number + most
     while True:
@@ -168,7 +176,8 @@ def adjoints_of_vibrations(
     most: int = 1,
     begins: Begins = NONE,
 ) -> list[tuple[str, Adjoint]]:
-    """The kinds of vibrations about a regular state, and their adjoints: one factorisation more for each.
+    """The kinds of vibrations about a regular state, and their adjoints: one factorisation more for
+    each.
 
     Parameters
     ----------
@@ -182,7 +191,8 @@ def adjoints_of_vibrations(
     Lost
         If the state has no such vibration.
     CaseError
-        If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave where shells touch.
+        If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave
+        where shells touch.
     """
     state = rigid(scene, scene.model.system.placed(record.point.state))
     if bodies := pressing(scene, state):
@@ -193,7 +203,11 @@ def adjoints_of_vibrations(
     held = held_at(scene, record, state, hold)
     kinds = vibrations(scene, state, of, beside=beside, most=most)
     made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in kinds]
-    return made if hold is not None else [(kind, with_begins(each, record, begins)) for kind, each in made]
+    return (
+        made
+        if hold is not None
+        else [(kind, with_begins(each, record, begins)) for kind, each in made]
+    )
 
 
 def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: Held) -> Adjoint:
@@ -209,7 +223,11 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
     by_u = np.sum([s.by_u for s in slopes], axis=0) * c
     by_mu = {name: c * sum(s.by_mu[name] for s in slopes) for name in held}
     # nothing displaces a shell that nothing loads, whatever changes
-    w, rows = (0.0 * by_u, {}) if scene.loose else solved(scene, state, Functional(value, by_u, by_mu), held)
+    w, rows = (
+        (0.0 * by_u, {})
+        if scene.loose
+        else solved(scene, state, Functional(value, by_u, by_mu), held)
+    )
     places, directions = [Place(state, w, rows)], list[Direction]()
     for mode in vibration.modes:
         if (m := _wave(mode)) is not None:
@@ -222,7 +240,9 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
     by_itself = lambda there, _: frequency(there.problem, of, vibration.value)  # noqa: E731
     gas = with_gas(held)
-    return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas, about=about)
+    return Adjoint(
+        scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas, about=about
+    )
 
 
 def _wave(mode: ShellMode) -> int | None:
@@ -231,15 +251,23 @@ def _wave(mode: ShellMode) -> int | None:
     return int(mode.label.removeprefix(WAVE)) if mode.label.startswith(WAVE) else None
 
 
-def _slopes(scene: Scene, state: State, mode: ShellMode, held: list[str], away: float) -> Functional:
+def _slopes(
+    scene: Scene, state: State, mode: ShellMode, held: list[str], away: float
+) -> Functional:
     """phi . K phi with its derivatives by u and by amplitudes that are unknown."""
     system, phi = scene.model.system, mode.vector
     if (m := _wave(mode)) is not None:
         assert scene.model.axisymmetric
         return variation(scene.model, state, phi, m, held)
     if mode.label:
-        raise CaseError(f"{mode.label}: the vibration leaves the symmetry of the model: take symmetry: none")
-    step, by_u, by_mu = system.step_along(phi, away), np.zeros(system.size), dict.fromkeys(held, 0.0)
+        raise CaseError(
+            f"{mode.label}: the vibration leaves the symmetry of the model: take symmetry: none"
+        )
+    step, by_u, by_mu = (
+        system.step_along(phi, away),
+        np.zeros(system.size),
+        dict.fromkeys(held, 0.0),
+    )
     for way, weight in CENTRAL.items():
         u, part = state.u + way * step * phi, weight / step
         K = symmetric_part(system.tangent(u, state.mu))

@@ -39,7 +39,9 @@ def hemisphere(
     phi_o = dimple[1] * np.sqrt(h) / (12 * (1 - nu**2)) ** 0.25 if dimple else None
     placed = spherical(Dimple(dimple[0] * h, phi_o) if dimple and phi_o else None)
     vertices = graded_vertices(np.pi / 2, [phi_o] if phi_o else [], h, refinement=refinement)
-    return MeridianModel(make_meridian(placed, vertices), Material(nu, h), degree, {"rim": condition}, loads, sigma)
+    return MeridianModel(
+        make_meridian(placed, vertices), Material(nu, h), degree, {"rim": condition}, loads, sigma
+    )
 
 
 def unloaded(model: MeridianModel) -> State:
@@ -59,7 +61,12 @@ def buckle(model: MeridianModel, lambda_m: float) -> Buckling:
     """The field first, then the pressure, as a case does it."""
     newton, state = BorderedNewton(model.system), unloaded(model)
     if lambda_m:
-        field = Path(newton, "lambda_m", "load", StepOptions(abs(lambda_m) / 2, abs(lambda_m), abs(lambda_m) * 1e-4))
+        field = Path(
+            newton,
+            "lambda_m",
+            "load",
+            StepOptions(abs(lambda_m) / 2, abs(lambda_m), abs(lambda_m) * 1e-4),
+        )
         for point, _ in field.towards(field.start(state), [lambda_m]):
             assert point.negative_pivots == 0
             state = point.state
@@ -91,7 +98,9 @@ def buckled(R_over_h: float, lambda_m: float) -> tuple[MeridianModel, Buckling]:
 def indent(model: MeridianModel, depths: list[float]) -> list[float]:
     """F R/(2 pi D) at depths w/h of the pole."""
     unit = model.force_unit * model.material.h
-    path = Path(BorderedNewton(model.system), "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit))
+    path = Path(
+        BorderedNewton(model.system), "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit)
+    )
     points = path.towards(path.start(unloaded(model)), [unit * depth for depth in depths])
     return [point.state.mu["force"] for point, reached in points if reached]
 

@@ -1,4 +1,6 @@
-"""Joined coaxial shells on their meridians: beams on elastic foundations, a shell cut in two, differences."""
+"""Joined coaxial shells on their meridians: beams on elastic foundations, a shell cut in two,
+differences.
+"""
 
 from typing import Any
 
@@ -17,10 +19,17 @@ NU, THIN, THICK, LENGTH, PRESSURE = 0.3, 1e-4, 2e-4, 0.15, 1e-6
 PRESSED = {"kind": "pressure", "until": "target", "pressure": PRESSURE, "points": 1}
 
 
-def cylinder(z: float, h: float, points: dict[str, Any] | None = None, **keys: Any) -> dict[str, Any]:
+def cylinder(
+    z: float, h: float, points: dict[str, Any] | None = None, **keys: Any
+) -> dict[str, Any]:
     shell = {"geometry": "cylinder", "radius": 1, "length": LENGTH, "thickness": h}
     material = {"youngs_modulus": 1, "poisson_ratio": NU}
-    return {"shell": {**shell, **material}, "place": {"position": [0, 0, z]}, "points": points or {}, **keys}
+    return {
+        "shell": {**shell, **material},
+        "place": {"position": [0, 0, z]},
+        "points": points or {},
+        **keys,
+    }
 
 
 def end(data: dict[str, Any]) -> tuple[Scene, Record, dict[str, Any]]:
@@ -30,15 +39,19 @@ def end(data: dict[str, Any]) -> tuple[Scene, Record, dict[str, Any]]:
 
 
 def beam(h: float) -> tuple[float, float, float]:
-    """Bending stiffness, decay, and the radial displacement under p = 1 of a long cylinder (R = E = 1)."""
+    """Bending stiffness, decay, and the radial displacement under p = 1 of a long cylinder (R = E =
+    1).
+    """
     return h**3 / (12 * (1 - NU**2)), (3 * (1 - NU**2)) ** 0.25 / np.sqrt(h), -1 / h
 
 
 def of_two_cylinders(k: float) -> float:
-    """Where they meet, under p = 1, joined by a spring k: Timoshenko & Woinowsky-Krieger, Plates and Shells, 114.
+    """Where they meet, under p = 1, joined by a spring k: Timoshenko & Woinowsky-Krieger, Plates
+    and Shells, 114.
 
-    With w = delta + exp(-beta x)(A cos beta x + B sin beta x), x away from the joint, w' = beta (B - A),
-    w'' = -2 beta^2 B and w''' = 2 beta^3 (A + B) there; shear and moment are D w''' and D w''.
+    With w = delta + exp(-beta x)(A cos beta x + B sin beta x), x away from the joint, w' = beta (B
+    - A), w'' = -2 beta^2 B and w''' = 2 beta^3 (A + B) there; shear and moment are D w''' and D
+    w''.
     """
     (D, b, d), (E, c, e) = beam(THIN), beam(THICK)
     rows = [
@@ -53,27 +66,47 @@ def of_two_cylinders(k: float) -> float:
 
 @pytest.mark.parametrize("kind", ["rigid", "hinge", "spring"])
 def test_two_cylinders(kind: str) -> None:
-    """Of different thickness, joined, under pressure: where they meet they move as by beam theory, 1e-5."""
+    """Of different thickness, joined, under pressure: where they meet they move as by beam theory,
+    1e-5.
+    """
     D, b, _ = beam(THIN)
     k = {"rigid": 1e6 * D * b, "hinge": 0.0, "spring": D * b}[kind]
-    joint = {"edges": ["low.top", "high.bottom"], "kind": kind, **({"stiffness": k} if kind == "spring" else {})}
+    joint = {
+        "edges": ["low.top", "high.bottom"],
+        "kind": kind,
+        **({"stiffness": k} if kind == "spring" else {}),
+    }
     low = cylinder(0, THIN, {"joint": [1, 0, LENGTH]}, boundary={"bottom": "clamped"})
     scene, _, seen = end(
-        {"shells": {"low": low, "high": cylinder(LENGTH, THICK)}, "joints": [joint], "loading": PRESSED}
+        {
+            "shells": {"low": low, "high": cylinder(LENGTH, THICK)},
+            "joints": [joint],
+            "loading": PRESSED,
+        }
     )
     p = PRESSURE * scene.model.material.classical_pressure
     assert seen["low_joint_ux"] == pytest.approx(p * of_two_cylinders(k), rel=1e-5)
 
 
 def test_a_ring_in_a_cylinder() -> None:
-    """A T-junction: the beam at a point support of a ring by Lamé; what is left is what the tie gives way, 2e-4."""
+    """A T-junction: the beam at a point support of a ring by Lamé; what is left is what the tie
+    gives way, 2e-4.
+    """
     inner = 0.97
     wall = cylinder(0, THIN, {"foot": [1, 0, LENGTH / 2]}, boundary={"bottom": "clamped"})
-    ring = {"geometry": "annulus", "radius": 1, "inner_radius": inner, "thickness": THICK, "youngs_modulus": 1}
+    ring = {
+        "geometry": "annulus",
+        "radius": 1,
+        "inner_radius": inner,
+        "thickness": THICK,
+        "youngs_modulus": 1,
+    }
     rib = {"shell": {**ring, "poisson_ratio": NU}, "place": {"position": [0, 0, LENGTH / 2]}}
     joints = [{"edges": ["rib.outer", "wall"]}]
     loading = {**PRESSED, "on": {"wall": "outside"}}
-    scene, _, seen = end({"shells": {"wall": wall, "rib": rib}, "joints": joints, "loading": loading})
+    scene, _, seen = end(
+        {"shells": {"wall": wall, "rib": rib}, "joints": joints, "loading": loading}
+    )
     D, b, d = beam(THIN)
     of_ring = ((1 - NU) + (1 + NU) * inner**2) / (1 - inner**2) / THICK
     force = d / (of_ring + 1 / (8 * b**3 * D))
@@ -82,7 +115,14 @@ def test_a_ring_in_a_cylinder() -> None:
 
 
 def cap(**keys: Any) -> dict[str, Any]:
-    shell = {"geometry": "cap", "radius": 1, "thickness": 0.03, "youngs_modulus": 1, "poisson_ratio": 0.3, **keys}
+    shell = {
+        "geometry": "cap",
+        "radius": 1,
+        "thickness": 0.03,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
+        **keys,
+    }
     return {"shell": shell}
 
 
@@ -92,13 +132,20 @@ def test_a_shell_cut_in_two_is_the_shell() -> None:
     loading = {"kind": "pressure", "until": "bifurcation"}
     cut = {"shells": {"top": top, "low": low}, "joints": [{"edges": ["low.hole", "top.rim"]}]}
     shell = {**cap(polar=80), "boundary": {"rim": "clamped"}}
-    one, other = (end({**data, "loading": loading, "mesh": {"size": 2 * np.pi / 180}})[1] for data in (cut, shell))
+    one, other = (
+        end({**data, "loading": loading, "mesh": {"size": 2 * np.pi / 180}})[1]
+        for data in (cut, shell)
+    )
     assert one.mode == other.mode != "symmetric"
-    assert one.point.state.mu["pressure"] == pytest.approx(other.point.state.mu["pressure"], rel=1e-9)
+    assert one.point.state.mu["pressure"] == pytest.approx(
+        other.point.state.mu["pressure"], rel=1e-9
+    )
 
 
 def test_frequencies_of_a_free_shell_cut_in_two() -> None:
-    """Its rigid motions are those of one body, and its vibrations those of the shell, 1e-5 on coarse cells."""
+    """Its rigid motions are those of one body, and its vibrations those of the shell, 1e-5 on
+    coarse cells.
+    """
     cut = {"shells": {"top": cap(polar=40), "low": cap(polar=80, hole=40)}}
     cut |= {"joints": [{"edges": ["low.hole", "top.rim"]}]}
     found = []
@@ -138,10 +185,14 @@ RING = {
 }
 
 
-@pytest.mark.parametrize("edges", [["dome.rim", "wall.top"], ["ring.outer", "wall"]], ids=["edges", "tee"])
+@pytest.mark.parametrize(
+    "edges", [["dome.rim", "wall.top"], ["ring.outer", "wall"]], ids=["edges", "tee"]
+)
 def test_derivatives(edges: list[str]) -> None:
     """Of energy and forces against differences at a rough state; more with a stiffer spring."""
-    shells = {"wall": WALL, "dome": DOME} if edges[0] == "dome.rim" else {"wall": WALL, "ring": RING}
+    shells = (
+        {"wall": WALL, "dome": DOME} if edges[0] == "dome.rim" else {"wall": WALL, "ring": RING}
+    )
     products = []
     for stiffness in (1e-4, 2e-4):
         joints = [{"edges": edges, "kind": "spring", "stiffness": stiffness}]
@@ -155,7 +206,9 @@ def test_derivatives(edges: list[str]) -> None:
         x.setArray(v)
         K.mult(x, product)
         low, high = (system.residual(u + side * 1e-7 * v, mu) for side in (-0.5, 0.5))
-        assert np.abs((high - low) / 1e-7 - product.array).max() < 1e-6 * np.abs(product.array).max()
+        assert (
+            np.abs((high - low) / 1e-7 - product.array).max() < 1e-6 * np.abs(product.array).max()
+        )
         products.append(v @ product.array)
     assert products[1] > products[0]
 
@@ -171,22 +224,43 @@ def test_dome_on_wall() -> None:
 def test_a_half_of_both_surfaces() -> None:
     """Folded by a spring, then pressed: as a half with cells of 0.12, 2e-5."""
     case = read_source(CASES / "dome_on_wall.yaml").data
-    joints = [{"edges": ["dome.rim", "wall.top"], "kind": "spring", "stiffness": 1e-5, "angle": -40}]
-    case |= {"joints": joints, "loading": {"kind": "pressure", "until": "target", "pressure": 0.25, "points": 1}}
+    joints = [
+        {"edges": ["dome.rim", "wall.top"], "kind": "spring", "stiffness": 1e-5, "angle": -40}
+    ]
+    case |= {
+        "joints": joints,
+        "loading": {"kind": "pressure", "until": "target", "pressure": 0.25, "points": 1},
+    }
     _, _, seen = end(case)
     _, _, half = end(case | {"symmetry": "half", "mesh": {"size": 0.12}})
     for key in ("volume_change", "dome_top_uz"):
         assert seen[key] == pytest.approx(half[key], rel=2e-5)
 
 
-RIM = {"geometry": "annulus", "radius": 1, "inner_radius": 0.8, "thickness": 0.02, "youngs_modulus": 1}
+RIM = {
+    "geometry": "annulus",
+    "radius": 1,
+    "inner_radius": 0.8,
+    "thickness": 0.02,
+    "youngs_modulus": 1,
+}
 BOX = {
     "outer": {**cylinder(0, 0.02), "boundary": {}},
     "top": {"shell": {**RIM, "poisson_ratio": NU}, "place": {"position": [0, 0, LENGTH]}},
-    "low": {"shell": {**RIM, "poisson_ratio": NU}, "place": {"axis": {"polar": 180}}, "boundary": {"inner": "clamped"}},
+    "low": {
+        "shell": {**RIM, "poisson_ratio": NU},
+        "place": {"axis": {"polar": 180}},
+        "boundary": {"inner": "clamped"},
+    },
 }
 AROUND = [{"edges": ["outer.top", "top.outer"]}, {"edges": ["outer.bottom", "low.outer"]}]
-TUBE = {"geometry": "torus", "radius": 1, "tube_radius": 0.3, "thickness": 0.02, "youngs_modulus": 1}
+TUBE = {
+    "geometry": "torus",
+    "radius": 1,
+    "tube_radius": 0.3,
+    "thickness": 0.02,
+    "youngs_modulus": 1,
+}
 CLOSED = {
     "shells": {
         "up": {"shell": {**TUBE, "poisson_ratio": NU, "tube": [0, 180]}, "boundary": {}},
@@ -196,9 +270,15 @@ CLOSED = {
 }
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "ring": (CLOSED, "joints: shells are joined in a ring"),
-    "contact": ({"contact": [["outer", "top"]]}, "contact: shells that are joined to each other are modelled with"),
+    "contact": (
+        {"contact": [["outer", "top"]]},
+        "contact: shells that are joined to each other are modelled with",
+    ),
     "sides": ({"joints": [{"edges": ["outer.top", "low.outer"]}]}, "point to opposite sides"),
-    "apart": ({"joints": [{"edges": ["outer.top", "top.inner"]}]}, "point to opposite sides|do not meet"),
+    "apart": (
+        {"joints": [{"edges": ["outer.top", "top.inner"]}]},
+        "point to opposite sides|do not meet",
+    ),
     "none": ({"joints": [{"edges": ["outer.top", "top.rim"]}]}, "there is no such edge"),
 }
 

@@ -1,4 +1,6 @@
-"""What the meridian model and the full shell must have in common: energies, volume, the surface itself."""
+"""What the meridian model and the full shell must have in common: energies, volume, the surface
+itself.
+"""
 
 import numpy as np
 import pytest
@@ -29,7 +31,9 @@ def displacement(phi: Array) -> tuple[Array, Array]:
     [
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
-        Magnetisation(WithinRims(((REACH.inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
+        Magnetisation(
+            WithinRims(((REACH.inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])
+        ),
     ],
 )
 def test_energies_and_volume(field: Magnetisation) -> None:
@@ -39,7 +43,9 @@ def test_energies_and_volume(field: Magnetisation) -> None:
     phi = line.V.tabulate_dof_coordinates()[:, 0]
     on_line = np.column_stack(displacement(phi)).ravel()
 
-    surface = ShellModel(triangulated(0.1, dimple=DIMPLE), Material(nu, 1 / R_over_h), 4, {"rim": "clamped"}, loads)
+    surface = ShellModel(
+        triangulated(0.1, dimple=DIMPLE), Material(nu, 1 / R_over_h), 4, {"rim": "clamped"}, loads
+    )
     x, y, z = surface.r0.x.array.reshape(-1, 3).T
     phi, theta = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
     U, W = displacement(phi)
@@ -52,7 +58,9 @@ def test_energies_and_volume(field: Magnetisation) -> None:
             continue  # their penalty depends on the mesh
         assert found[name] == pytest.approx(expected[name], rel=2e-5), name
     assert line.volume_change(on_line) == pytest.approx(surface.volume_change(on_surface), rel=2e-5)
-    assert line.deflection(on_line, "pole") == pytest.approx(surface.deflection(on_surface, "pole"), rel=1e-12)
+    assert line.deflection(on_line, "pole") == pytest.approx(
+        surface.deflection(on_surface, "pole"), rel=1e-12
+    )
 
 
 def test_surface_of_revolution() -> None:

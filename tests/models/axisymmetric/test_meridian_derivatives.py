@@ -17,7 +17,15 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.meridian import MeridianModel
 
 TERMS = ["membrane", "bending", "interior edges", "clamped edges", "magnetic", "pressure"]
-RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "load moment b 0"]
+RING_TERMS = [
+    "membrane",
+    "bending",
+    "interior edges",
+    "mirror edges",
+    "magnetic",
+    "load",
+    "load moment b 0",
+]
 FACTORS = {"lambda_m": 0.02, "pressure": 0.3, "load": 0.5}
 
 
@@ -27,17 +35,25 @@ def coarse() -> MeridianModel:
 
 
 def ring() -> MeridianModel:
-    """A tube of varying thickness that opens like a trumpet, mirrored at its one end and loaded at the other."""
+    """A tube of varying thickness that opens like a trumpet, mirrored at its one end and loaded at
+    the other.
+    """
 
     def trumpet(chart: np.ndarray) -> np.ndarray:
         s = chart[:, 0]
         return np.column_stack([1 + 0.3 * s**2, 0 * s, -s])
 
-    dead = (EdgeForce("b", np.array([0.0, 0.0, 0.1]), total=False), AreaForce(None, 0.02), EdgeMoment("b", 0.03))
+    dead = (
+        EdgeForce("b", np.array([0.0, 0.0, 0.1]), total=False),
+        AreaForce(None, 0.02),
+        EdgeMoment("b", 0.03),
+    )
     meridian = make_meridian(trumpet, np.linspace(0, 1, 4), ("a", "b"), {"pole": (1.0, 0.0)})
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2)
     loads = Loads(magnetic=ALONG_AXIS, dead={"load": dead})
-    return MeridianModel(meridian, Material(0.3, 0.05), 4, {"a": "plane"}, loads, thickness=thickness)
+    return MeridianModel(
+        meridian, Material(0.3, 0.05), 4, {"a": "plane"}, loads, thickness=thickness
+    )
 
 
 def turning() -> MeridianModel:
@@ -55,13 +71,20 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
     v[system._fixed] = 0
 
     def energy(x: np.ndarray) -> float:
-        return sum((mu[t.amplitude] if t.amplitude else 1) * system.energies(x)[t.name] for t in system.terms)
+        return sum(
+            (mu[t.amplitude] if t.amplitude else 1) * system.energies(x)[t.name]
+            for t in system.terms
+        )
 
     def rate(f, e: float = 1e-5):  # type: ignore[no-untyped-def]
-        return (8 * (f(u + e * v) - f(u - e * v)) - (f(u + 2 * e * v) - f(u - 2 * e * v))) / (12 * e)
+        return (8 * (f(u + e * v) - f(u - e * v)) - (f(u + 2 * e * v) - f(u - 2 * e * v))) / (
+            12 * e
+        )
 
     R = system.residual(u, mu)
-    assert R @ v == pytest.approx(rate(energy), rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v))
+    assert R @ v == pytest.approx(
+        rate(energy), rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v)
+    )
     rows, columns, values = system.tangent(u, mu).getValuesCSR()
     K = scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size)).toarray()
     assert np.abs(K - K.T).max() <= 1e-12 * np.abs(K).max()
@@ -80,7 +103,9 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
 def test_term_alone(made: str, name: str) -> None:
     model = MODELS[made]()
     terms = {t.name: t for t in model.system.terms}
-    alone = FiniteElementSystem(model.u, [terms[name]], model.system.clamped, terms["interior edges"], 1.0)
+    alone = FiniteElementSystem(
+        model.u, [terms[name]], model.system.clamped, terms["interior edges"], 1.0
+    )
     u = 1e-4 * np.random.default_rng(0).standard_normal(alone.size)
     u[alone._fixed] = 0
     check(alone, u, dict.fromkeys(FACTORS, 1.0))
@@ -110,4 +135,6 @@ def test_waves_have_every_term_that_is_not_linear() -> None:
         return float(x @ out.array)
 
     whole = form(model.system.tangent(u, FACTORS), v)
-    assert form(model.excluded_modes.waves.tangent(State(u, FACTORS), 0), wave) == pytest.approx(whole / 2, rel=1e-10)
+    assert form(model.excluded_modes.waves.tangent(State(u, FACTORS), 0), wave) == pytest.approx(
+        whole / 2, rel=1e-10
+    )

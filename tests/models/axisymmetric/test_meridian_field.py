@@ -27,13 +27,27 @@ def test_on_the_meridian_and_its_waves(law: RemanenceLaw) -> None:
     gradient = np.diag([0.5, 0.5, -1.0])
     built_in = Magnetisation(tangential, E3, gradient=gradient, law=law)
     known = replace(built_in, gradient=None, in_space=FormulasInSpace(formulas, np.eye(3)))
-    models = [hemisphere(20, 0.3, Loads(magnetic=field), refinement=0.15) for field in (known, built_in)]
-    u = models[0].system.held(1e-2 * np.random.default_rng(0).standard_normal(models[0].system.size))
+    models = [
+        hemisphere(20, 0.3, Loads(magnetic=field), refinement=0.15) for field in (known, built_in)
+    ]
+    u = models[0].system.held(
+        1e-2 * np.random.default_rng(0).standard_normal(models[0].system.size)
+    )
     found = []
     for model in models:
         waves = model.excluded_modes.waves
         K = [dense(waves.tangent(State(u, mu), 3)) for mu in ({"lambda_m": 0.0}, {"lambda_m": 1.0})]
-        loads, energy = model.system.load(u, {}, "lambda_m"), model.system.potential(u, {}, "lambda_m")
-        found.append([np.array([energy]), loads, K[1] - K[0], dense(model.system.tangent(u, {"lambda_m": 1.0}))])
+        loads, energy = (
+            model.system.load(u, {}, "lambda_m"),
+            model.system.potential(u, {}, "lambda_m"),
+        )
+        found.append(
+            [
+                np.array([energy]),
+                loads,
+                K[1] - K[0],
+                dense(model.system.tangent(u, {"lambda_m": 1.0})),
+            ]
+        )
     for here, there in zip(*found, strict=True):
         assert np.abs(here - there).max() <= 1e-10 * np.abs(there).max()

@@ -46,13 +46,20 @@ def test_pole_indentation() -> None:
 
 
 def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
-    models = [hemisphere(90, 0.5, Loads(forces={"force": Force("pole", patch / 90)})) for patch in (2.0, 0.5)]
+    models = [
+        hemisphere(90, 0.5, Loads(forces={"force": Force("pole", patch / 90)}))
+        for patch in (2.0, 0.5)
+    ]
     for model in models:
         down = model.zero()
         down[1::2] = -1
-        assert -model.system.load(down, {}, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
+        assert -model.system.load(down, {}, "force") @ down == pytest.approx(
+            model.force_unit, rel=1e-12
+        )
         assert model.loaded_deflection(down, "force") == pytest.approx(1.0, rel=1e-12)
-    point, *patches = (indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models])
+    point, *patches = (
+        indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models]
+    )
     assert point < patches[1] < patches[0] < 1.02 * point
 
 
@@ -61,11 +68,18 @@ def test_clamped_plate() -> None:
     h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
     meridian = make_meridian(flat, graded_vertices(1.0, [], h))
     model = MeridianModel(meridian, Material(nu, h), 4, {"rim": "clamped"}, Loads(pressure=True))
-    path = Path(BorderedNewton(model.system), "pressure", "load", StepOptions(p_over_pc, p_over_pc, p_over_pc))
+    path = Path(
+        BorderedNewton(model.system),
+        "pressure",
+        "load",
+        StepOptions(p_over_pc, p_over_pc, p_over_pc),
+    )
     ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
     p = p_over_pc * model.material.classical_pressure / h
     w0 = model.deflection(point.state.u, "pole")
-    assert w0 == pytest.approx(p / (64 * model.material.bending_stiffness), rel=2e-5)  # the membrane carries 1e-5
+    assert w0 == pytest.approx(
+        p / (64 * model.material.bending_stiffness), rel=2e-5
+    )  # the membrane carries 1e-5
     assert model.volume_change(point.state.u) == pytest.approx(-np.pi * w0 / 3, rel=2e-5)
 
 
@@ -105,13 +119,23 @@ def test_cells_of_a_given_size() -> None:
 
 @pytest.mark.slow
 def test_waves_that_come_and_go_within_a_step() -> None:
-    """A designed remanence: the same bifurcations on the path's own steps, up to 0.08 of the load, as at 50 loads."""
+    """A designed remanence: the same bifurcations on the path's own steps, up to 0.08 of the load,
+    as at 50 loads.
+    """
     remanent = f"{{kind: points, file: {File(__file__).parent / 'window.csv'}, filter: 0.0667}}"
     settings = ["magnetic.lambda_m=0.001", f"magnetic.remanent={remanent}"]
     found = {}
     for how in ("until: limit", "control: load, until: target, pressure: 1, points: 50"):
-        case = Case.load(CASES / "dimple_buckling.yaml", [*settings, f"loading={{kind: pressure, {how}}}"])
-        found[how] = [(p["mode"], p["p_over_pc"]) for p in run(case).limit_points if p["p_over_pc"] < 1]
+        case = Case.load(
+            CASES / "dimple_buckling.yaml", [*settings, f"loading={{kind: pressure, {how}}}"]
+        )
+        found[how] = [
+            (p["mode"], p["p_over_pc"]) for p in run(case).limit_points if p["p_over_pc"] < 1
+        ]
     steps, loads = found.values()
-    assert [mode for mode, _ in steps] == [mode for mode, _ in loads] == ["m = 4", "m = 5", "m = 5", "m = 4"]
+    assert (
+        [mode for mode, _ in steps]
+        == [mode for mode, _ in loads]
+        == ["m = 4", "m = 5", "m = 5", "m = 4"]
+    )
     assert [load for _, load in steps] == pytest.approx([load for _, load in loads], rel=1e-6)

@@ -15,7 +15,11 @@ CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_
 
 def found(shell: dict[str, Any], step: dict[str, Any], **others: Any) -> dict[str, Any]:
     """The columns of a motion."""
-    data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3, "refinement": 0.5}} | others
+    data = {
+        "shell": shell,
+        "boundary": {"rim": "clamped"},
+        "mesh": {"degree": 3, "refinement": 0.5},
+    } | others
     scene = Scene(Case.from_source(data | {"loading": [{"kind": "time", **step}]}))
     return columns(scene, follow(scene))
 
@@ -24,7 +28,10 @@ def found(shell: dict[str, Any], step: dict[str, Any], **others: Any) -> dict[st
     ("viscous", "polynomial"),
     [
         ({"viscosity": 0.1 / OMEGA}, [1, 0.1, 1]),
-        ({"relaxation": [{"modulus": 0.3, "time": 1 / OMEGA}]}, [1, 1, 1.3, 1]),  # (s^2 + 1)(s + 1) + 0.3 s
+        (
+            {"relaxation": [{"modulus": 0.3, "time": 1 / OMEGA}]},
+            [1, 1, 1.3, 1],
+        ),  # (s^2 + 1)(s + 1) + 0.3 s
     ],
 )
 def test_damped_vibration(viscous: dict[str, Any], polynomial: list[float]) -> None:
@@ -34,7 +41,9 @@ def test_damped_vibration(viscous: dict[str, Any], polynomial: list[float]) -> N
     step = {"duration": period / 2, "points": 2, "step": period / 80, "rho_inf": 1.0, "push": push}
     disc = found(DISC | viscous, step)
     roots = np.roots(polynomial)
-    weights = np.linalg.solve(np.vander(roots, len(roots), increasing=True).T, [1, 0, -1][: len(roots)])
+    weights = np.linalg.solve(
+        np.vander(roots, len(roots), increasing=True).T, [1, 0, -1][: len(roots)]
+    )
     exact = np.real(np.exp(np.outer(OMEGA * disc["time"][1:], roots)) @ weights)
     assert disc["w_over_h"][1:] / 0.01 == pytest.approx(exact, abs=2e-3)
     energy = (disc["kinetic"] + disc["stored"] + disc["dissipated"])[1:]
@@ -44,10 +53,15 @@ def test_damped_vibration(viscous: dict[str, Any], polynomial: list[float]) -> N
 
 @pytest.mark.slow
 def test_curved_shell_as_on_triangles() -> None:
-    """A cap that a slow pressure presses, with both kinds of viscosity: membrane, bending and edges."""
+    """A cap that a slow pressure presses, with both kinds of viscosity: membrane, bending and
+    edges.
+    """
     viscous = {"viscosity": 5.0, "relaxation": [{"modulus": 0.5, "time": 20.0}]}
     load = {"pressure": {"kind": "ramp", "to": 0.2, "over": 60.0}}
     step = {"duration": 60.0, "points": 3, "step": 5.0, "rho_inf": 0.0, "history": load}
-    meridian, half = found(CAP | viscous, step), found(CAP | viscous, step, symmetry="half", mesh={"degree": 3})
+    meridian, half = (
+        found(CAP | viscous, step),
+        found(CAP | viscous, step, symmetry="half", mesh={"degree": 3}),
+    )
     for key in ("w_pole_over_h", "dissipated"):
         assert meridian[key][1:] == pytest.approx(half[key][1:], rel=1e-2), key

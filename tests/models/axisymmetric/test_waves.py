@@ -31,7 +31,11 @@ def displacement(phi: Array) -> tuple[Array, Array]:
 def wave(phi: Array, m: int) -> tuple[Array, Array, Array]:
     """Smooth coefficients (U, V, W): U + V like rho^(m+1), U - V like rho^(m-1), W like rho^m."""
     rho, z = np.sin(phi), np.cos(phi)
-    return z * (rho ** (m - 1) + rho ** (m + 1)), z * (-(rho ** (m - 1)) + 2 * rho ** (m + 1)), z * rho**m
+    return (
+        z * (rho ** (m - 1) + rho ** (m + 1)),
+        z * (-(rho ** (m - 1)) + 2 * rho ** (m + 1)),
+        z * rho**m,
+    )
 
 
 def second_variation(K: Any, v: Array) -> float:
@@ -76,7 +80,8 @@ def crossings(model: MeridianModel, found: Buckling) -> list[Crossing]:
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_agrees_with_the_half_shell(law: RemanenceLaw) -> None:
-    """All terms but the penalty; thick enough that bending matters, the loads' parts compared by themselves.
+    """All terms but the penalty; thick enough that bending matters, the loads' parts compared by
+    themselves.
 
     The fields turn the clamped edge, where the penalty would depend on the mesh: it is left out.
     """
@@ -113,7 +118,9 @@ def test_rigid_motions_are_neutral() -> None:
     waves = model.excluded_modes.waves
     rho, z = model.r0.x.array.reshape(-1, 2).T
     zero = 0 * rho
-    translation, rotation = (np.column_stack(c).ravel() for c in ([zero, zero - 1, zero], [zero, -z, -rho]))
+    translation, rotation = (
+        np.column_stack(c).ravel() for c in ([zero, zero - 1, zero], [zero, -z, -rho])
+    )
     still = State(model.zero(), {})
     u = np.column_stack(displacement(model.V.tabulate_dof_coordinates()[:, 0])).ravel()
     for state, v in ((still, translation), (still, rotation), (State(u, {}), translation)):
@@ -125,7 +132,9 @@ def test_rigid_motions_are_neutral() -> None:
 
 
 def test_known_waves() -> None:
-    """An independent axisymmetric solver with its own circumferential modes; before the axisymmetric fold."""
+    """An independent axisymmetric solver with its own circumferential modes; before the
+    axisymmetric fold.
+    """
     model, found = buckled(300, 0.00184)
     waves = model.excluded_modes.waves
     first = crossings(model, found)[0]
@@ -133,7 +142,10 @@ def test_known_waves() -> None:
     assert m == 28
     assert point.state.mu["pressure"] == pytest.approx(1.0145, rel=1e-4)
     assert point.state.mu["pressure"] < found.instability.point.state.mu["pressure"]
-    there, before = (nearest_to_zero(waves.factor_at(state, m))[0] for state in (point.state, found.points[0].state))
+    there, before = (
+        nearest_to_zero(waves.factor_at(state, m))[0]
+        for state in (point.state, found.points[0].state)
+    )
     assert abs(there) < 1e-5 * before
 
 
@@ -145,7 +157,9 @@ def test_no_wave_before_the_fold() -> None:
 
 @pytest.mark.slow
 def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
-    """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405 and 0.8418."""
+    """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405
+    and 0.8418.
+    """
     model = hemisphere(90, 0.5, Loads(pressure=True))
     found = buckle(model, 0.0)
     first = crossings(model, found)[0]
@@ -167,7 +181,9 @@ def test_counts_of_all_waves_are_those_of_each(R_over_h: float, lambda_m: float)
 @pytest.mark.parametrize("triangle", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_definite_or_not(seed: int, triangle: bool) -> None:
-    """Two matrices of one sparsity, or their triangles, interpolated so that the least eigenvalue crosses zero."""
+    """Two matrices of one sparsity, or their triangles, interpolated so that the least eigenvalue
+    crosses zero.
+    """
     random, n = np.random.default_rng(seed), 30
     order = random.permutation(n)  # of a band that the numbering hides
     near = np.abs(order[:, None] - order) <= 3
@@ -182,5 +198,8 @@ def test_definite_or_not(seed: int, triangle: bool) -> None:
     def least(t: float) -> float:
         return float(np.linalg.eigvalsh((A + t * (B - A))[np.ix_(free, free)])[0])
 
-    seen = {banded.positive(bands, np.array([1.0 - t, t])): least(t) > 0 for t in np.linspace(0, 0.99, 40)}
+    seen = {
+        banded.positive(bands, np.array([1.0 - t, t])): least(t) > 0
+        for t in np.linspace(0, 0.99, 40)
+    }
     assert seen == {True: True, False: False}

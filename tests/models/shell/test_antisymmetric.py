@@ -43,11 +43,19 @@ def test_second_variation_is_that_of_the_full_shell() -> None:
 
 
 def test_waves_come_in_pairs() -> None:
-    """A perfect sphere is axisymmetric: cos(m theta), seen by the half, and sin(m theta), excluded, soften together."""
+    """A perfect sphere is axisymmetric: cos(m theta), seen by the half, and sin(m theta), excluded,
+    soften together.
+    """
     data = {
         "shell": {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3},
         "boundary": {"equator": "clamped"},
-        "loading": {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.75, "points": 3},
+        "loading": {
+            "kind": "pressure",
+            "until": "target",
+            "control": "load",
+            "pressure": 0.75,
+            "points": 3,
+        },
         "mesh": {"degree": 3, "refinement": 1.5},
         "symmetry": "half",
     }
@@ -56,7 +64,8 @@ def test_waves_come_in_pairs() -> None:
     assert modes is not None
     states = [record.point.state for record in follow(scene) if record.label == "target"]
     seen, excluded = (
-        [critical_mode(stability, state).eigenvalue for state in states] for stability in (scene.newton, modes)
+        [critical_mode(stability, state).eigenvalue for state in states]
+        for stability in (scene.newton, modes)
     )
     assert excluded == pytest.approx(seen, rel=0.03)
     assert seen[2] < 0.4 * seen[1]

@@ -1,4 +1,6 @@
-"""An applied field by formulas: against the built-in ones, finite differences, and the force on a rigid magnet."""
+"""An applied field by formulas: against the built-in ones, finite differences, and the force on a
+rigid magnet.
+"""
 
 from dataclasses import replace
 
@@ -24,7 +26,11 @@ BR, BA = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96])
 G = np.array([[0.5, 0.2, -0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 0.2]])
 # of a dipole along e3 at (0, 0, -d), over that in its middle: 3 (m . s) s/s^5 - m/s^3
 S = "(x**2 + y**2 + (z + {d})**2)"
-DIPOLE = [f"3*x*(z + {{d}})/{S}**2.5", f"3*y*(z + {{d}})/{S}**2.5", f"3*(z + {{d}})**2/{S}**2.5 - {S}**-1.5"]
+DIPOLE = [
+    f"3*x*(z + {{d}})/{S}**2.5",
+    f"3*y*(z + {{d}})/{S}**2.5",
+    f"3*(z + {{d}})**2/{S}**2.5 - {S}**-1.5",
+]
 
 
 def formulas(*texts: str, turn: float = 0.0, d: float = 2.0) -> FormulasInSpace:
@@ -41,7 +47,9 @@ def shell(field: Magnetisation) -> ShellModel:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_linear_field_is_that_of_its_gradient(law: RemanenceLaw) -> None:
-    """Energies, residuals and tangents to 1e-12, at a pattern; the second displacement after the first."""
+    """Energies, residuals and tangents to 1e-12, at a pattern; the second displacement after the
+    first.
+    """
     built_in = Magnetisation(tangential, BA, gradient=G, law=law)
     known, other = shell(replace(built_in, gradient=None, in_space=linear())), shell(built_in)
     for seed in range(2):
@@ -51,7 +59,8 @@ def test_linear_field_is_that_of_its_gradient(law: RemanenceLaw) -> None:
         residuals = [model.system.load(u, MU, "lambda_m") for model in (known, other)]
         assert np.abs(residuals[0] - residuals[1]).max() <= 1e-12 * np.abs(residuals[1]).max()
         magnetic = [
-            csr(model.system.tangent(u, MU)) - csr(model.system.tangent(u, {"lambda_m": 0.0}).copy())
+            csr(model.system.tangent(u, MU))
+            - csr(model.system.tangent(u, {"lambda_m": 0.0}).copy())
             for model in (known, other)
         ]
         assert abs(magnetic[1]).max() > 1e-3
@@ -61,7 +70,9 @@ def test_linear_field_is_that_of_its_gradient(law: RemanenceLaw) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_derivatives_in_a_field_of_a_dipole(law: RemanenceLaw) -> None:
     """Points against forms, and these against finite differences: the field is not a polynomial."""
-    model = shell(Magnetisation(tangential, BA, law=law, in_space=formulas(*DIPOLE, turn=0.4, d=1.0)))
+    model = shell(
+        Magnetisation(tangential, BA, law=law, in_space=formulas(*DIPOLE, turn=0.4, d=1.0))
+    )
     for seed, size in ((0, 1e-3), (1, 1e-2)):
         u = random_displacement(model, size, seed)
         assert tangent_difference(model.system, u, MU) <= 1e-12
@@ -75,14 +86,25 @@ def test_derivatives_in_a_field_of_a_dipole(law: RemanenceLaw) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_force_and_torque_on_a_small_rigid_magnet(law: RemanenceLaw) -> None:
-    """V grad(Br . B) and Br x B at its middle, to (size/distance)^2, wherever it moves and turns."""
+    """V grad(Br .
+
+    B) and Br x B at its middle, to (size/distance)^2, wherever it moves and turns.
+    """
     d = 100.0
     field = formulas(*DIPOLE, d=d)
-    model = ShellModel(disc(0.8), MATERIAL, 2, {}, Loads(magnetic=Magnetisation(BR, BA, law=law, in_space=field)))
+    model = ShellModel(
+        disc(0.8), MATERIAL, 2, {}, Loads(magnetic=Magnetisation(BR, BA, law=law, in_space=field))
+    )
     X = model.r0.x.array.reshape(-1, 3)
     area = 3 * model.volume_change(np.tile([0.0, 0.0, 1.0], len(X)))
-    for middle, angle in (([0.0, 0.0, 0.0], 0.0), ([60.0, -20.0, 30.0], 0.0), ([-40.0, 10.0, 50.0], 1.2)):
-        Q = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    for middle, angle in (
+        ([0.0, 0.0, 0.0], 0.0),
+        ([60.0, -20.0, 30.0], 0.0),
+        ([-40.0, 10.0, 50.0], 1.2),
+    ):
+        Q = np.array(
+            [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+        )
         turned = X @ Q.T
         load = model.system.load((turned + middle - X).ravel(), {}, "lambda_m").reshape(-1, 3)
         B, slope, _ = (a[0] for a in field(np.array([middle])))

@@ -45,7 +45,9 @@ def alone(model: ShellModel, name: str) -> FiniteElementSystem:
 
 @pytest.mark.parametrize("name", TERMS)
 def test_term_alone(shell: Shells, name: str) -> None:
-    model = shell(2, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent")
+    model = shell(
+        2, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent"
+    )
     u = random_displacement(model, 5e-4)
     check(alone(model, name), u, {"lambda_m": 1.0, "pressure": 1.0})
 
@@ -87,7 +89,11 @@ def test_force_has_the_load_vector_of_its_work() -> None:
         model = ShellModel(surface, Material(0.3, 0.05), 2, {}, Loads(forces={"force": force}))
         u = random_displacement(model, 1e-3)
         load = model.system.load(u, {}, "force")
-        assert -load @ u == pytest.approx(model.force_unit * model.loaded_deflection(u, "force"), rel=1e-12)
+        assert -load @ u == pytest.approx(
+            model.force_unit * model.loaded_deflection(u, "force"), rel=1e-12
+        )
         # a unit translation along the inward normal has w = 1, so the total force is F along it
         inward = -model.normals["load"]
-        assert -load.reshape(-1, 3).sum(axis=0) == pytest.approx(model.force_unit * inward, rel=1e-12, abs=1e-15)
+        assert -load.reshape(-1, 3).sum(axis=0) == pytest.approx(
+            model.force_unit * inward, rel=1e-12, abs=1e-15
+        )

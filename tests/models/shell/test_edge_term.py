@@ -38,7 +38,9 @@ def hinge(r0: Jet, u: Jet, edge: Edge) -> Expr:
     return ufl.dot(kin.normal(r0), edge.by_outward(u)) ** 2 / 2
 
 
-def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any) -> dict[str, float]:
+def loaded(
+    symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any
+) -> dict[str, float]:
     """What is observed at a small load of one amplitude."""
     data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.5}, **sections}
     scene = ms.Scene(ms.Case.from_source(data), terms=terms)
@@ -47,16 +49,27 @@ def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **s
 
 
 def test_ring_around_a_flat_ring_that_is_pulled() -> None:
-    """On its meridian. Lamé: u = A r + B/r, held at r = a, with the pull q less the ring's force EA u/R² at r = R."""
+    """On its meridian.
+
+    Lamé: u = A r + B/r, held at r = a, with the pull q less the ring's force EA u/R² at r = R.
+    """
     a, q, EA = 0.5, 1e-6, 0.7
-    outward = ms.OwnTerm("pull", pull, on="outer", observed={"spread": lambda r0, u, edge: -pull(r0, u, edge)})
+    outward = ms.OwnTerm(
+        "pull", pull, on="outer", observed={"spread": lambda r0, u, edge: -pull(r0, u, edge)}
+    )
     found = loaded(
         "axisymmetric",
         "pull",
         q,
         outward,
         ms.OwnTerm("ring", ring, on="outer", value=EA),
-        shell={"geometry": "annulus", "radius": 1, "inner_radius": a, "thickness": H, "poisson_ratio": NU},
+        shell={
+            "geometry": "annulus",
+            "radius": 1,
+            "inner_radius": a,
+            "thickness": H,
+            "poisson_ratio": NU,
+        },
         boundary={"inner": "clamped"},
     )
     A = q / (((1 + NU) + (1 - NU) * a**2) / (1 - NU**2) + EA * (1 - a**2))  # and B = -A a²
@@ -65,7 +78,10 @@ def test_ring_around_a_flat_ring_that_is_pulled() -> None:
 
 
 def test_plate_on_an_elastic_hinge() -> None:
-    """On a half. Timoshenko, Plates and Shells, section 15: between a simply supported and a clamped plate."""
+    """On a half.
+
+    Timoshenko, Plates and Shells, section 15: between a simply supported and a clamped plate.
+    """
     D, K, p = H**2 / (12 * (1 - NU**2)), 2.0, 1e-6
     found = loaded(
         "half",
@@ -77,7 +93,9 @@ def test_plate_on_an_elastic_hinge() -> None:
         loading={"kind": "pressure", "pressure": p, "control": "load", "until": "target"},
     )
     load = p * Material(NU, H).classical_pressure / H
-    assert found["w_pole_over_h"] * H == pytest.approx(load / (64 * D) * (5 + NU + K) / (1 + NU + K), rel=2e-4)
+    assert found["w_pole_over_h"] * H == pytest.approx(
+        load / (64 * D) * (5 + NU + K) / (1 + NU + K), rel=2e-4
+    )
 
 
 @pytest.mark.parametrize("density", [ring, hinge])
@@ -107,6 +125,10 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="a function of r0, u, an edge and 0 parameters"):
         ms.OwnTerm("own", lambda r0, u: u.r[2], on="rim")
     with pytest.raises(ms.CaseError, match="own is an energy of an edge, which only a shell has"):
-        make_problem(ms.Case.load(CASES / "solid_buckling.yaml"), [ms.OwnTerm("own", pull, on="equator")])
+        make_problem(
+            ms.Case.load(CASES / "solid_buckling.yaml"), [ms.OwnTerm("own", pull, on="equator")]
+        )
     with pytest.raises(MeshError, match="terms: own: on: brim: the surface has no such edge, only"):
-        make_problem(ms.Case.load(CASES / "dimple_buckling.yaml"), [ms.OwnTerm("own", pull, on="brim")])
+        make_problem(
+            ms.Case.load(CASES / "dimple_buckling.yaml"), [ms.OwnTerm("own", pull, on="brim")]
+        )

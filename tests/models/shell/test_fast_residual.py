@@ -43,11 +43,15 @@ MU = {"lambda_m": 0.4, "lambda_across": -0.7, "pressure": 0.3, "force": 0.2}
 def by_forms(system: FiniteElementSystem) -> FiniteElementSystem:
     """The same terms and conditions, with FFCx's residuals."""
     assert system.gradients
-    return FiniteElementSystem(system.u, system.terms, system.clamped, pattern(system), 1.0, system._assembler)
+    return FiniteElementSystem(
+        system.u, system.terms, system.clamped, pattern(system), 1.0, system._assembler
+    )
 
 
 def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:
-    """Largest difference of the residual, or of a load column, over the largest entry of the forms' one."""
+    """Largest difference of the residual, or of a load column, over the largest entry of the forms'
+    one.
+    """
     reference = by_forms(system)
     pairs = [(system.residual(u, mu), reference.residual(u, mu))]
     loads = {t.amplitude for t in system.terms if t.amplitude}
@@ -89,9 +93,15 @@ def test_edge_conditions_and_dead_load(condition: Condition) -> None:
 def test_remanence_that_varies_field_that_varies_and_turns() -> None:
     """A pattern, a gradient (which needs u itself), and a field with a part across."""
     G = np.array([[0.5, 0.2, -0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
-    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, (np.array([1.0, 0.0, 0.0]),))
+    field = Magnetisation(
+        tangential, np.array([0.0, 0.6, 0.8]), "full", G, (np.array([1.0, 0.0, 0.0]),)
+    )
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {}, Loads(magnetic=field))
-    for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0}, {"lambda_m": 10.0, "lambda_across": 0.0}):
+    for mu in (
+        MU,
+        {"lambda_m": 0.0, "lambda_across": 1.0},
+        {"lambda_m": 10.0, "lambda_across": 0.0},
+    ):
         assert difference(model.system, random_displacement(model, 1e-3), mu) <= 1e-12
 
 
@@ -101,40 +111,67 @@ def test_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for chunk in (gradients.CHUNK, 50):
         monkeypatch.setattr(gradients, "CHUNK", chunk)
-        model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, Loads(magnetic=field))
-        found.append(np.array([model.system.residual(random_displacement(model, 1e-3, seed), MU) for seed in range(2)]))
+        model = ShellModel(
+            hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, Loads(magnetic=field)
+        )
+        found.append(
+            np.array(
+                [
+                    model.system.residual(random_displacement(model, 1e-3, seed), MU)
+                    for seed in range(2)
+                ]
+            )
+        )
     assert np.abs(found[1] - found[0]).max() <= 1e-14 * np.abs(found[0]).max()
 
 
 @pytest.mark.parametrize("aspect", [50, 500])
 def test_slivers(aspect: float) -> None:
-    """A hemisphere pressed flat, against forms whose Jacobian (3, 2) is inverted by way of its square."""
+    """A hemisphere pressed flat, against forms whose Jacobian (3, 2) is inverted by way of its
+    square.
+    """
     model = ShellModel(
-        hemisphere(0.8, half=True), Material(0.3, 0.05), 4, {"rim": "clamped", "symmetry": "symmetry"}, Loads(True)
+        hemisphere(0.8, half=True),
+        Material(0.3, 0.05),
+        4,
+        {"rim": "clamped", "symmetry": "symmetry"},
+        Loads(True),
     )
     model.V.mesh.geometry.x[:, 1] /= aspect
     model.r0.x.array.reshape(-1, 3)[:, 1] /= aspect
-    model.u.x.array[:] = random_displacement(model, 1e-3) * np.tile([1, 1 / aspect, 1], model.system.size // 3)
+    model.u.x.array[:] = random_displacement(model, 1e-3) * np.tile(
+        [1, 1 / aspect, 1], model.system.size // 3
+    )
     for term in model.system.terms:
         residual = FastResidual(model.r0, model.u, 4, [term], KernelLog())
         reference, found = np.zeros_like(model.u.x.array), np.zeros_like(model.u.x.array)
         term.add_residual(reference, 1.0)
         residual.add(found, {term.name: 1.0})
-        rounding = 20 * np.finfo(float).eps * aspect**2  # of the forms' sums: 10.6 on the most unlike of processors
+        rounding = (
+            20 * np.finfo(float).eps * aspect**2
+        )  # of the forms' sums: 10.6 on the most unlike of processors
         assert np.abs(found - reference).max() <= rounding * np.abs(reference).max()
 
 
 def test_no_residual_forms_are_compiled() -> None:
     """Nor for the modes that a half shell excludes."""
     model = ShellModel(
-        hemisphere(0.8, half=True), Material(0.3, 0.05), 2, {"symmetry": "symmetry"}, Loads(magnetic=TILTED)
+        hemisphere(0.8, half=True),
+        Material(0.3, 0.05),
+        2,
+        {"symmetry": "symmetry"},
+        Loads(magnetic=TILTED),
     )
     assert model.excluded_modes
     names = model.kernels.names
     assert not [name for name in names if name.endswith("residual")]
-    assert {"membrane, bending gradient", "magnetic gradient", "interior edges gradient"} <= set(names)
+    assert {"membrane, bending gradient", "magnetic gradient", "interior edges gradient"} <= set(
+        names
+    )
     by_forms(model.system)
-    assert [name for name in names if name.endswith("residual")] == [f"{t.name} residual" for t in model.system.terms]
+    assert [name for name in names if name.endswith("residual")] == [
+        f"{t.name} residual" for t in model.system.terms
+    ]
 
 
 RANKS = """
@@ -165,4 +202,6 @@ def test_ranks() -> None:
     for each in found:
         assert len(each) == 2 + 3
         assert max(error for _, error in each) <= 1e-12
-        assert [size for size, _ in each] == pytest.approx([size for size, _ in found[0]], rel=1e-12)
+        assert [size for size, _ in each] == pytest.approx(
+            [size for size, _ in found[0]], rel=1e-12
+        )

@@ -77,7 +77,9 @@ def test_excluded_modes(shell: Shells) -> None:
 @pytest.mark.telling
 @pytest.mark.parametrize("condition", ["free", "simply supported", "clamped"])
 def test_edge_conditions(condition: Condition) -> None:
-    model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": condition}, Loads(pressure=True))
+    model = ShellModel(
+        hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": condition}, Loads(pressure=True)
+    )
     assert difference(model.system, random_displacement(model, 1e-3), MU) <= 1e-12
 
 
@@ -88,7 +90,11 @@ def test_remanence_that_varies_field_that_varies_and_turns() -> None:
     field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, (across,))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {}, Loads(magnetic=field))
     system, u = model.system, random_displacement(model, 1e-3)
-    for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0}, {"lambda_m": 10.0, "lambda_across": 0.0}):
+    for mu in (
+        MU,
+        {"lambda_m": 0.0, "lambda_across": 1.0},
+        {"lambda_m": 10.0, "lambda_across": 0.0},
+    ):
         assert difference(system, u, mu) <= 1e-12
 
 
@@ -109,7 +115,10 @@ def test_matrix_is_reused_and_follows_state_and_amplitudes(shell: Shells) -> Non
 def test_stress_of_other_displacements(shell: Shells) -> None:
     """v . K v changes by twice the integral of `densities.prestress` with the change of the strain, by a form."""
     model = shell(2)
-    system, u, step, v = model.system, *(random_displacement(model, 1e-2, seed) for seed in range(3))
+    system, u, step, v = (
+        model.system,
+        *(random_displacement(model, 1e-2, seed) for seed in range(3)),
+    )
     K = csr(system.tangent(u, MU))
     assert abs(csr(system.tangent(u, MU, [(1.0, u)])) - K).max() <= 1e-14 * abs(K).max()
     changed = csr(system.tangent(u, MU, followed(u - step, step)))
@@ -134,7 +143,13 @@ HALF_SHELL = {
     "shell": {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3},
     "boundary": {"equator": "clamped"},
     "magnetic": {"lambda_m": 1e-3},
-    "loading": {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.2, "points": 1},
+    "loading": {
+        "kind": "pressure",
+        "until": "target",
+        "control": "load",
+        "pressure": 0.2,
+        "points": 1,
+    },
     "mesh": {"degree": 2, "refinement": 0.6},
     "symmetry": "half",
 }

@@ -1,4 +1,7 @@
-"""Formulas narrower than elements. Source: integrals over the sphere in polar coordinates around the place."""
+"""Formulas narrower than elements.
+
+Source: integrals over the sphere in polar coordinates around the place.
+"""
 
 import re
 from itertools import pairwise
@@ -18,7 +21,13 @@ from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.follow import follow
 
-SPHERE = {"geometry": "cap", "radius": 1, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
+SPHERE = {
+    "geometry": "cap",
+    "radius": 1,
+    "thickness": 0.01,
+    "youngs_modulus": 1,
+    "poisson_ratio": 0.3,
+}
 AWAY = "(x-0.31)**2+(y-0.23)**2"
 
 
@@ -64,7 +73,9 @@ def test_all_of_a_narrow_load_is_there(load, of, radius, mesh):
     """Its resultant, on elements that are as small as it and on large ones."""
     scene = Scene(dead(load, **mesh))
     column = scene.model.system.load(scene.model.zero(), scene.unloaded().mu, "load").reshape(-1, 3)
-    assert -0.01 * column[:, 2].sum() == pytest.approx(-1e-7 * over_sphere(of, radius), rel=1e-3)  # times E h R
+    assert -0.01 * column[:, 2].sum() == pytest.approx(
+        -1e-7 * over_sphere(of, radius), rel=1e-3
+    )  # times E h R
 
 
 @pytest.mark.slow
@@ -77,7 +88,10 @@ def test_all_of_a_narrow_load_is_carried():
 
 
 def test_all_of_a_narrow_potential_is_there() -> None:
-    """Of a rigid lift its energy is that of the force on a disc: pi width². Its place is found by no symmetry."""
+    """Of a rigid lift its energy is that of the force on a disc: pi width².
+
+    Its place is found by no symmetry.
+    """
     width = 0.002
     case = {
         "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
@@ -85,7 +99,12 @@ def test_all_of_a_narrow_potential_is_there() -> None:
         "loading": {
             "kind": "dead",
             "control": "load",
-            "loads": [{"over": "all", "potential": f"1e-7*exp(-((x-0.31)**2+(y-0.17)**2)/{width}**2)*(1+z)"}],
+            "loads": [
+                {
+                    "over": "all",
+                    "potential": f"1e-7*exp(-((x-0.31)**2+(y-0.17)**2)/{width}**2)*(1+z)",
+                }
+            ],
             "factor": 1,
             "points": 1,
         },
@@ -133,13 +152,17 @@ def test_a_narrow_imperfection_has_few_cells():
 
 @pytest.mark.slow
 def test_a_mesh_that_does_not_show_a_formula_says_so():
-    assert "warning: loading.loads.0.per_area: varies within elements" in describe(dead(disc(0.05), size=0.4))
+    assert "warning: loading.loads.0.per_area: varies within elements" in describe(
+        dead(disc(0.05), size=0.4)
+    )
     assert "warning" not in describe(dead(disc(0.05)))
 
 
 @pytest.mark.parametrize("polar", ["((x-0.31)**2+(y-0.23)**2)", "((x-0.001)**2+y**2)"])
 def test_a_tiny_disc_of_remanence_is_neither_missed_nor_axisymmetric(polar):
-    """Off the axis, and almost on it: no model of the meridian, and elements as small as it there alone."""
+    """Off the axis, and almost on it: no model of the meridian, and elements as small as it there
+    alone.
+    """
     shell = {"geometry": "hemisphere", "radius_to_thickness": 100, "poisson_ratio": 0.3}
     field = {
         "lambda_m": 0.001,
@@ -153,7 +176,9 @@ def test_a_tiny_disc_of_remanence_is_neither_missed_nor_axisymmetric(polar):
     }
     problem = make_problem(Case.model_validate(case | {"loading": {"kind": "field", "points": 1}}))
     assert problem.meridian is None
-    assert problem.size(problem.shape.reach * np.ones(2) / 9) > 10 * min(f.size for f in problem.size.features)
+    assert problem.size(problem.shape.reach * np.ones(2) / 9) > 10 * min(
+        f.size for f in problem.size.features
+    )
     assert min(f.size for f in problem.size.features) < 0.002
 
 
@@ -161,14 +186,22 @@ def test_the_cost_of_finding_grows_slowly_and_smooth_formulas_have_none():
     """Parts that are looked at, as the disc becomes a thousand times smaller."""
     there = outline(dead("1").shell)
     parts = {
-        text: len(looked_at(Together([formula(text)]), there).area) for text in ("2", "1 + x*y", disc(1e-2), disc(1e-5))
+        text: len(looked_at(Together([formula(text)]), there).area)
+        for text in ("2", "1 + x*y", disc(1e-2), disc(1e-5))
     }
     assert parts["1 + x*y"] == parts["2"]
     assert parts[disc(1e-5)] < 1.5 * parts[disc(1e-2)] < 15_000
 
 
 def test_a_thickness_that_jumps_in_elements_says_what_that_costs():
-    shell = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    shell = {
+        "geometry": "plate",
+        "length": 1,
+        "width": 1,
+        "thickness": 0.01,
+        "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
+    }
     case = dead("1", size=0.1).model_dump(mode="json", exclude_unset=True) | {
         "shell": shell | {"thickness_factor": "1.5-0.5*sign(x-0.47)"},
         "boundary": {"left": "clamped"},
@@ -181,20 +214,35 @@ def test_a_thickness_that_jumps_in_elements_says_what_that_costs():
     ("factor", "break_at"),
     [("1.5-0.5*sign(x-0.53)", 0.53), ("1-0.5*exp(-((x-0.05)/0.01)**2)", 0.05)],
 )
-def test_the_stiffness_that_is_lost_is_said_within_a_factor_of_two(factor: str, break_at: float) -> None:
+def test_the_stiffness_that_is_lost_is_said_within_a_factor_of_two(
+    factor: str, break_at: float
+) -> None:
     """A cantilever under a force at its tip, against the integral of (1 - x)^2/t^3."""
-    x, weights = (np.concatenate(each) for each in zip(*(_gauss(a, b) for a, b in _around(break_at)), strict=True))
+    x, weights = (
+        np.concatenate(each)
+        for each in zip(*(_gauss(a, b) for a, b in _around(break_at)), strict=True)
+    )
     t = eval(factor, {"x": x, "sign": np.sign, "exp": np.exp})
     exact = 3 * float(weights @ ((1 - x) ** 2 / t**3))
     tips = []
     for thickness in (factor, "1 + 0*x"):
         case = Case.model_validate(
             {
-                "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0.0}
+                "shell": {
+                    "geometry": "strip",
+                    "radius_to_thickness": 50,
+                    "width": 0.1,
+                    "poisson_ratio": 0.0,
+                }
                 | {"thickness_factor": thickness},
                 "boundary": {"root": "clamped"},
                 "points": {"tip": [1, 0, 0]},
-                "loading": {"kind": "dead", "loads": [{"at": "tip", "force": [0, 0, 1e-12]}], "factor": 1, "points": 1},
+                "loading": {
+                    "kind": "dead",
+                    "loads": [{"at": "tip", "force": [0, 0, 1e-12]}],
+                    "factor": 1,
+                    "points": 1,
+                },
                 "mesh": {"size": 0.3},
             }
         )

@@ -1,4 +1,6 @@
-"""Parameters that enter an energy freely: derivatives in every model, and control by value, force and volume."""
+"""Parameters that enter an energy freely: derivatives in every model, and control by value, force
+and volume.
+"""
 
 from pathlib import Path
 
@@ -18,7 +20,9 @@ SHIFTED = {"bed": 0.7, "place": 0.02, "skew": 0.3}
 
 
 def bed(r0: ms.Jet, u: ms.Jet, place: Expr, skew: Expr) -> Expr:
-    """Springs to a floor that moves along e3 by `place`, stiffer above by `skew`; nonlinear in both."""
+    """Springs to a floor that moves along e3 by `place`, stiffer above by `skew`; nonlinear in
+    both.
+    """
     w = u.r[2] - place
     return ufl.exp(skew * r0.r[2]) * (w**2 / 2 + place * w**3)
 
@@ -39,9 +43,13 @@ def scene(file: str, *settings: str) -> ms.Scene:
     ],
 )
 def test_derivatives(file: str, symmetry: str, size: float) -> None:
-    """Against central differences of the energy, the residual and the potentials, in each parameter."""
+    """Against central differences of the energy, the residual and the potentials, in each
+    parameter.
+    """
     system = scene(file, f"symmetry={symmetry}").model.system
-    u, v = (system.held(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
+    u, v = (
+        system.held(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+    )
     mu = dict.fromkeys(("lambda_m", "pressure"), 0.0) | SHIFTED
 
     def moved(name: str, step: float) -> dict[str, float]:
@@ -53,18 +61,26 @@ def test_derivatives(file: str, symmetry: str, size: float) -> None:
 
     for name in ("place", "skew", "bed"):
         column = system.load(u, mu, name)
-        assert column == pytest.approx(difference("residual", name, 1e-4), abs=1e-7 * np.abs(column).max())
-        along = (system.potential(u + 1e-4 * v, mu, name) - system.potential(u - 1e-4 * v, mu, name)) / 2e-4
+        assert column == pytest.approx(
+            difference("residual", name, 1e-4), abs=1e-7 * np.abs(column).max()
+        )
+        along = (
+            system.potential(u + 1e-4 * v, mu, name) - system.potential(u - 1e-4 * v, mu, name)
+        ) / 2e-4
         assert along == pytest.approx(dot(system.comm, column, v), rel=1e-5)
         for other in ("place", "skew", "bed"):
             expected = difference("potential", other, 1e-4, name)
-            assert system.curvature(u, mu, name, other) == pytest.approx(expected, rel=1e-6, abs=1e-10)
+            assert system.curvature(u, mu, name, other) == pytest.approx(
+                expected, rel=1e-6, abs=1e-10
+            )
     K, other = (system.tangent(u, moved("skew", step)).norm() for step in (0.0, 1.0))
     assert abs(K - other) > 1e-8 * K  # the tangent changes with the parameter
 
 
 def test_floor_by_its_place_and_by_its_force() -> None:
-    """A floor moved by a given force comes to the place at which it needs that force; the device is stable."""
+    """A floor moved by a given force comes to the place at which it needs that force; the device is
+    stable.
+    """
     held = scene("dimple_buckling.yaml", "symmetry=axisymmetric")
     newton, system, rest = held.newton, held.model.system, held.unloaded()
     rest = rest.with_(rest.u, "bed", 0.5)
@@ -84,7 +100,9 @@ def test_trace_in_a_free_parameter() -> None:
     """The floor is lowered and raised again by `trace`; its columns are there."""
     held = scene("dimple_buckling.yaml", "symmetry=axisymmetric")
     rest = held.unloaded()
-    *_, low = ms.trace(held, "place", rest.with_(rest.u, "bed", 0.5), control="load", targets=[-1e-3])
+    *_, low = ms.trace(
+        held, "place", rest.with_(rest.u, "bed", 0.5), control="load", targets=[-1e-3]
+    )
     *_, back = ms.trace(held, "place", low, control="load", targets=[0.0])
     assert held.observe(low.point.state)["place"] == -1e-3
     assert np.abs(back.point.state.u).max() < 1e-9 * np.abs(low.point.state.u).max()

@@ -37,15 +37,27 @@ def test_swelling_sphere() -> None:
     """r = (1 + e) r0: E = (e + e^2/2) a0, K = e b0, so every energy has a closed form."""
     nu, h, e = 0.3, 0.05, 0.02
     Br, Ba = np.array([0.0, 0, 1]), np.array([0.6, 0.0, 0.8])
-    model = ShellModel(hemisphere(0.35), Material(nu, h), 4, {}, Loads(pressure=True, magnetic=Magnetisation(Br, Ba)))
+    model = ShellModel(
+        hemisphere(0.35),
+        Material(nu, h),
+        4,
+        {},
+        Loads(pressure=True, magnetic=Magnetisation(Br, Ba)),
+    )
     u = e * model.r0.x.array
     found = model.system.energies(u)
     area, both = 2 * np.pi, 2 * (1 - nu) + 4 * nu  # S:S = 2 s^2, tr S = 2 s
-    assert found["membrane"] == pytest.approx(both * (e + e**2 / 2) ** 2 / (2 * (1 - nu**2)) * area, rel=1e-5)
-    assert found["bending"] == pytest.approx(h**2 / (24 * (1 - nu**2)) * both * e**2 * area, rel=1e-3)
+    assert found["membrane"] == pytest.approx(
+        both * (e + e**2 / 2) ** 2 / (2 * (1 - nu**2)) * area, rel=1e-5
+    )
+    assert found["bending"] == pytest.approx(
+        h**2 / (24 * (1 - nu**2)) * both * e**2 * area, rel=1e-3
+    )
     assert model.volume_change(u) == pytest.approx(2 * np.pi / 3 * ((1 + e) ** 3 - 1), rel=1e-5)
     # -e Ba . (I - n n) Br integrated: the integral of n n over the hemisphere is 2 pi/3 I
-    assert found["magnetic"] == pytest.approx(-e * (Ba @ Br) * (2 * np.pi - 2 * np.pi / 3), rel=1e-5)
+    assert found["magnetic"] == pytest.approx(
+        -e * (Ba @ Br) * (2 * np.pi - 2 * np.pi / 3), rel=1e-5
+    )
 
 
 def test_half_is_half_of_the_whole() -> None:
@@ -59,5 +71,7 @@ def test_half_is_half_of_the_whole() -> None:
         u = 0.05 * (z**2)[:, None] * np.column_stack([x * y**2, y * (1 + x), 0.3 + x + y**2])
         found = model.system.energies(u.ravel())
         edges = sum(v for k, v in found.items() if k.endswith("edges"))
-        energies.append(model.multiplicity * np.array([found["membrane"], found["bending"] + edges]))
+        energies.append(
+            model.multiplicity * np.array([found["membrane"], found["bending"] + edges])
+        )
     assert energies[1] == pytest.approx(energies[0], rel=2e-4)

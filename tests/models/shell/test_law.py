@@ -1,4 +1,6 @@
-"""What a law of the material says of stresses and edges follows from its energies, for arrays and for expressions."""
+"""What a law of the material says of stresses and edges follows from its energies, for arrays and
+for expressions.
+"""
 
 from dataclasses import replace
 
@@ -38,8 +40,12 @@ UP = np.linalg.inv(np.eye(2) + tensors(5) / 2)
 @pytest.mark.parametrize("law", LAWS)
 def test_stress_and_moment_are_derivatives(law: Law) -> None:
     """Along any strain, by complex steps: exact to rounding."""
-    assert work(law.stress(E, UP), T) == pytest.approx(law.membrane(E + 1j * STEP * T, UP).imag / STEP)
-    assert work(law.moment(E, K, UP), T) == pytest.approx(law.bending(E, K + 1j * STEP * T, UP).imag / STEP)
+    assert work(law.stress(E, UP), T) == pytest.approx(
+        law.membrane(E + 1j * STEP * T, UP).imag / STEP
+    )
+    assert work(law.moment(E, K, UP), T) == pytest.approx(
+        law.bending(E, K + 1j * STEP * T, UP).imag / STEP
+    )
 
 
 @pytest.mark.parametrize("law", LAWS)

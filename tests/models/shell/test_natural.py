@@ -1,4 +1,6 @@
-"""The natural shape: closed forms, derivatives, every model against the others, and what a case says of it."""
+"""The natural shape: closed forms, derivatives, every model against the others, and what a case
+says of it.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -22,7 +24,11 @@ CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_
 STRIP = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0}
 UNEVEN = {"stretch": ["1.1 + 0.1*x*y", 0.95], "curvature": ["0.3 + x**2", 0.1, 0.2]}
 BOTH = {"natural_curvature": 0.7, "natural_stretch": 0.8}
-DEGREES = {"none": {"degree": 3}, "half": {"degree": 3}, "axisymmetric": {"degree": 4}}  # few: kernels take long
+DEGREES = {
+    "none": {"degree": 3},
+    "half": {"degree": 3},
+    "axisymmetric": {"degree": 4},
+}  # few: kernels take long
 
 
 def load(**sections: Any) -> ms.Case:
@@ -58,7 +64,9 @@ def test_hemisphere_swells_without_stress() -> None:
         natural={"stretch": 1.3},
         mesh={"degree": 4, "refinement": 0.5},
     )
-    assert swells(case, [0, 0])["volume_change"] == pytest.approx((1.3**3 - 1) * 2 * np.pi / 3, rel=1e-6)
+    assert swells(case, [0, 0])["volume_change"] == pytest.approx(
+        (1.3**3 - 1) * 2 * np.pi / 3, rel=1e-6
+    )
 
 
 def test_hemisphere_of_triangles_swells_without_stress() -> None:
@@ -71,7 +79,9 @@ def test_hemisphere_of_triangles_swells_without_stress() -> None:
         mesh={"degree": 3, "refinement": 0.3},
         symmetry="none",
     )
-    assert swells(case, [0, 0, 0])["volume_change"] == pytest.approx((1.3**3 - 1) * 2 * np.pi / 3, rel=3e-4)
+    assert swells(case, [0, 0, 0])["volume_change"] == pytest.approx(
+        (1.3**3 - 1) * 2 * np.pi / 3, rel=3e-4
+    )
 
 
 def test_cap_swells_without_stress() -> None:
@@ -98,7 +108,9 @@ def test_cap_swells_without_stress() -> None:
     ],
 )
 def test_stretched_and_bent_strip(model: str, mesh: dict[str, Any], error: float) -> None:
-    """Free of stress, a circle with kappa per natural length; so is a solid, to the error of its elements."""
+    """Free of stress, a circle with kappa per natural length; so is a solid, to the error of its
+    elements.
+    """
     case = load(
         model=model,
         shell=STRIP,
@@ -114,10 +126,17 @@ def test_stretched_and_bent_strip(model: str, mesh: dict[str, Any], error: float
 
 @pytest.mark.slow
 def test_bilayer() -> None:
-    """Timoshenko 1925: two equal layers of a beam that grow apart by a strain e bend to kappa = 3 e/(2 h)."""
+    """Timoshenko 1925: two equal layers of a beam that grow apart by a strain e bend to kappa = 3
+    e/(2 h).
+    """
     e, layers = 1e-4, {"layers": 2}
     case = load(
-        model="solid", shell=STRIP, boundary={"root": "clamped"}, mesh={"size": 0.1}, solid=layers, symmetry="none"
+        model="solid",
+        shell=STRIP,
+        boundary={"root": "clamped"},
+        mesh={"size": 0.1},
+        solid=layers,
+        symmetry="none",
     )
     problem = make_problem(case)
 
@@ -134,19 +153,37 @@ def test_bilayer() -> None:
 
 @pytest.mark.parametrize(
     ("model", "symmetry", "shell", "size"),
-    [("shell", "none", CAP, 1e-3), ("shell", "axisymmetric", CAP, 1e-3), ("solid", "none", STRIP, 1e-5)],
+    [
+        ("shell", "none", CAP, 1e-3),
+        ("shell", "axisymmetric", CAP, 1e-3),
+        ("solid", "none", STRIP, 1e-5),
+    ],
 )
 def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: float) -> None:
-    """Residual, tangent, columns and curvatures against central differences, at random places and amplitudes.
+    """Residual, tangent, columns and curvatures against central differences, at random places and
+    amplitudes.
 
     The residual changes with each amplitude, and so does the tangent.
     """
-    natural = UNEVEN if symmetry == "none" else {"stretch": ["1.1 + 0.1*z", 0.95], "curvature": ["0.3 + z", 0.1, 0]}
+    natural = (
+        UNEVEN
+        if symmetry == "none"
+        else {"stretch": ["1.1 + 0.1*z", 0.95], "curvature": ["0.3 + z", 0.1, 0]}
+    )
     mesh = {"refinement": 0.5} if model == "solid" else DEGREES[symmetry] | {"refinement": 0.2}
     edge = "rim" if shell is CAP else "root"
-    case = load(model=model, shell=shell, boundary={edge: "clamped"}, natural=natural, mesh=mesh, symmetry=symmetry)
+    case = load(
+        model=model,
+        shell=shell,
+        boundary={edge: "clamped"},
+        natural=natural,
+        mesh=mesh,
+        symmetry=symmetry,
+    )
     system = ms.Scene(case).model.system
-    u, v = (system.held(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
+    u, v = (
+        system.held(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+    )
     mu = dict(BOTH)
 
     def energy(x: np.ndarray, at: dict[str, float]) -> float:
@@ -177,14 +214,20 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
             there = partial(moved, other)
             bend = rate(lambda s, there=there, name=name: system.potential(u, there(s), name), 1e-3)
             assert system.curvature(u, mu, name, other) == pytest.approx(bend, rel=1e-5)
-        changed = scipy.sparse.csr_array((system.tangent(u, at(0.1)).getValuesCSR()[2], columns, rows), shape=K.shape)
+        changed = scipy.sparse.csr_array(
+            (system.tangent(u, at(0.1)).getValuesCSR()[2], columns, rows), shape=K.shape
+        )
         assert abs(changed - K).max() > 1e-6 * abs(K).max()
 
 
 def test_fast_tangent_and_residual() -> None:
     """Those from point kernels are those of FFCx's forms."""
     case = load(
-        shell=CAP, boundary={"rim": "clamped"}, natural=UNEVEN, mesh={"degree": 2, "refinement": 0.3}, symmetry="none"
+        shell=CAP,
+        boundary={"rim": "clamped"},
+        natural=UNEVEN,
+        mesh={"degree": 2, "refinement": 0.3},
+        symmetry="none",
     )
     fast = ms.Scene(case).model.system
     pattern = next(t for t in fast.terms if t.name == "interior edges")
@@ -200,12 +243,21 @@ def test_fast_tangent_and_residual() -> None:
 
 @pytest.mark.slow
 def test_the_same_in_every_shell() -> None:
-    """A clamped cap that grows unevenly: half and full shell converge to the meridian, the solid to h/R."""
+    """A clamped cap that grows unevenly: half and full shell converge to the meridian, the solid to
+    h/R.
+    """
     natural = {"stretch": "1 + 0.02*z", "curvature": ["0.2 + x**2 + y**2", 0.2, 0]}
 
     def end(symmetry: str, model: str = "shell", **mesh: Any) -> dict[str, float]:
         mesh = mesh if model == "solid" else {**mesh, **DEGREES[symmetry]}
-        case = load(model=model, shell=CAP, boundary={"rim": "clamped"}, natural=natural, mesh=mesh, symmetry=symmetry)
+        case = load(
+            model=model,
+            shell=CAP,
+            boundary={"rim": "clamped"},
+            natural=natural,
+            mesh=mesh,
+            symmetry=symmetry,
+        )
         scene = ms.Scene(case)
         return scene.observe(grow(scene, "natural_stretch", "natural_curvature"))
 
@@ -216,14 +268,20 @@ def test_the_same_in_every_shell() -> None:
         return [abs(found[name] / meridian[name] - 1) for name in ("w_pole_over_h", "energy")]
 
     coarse, fine, full = error("half", 1.0), error("half", 2.0), error("none", 1.0)
-    assert [a / b for a, b in zip(coarse, fine, strict=True)] == pytest.approx([7, 8], rel=0.2)  # order 3
+    assert [a / b for a, b in zip(coarse, fine, strict=True)] == pytest.approx(
+        [7, 8], rel=0.2
+    )  # order 3
     assert fine[0] < 3e-4
     assert full[0] < 3e-3
-    assert end("half", "solid")["w_pole_over_h"] == pytest.approx(meridian["w_pole_over_h"], rel=0.02)
+    assert end("half", "solid")["w_pole_over_h"] == pytest.approx(
+        meridian["w_pole_over_h"], rel=0.02
+    )
 
 
 def test_fields_of_what_is_held() -> None:
-    """A plate that cannot move: E = (1/lambda^2 - 1)/2 of its natural size, M = -D (1 + nu) kappa of its shape."""
+    """A plate that cannot move: E = (1/lambda^2 - 1)/2 of its natural size, M = -D (1 + nu) kappa
+    of its shape.
+    """
     jet = np.zeros((6, 1, 4, 3))
     jet[1, ..., 0], jet[2, ..., 1] = 2.0, 0.5
     stretch, curvature, along = np.full(3, 0.2), np.array([0.4, 0.4, 0.0]), lambda r0, n0: 0 * r0
@@ -233,7 +291,9 @@ def test_fields_of_what_is_held() -> None:
     assert found["E_1"] == pytest.approx((1 / 1.44 - 1) / 2)
     assert held["E_total"] == pytest.approx(0)
     assert found["M_1"] == pytest.approx(0)
-    found = principal_fields(stresses.of(0 * jet, {"natural_stretch": 0.0, "natural_curvature": 1.0}))
+    found = principal_fields(
+        stresses.of(0 * jet, {"natural_stretch": 0.0, "natural_curvature": 1.0})
+    )
     assert found["M_2"] == pytest.approx(-1.3 * 0.4)
     assert found["E_1"] == pytest.approx(0)
 
@@ -247,13 +307,25 @@ def test_fields_of_what_is_held() -> None:
         ({"curvature": "1/(x - x)"}, r"natural.curvature: .*: is .* at"),
         ({"curvature": "5/m"}, "natural.curvature: has a unit"),
         ({"curvature": {"rest": 1}}, "natural.curvature: the shell has no dimple"),
-        ({"curvature": [1, 0, 0], "along": [0, 0, 1]}, "natural.along: has no direction in the surface"),
+        (
+            {"curvature": [1, 0, 0], "along": [0, 0, 1]},
+            "natural.along: has no direction in the surface",
+        ),
     ],
 )
 def test_refused(natural: dict[str, Any], said: str) -> None:
     """One message with the key."""
-    with pytest.raises(Exception, match=said.replace("(", "\\(")):  # a CaseError, or a MeshError at the nodes
-        ms.Scene(load(shell=CAP, boundary={"rim": "clamped"}, natural=natural, mesh={"degree": 2, "refinement": 0.3}))
+    with pytest.raises(
+        Exception, match=said.replace("(", "\\(")
+    ):  # a CaseError, or a MeshError at the nodes
+        ms.Scene(
+            load(
+                shell=CAP,
+                boundary={"rim": "clamped"},
+                natural=natural,
+                mesh={"degree": 2, "refinement": 0.3},
+            )
+        )
 
 
 def test_units_of_curvature() -> None:
@@ -276,4 +348,7 @@ def test_symmetry() -> None:
         ({"curvature": "y + x*x"}, "half shell"),
         ({"curvature": "y**3 + x"}, "full shell"),
     ):
-        assert make_problem(load(shell=CAP, boundary={"rim": "clamped"}, natural=natural)).included[0] == model, natural
+        assert (
+            make_problem(load(shell=CAP, boundary={"rim": "clamped"}, natural=natural)).included[0]
+            == model
+        ), natural

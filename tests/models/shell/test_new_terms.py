@@ -18,7 +18,14 @@ from magshell_fenicsx.mesh.msh import in_space
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.revolved import Arc, Revolved, Segment
 from magshell_fenicsx.mesh.shapes import flat
-from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Held, Material, PointForce
+from magshell_fenicsx.models.shell.parameters import (
+    AreaForce,
+    EdgeForce,
+    EdgeMoment,
+    Held,
+    Material,
+    PointForce,
+)
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.shell import ShellModel
@@ -31,22 +38,30 @@ def panel(size: float = 0.5) -> Midsurface:
     """A cylindrical panel of one radian."""
     points = {"pole": np.array([0.5, 0.5])}
     grid = Grid((0.0, 0.0), (1.0, 1.0), size)
-    return distribute(grid_mesh(grid, points, Revolved(Segment((1.0, 0.0), (1.0, 1.0)), 1.0)), MPI.COMM_SELF)
+    return distribute(
+        grid_mesh(grid, points, Revolved(Segment((1.0, 0.0), (1.0, 1.0)), 1.0)), MPI.COMM_SELF
+    )
 
 
 def box(angle: float) -> Midsurface:
-    """Two unit squares that meet at an angle (rad, 0 is flat) along x = 0, as a mesh from elsewhere would."""
+    """Two unit squares that meet at an angle (rad, 0 is flat) along x = 0, as a mesh from elsewhere
+    would.
+    """
 
     def fold(chart: np.ndarray) -> np.ndarray:
         x, y = chart.T
         right = np.maximum(x, 0)
-        return np.column_stack([np.minimum(x, 0) + right * np.cos(angle), y, -right * np.sin(angle)])
+        return np.column_stack(
+            [np.minimum(x, 0) + right * np.cos(angle), y, -right * np.sin(angle)]
+        )
 
     chart = grid_mesh(Grid((-1.0, 0.0), (1.0, 1.0), 0.5), {}, flat)
     nodes = fold(chart.nodes)
     points = {"pole": fold(np.array([[1.0, 1.0]]))[0]}
     halves = {"left half": chart.nodes[chart.cells].mean(axis=1)[:, 0] < 0}
-    return distribute(PatchMesh(nodes, chart.cells, in_space, chart.edges, points, patches=halves), MPI.COMM_SELF)
+    return distribute(
+        PatchMesh(nodes, chart.cells, in_space, chart.edges, points, patches=halves), MPI.COMM_SELF
+    )
 
 
 def varying(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -63,7 +78,11 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
         Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(
-        panel(), MATERIAL, 2, {"bottom": "plane"}, Loads(dead={"load": (EdgeMoment("bottom", 0.01),)})
+        panel(),
+        MATERIAL,
+        2,
+        {"bottom": "plane"},
+        Loads(dead={"load": (EdgeMoment("bottom", 0.01),)}),
     ),
     "folded": lambda: ShellModel(box(1.8), MATERIAL, 2, {"left": "clamped"}, Loads()),
     "thickness": lambda: ShellModel(
@@ -75,7 +94,12 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
         thickness=Thickness(varying),
     ),
     "folded, two thicknesses": lambda: ShellModel(
-        box(1.2), MATERIAL, 2, {"left": "clamped"}, Loads(), thickness=Thickness(patches={"left half": 0.5})
+        box(1.2),
+        MATERIAL,
+        2,
+        {"left": "clamped"},
+        Loads(),
+        thickness=Thickness(patches={"left half": 0.5}),
     ),
 }
 MU = {"load": 0.7, "pressure": 0.3, "lambda_m": 0.4}
@@ -97,11 +121,16 @@ def test_tangent(name: str) -> None:
 @pytest.mark.parametrize("name", SHELLS)
 def test_residual_is_the_derivative_of_the_energy(name: str) -> None:
     model = SHELLS[name]()
-    u, v = (model.system.held(random_displacement(model, size, seed)) for size, seed in ((1e-3, 1), (1.0, 2)))
+    u, v = (
+        model.system.held(random_displacement(model, size, seed))
+        for size, seed in ((1e-3, 1), (1.0, 2))
+    )
 
     def energy(w: np.ndarray) -> float:
         found = model.system.energies(w)
-        return sum(found[t.name] * (MU[t.amplitude] if t.amplitude else 1.0) for t in model.system.terms)
+        return sum(
+            found[t.name] * (MU[t.amplitude] if t.amplitude else 1.0) for t in model.system.terms
+        )
 
     step = 1e-6
     slope = (energy(u + step * v) - energy(u - step * v)) / (2 * step)
@@ -118,11 +147,17 @@ def test_a_fold_takes_no_energy_from_rigid_motion_and_resists_opening(angle: flo
     rigid = (x @ Q.T - x).ravel()
     assert abs(sum(model.system.energies(rigid).values())) < 1e-12
     little = 1e-3
-    Q = np.array([[np.cos(little), 0, np.sin(little)], [0, 1, 0], [-np.sin(little), 0, np.cos(little)]])
+    Q = np.array(
+        [[np.cos(little), 0, np.sin(little)], [0, 1, 0], [-np.sin(little), 0, np.cos(little)]]
+    )
     right = ~((x[:, 0] <= 1e-9) & (np.abs(x[:, 2]) < 1e-9))
     opened = np.where(right[:, None], x @ Q.T - x, 0.0).ravel()
-    stiffness = 45 * MATERIAL.bending_stiffness / (2 * 0.125)  # sigma = 5 k^2; flat area over length of the edge
-    assert model.system.energies(opened)["interior edges"] == pytest.approx(stiffness * little**2, rel=1e-6)
+    stiffness = (
+        45 * MATERIAL.bending_stiffness / (2 * 0.125)
+    )  # sigma = 5 k^2; flat area over length of the edge
+    assert model.system.energies(opened)["interior edges"] == pytest.approx(
+        stiffness * little**2, rel=1e-6
+    )
 
 
 def test_small_folds_are_smooth_edges() -> None:
@@ -141,7 +176,8 @@ def test_moment_counts_turns() -> None:
     for n in range(1, 7):
         a = n * np.pi / 4
         Q = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        # the right edge runs along -e3 with the surface on its left... the sign is that of the outward normal
+        # the right edge runs along -e3 with the surface on its left... the sign is that of the
+        # outward normal
         u = (x @ Q.T - x).ravel()
         state = model.system.advance(State(u, {"load": 1.0}), state.mu)
         found = -model.system.potential(u, state.mu, "load")
@@ -150,7 +186,9 @@ def test_moment_counts_turns() -> None:
 
 
 def test_dead_loads_add_up_to_their_resultants() -> None:
-    """Of a translation: point, edge (in all and per length), area and normal pressure; Gauss for the last."""
+    """Of a translation: point, edge (in all and per length), area and normal pressure; Gauss for
+    the last.
+    """
     loads = (
         PointForce("pole", np.array([1.0, 2.0, 3.0])),
         EdgeForce("left", np.array([0.0, 1.0, 0.0]), total=True),
@@ -161,24 +199,33 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
     model = ShellModel(panel(), MATERIAL, 4, {}, Loads(dead={"load": loads}))
     entries = -model.system.load(model.zero(), {}, "load").reshape(-1, 3).sum(axis=0)
     pressure = -2.0 * np.array([np.sin(1), 1 - np.cos(1), 0.0])
-    assert entries == pytest.approx(np.array([1.0, 2.0, 3.0]) + np.array([1.0, 1.0, 1.0]) + pressure, abs=1e-7)
+    assert entries == pytest.approx(
+        np.array([1.0, 2.0, 3.0]) + np.array([1.0, 1.0, 1.0]) + pressure, abs=1e-7
+    )
     assert model.load_size["load"] == pytest.approx(np.sqrt(14) + 1 + 1 + 1 + 2, rel=1e-7)
 
 
 def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
     """Deflection of a cantilever of length 1 under a small end force, over F/(E h_ref)."""
     surface = distribute(
-        grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, flat), MPI.COMM_SELF
+        grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, flat),
+        MPI.COMM_SELF,
     )
     force = 1e-9
     loads = Loads(dead={"load": (EdgeForce("right", np.array([0.0, 0.0, force]), total=True),)})
-    model = ShellModel(surface, Material(0.0, h), degree, {"left": "clamped"}, loads, thickness=thickness)
-    found = BorderedNewton(model.system).solve(State(model.zero(), {"load": 0.0}), "load", GivenLoad("load", 1.0))
+    model = ShellModel(
+        surface, Material(0.0, h), degree, {"left": "clamped"}, loads, thickness=thickness
+    )
+    found = BorderedNewton(model.system).solve(
+        State(model.zero(), {"load": 0.0}), "load", GivenLoad("load", 1.0)
+    )
     return float(model.displacement(found.state.u, "pole")[2]) / force
 
 
 def test_thickness_that_varies() -> None:
-    """A cantilever with h(x) = h/(1 + x)^(1/3): w = F/E 12/(b h^3) int (1 - x)^2 (1 + x) dx (Bernoulli)."""
+    """A cantilever with h(x) = h/(1 + x)^(1/3): w = F/E 12/(b h^3) int (1 - x)^2 (1 + x) dx
+    (Bernoulli).
+    """
     h, b = 0.02, 0.1
     found = bent(Thickness(lambda x, y, z: (1 + x) ** (-1 / 3)), h)
     assert found == pytest.approx(12 / (b * h**2) * (1 / 3 + 1 / 12), rel=2e-4)  # F is over E h
@@ -186,8 +233,12 @@ def test_thickness_that_varies() -> None:
 
 def test_uniform_factor_is_a_thickness() -> None:
     """Twice the thickness by a factor, or by h: force unit E h R."""
-    assert bent(Thickness(lambda x, y, z: 2 + 0 * x), 0.01) == pytest.approx(bent(None, 0.02) / 2, rel=1e-7)
+    assert bent(Thickness(lambda x, y, z: 2 + 0 * x), 0.01) == pytest.approx(
+        bent(None, 0.02) / 2, rel=1e-7
+    )
 
 
 def test_arc_profile() -> None:
-    assert Arc(1.0, 0.0, np.pi / 2)(np.array([np.pi / 2])) == pytest.approx(np.array([[0.0, 1.0]]), abs=1e-15)
+    assert Arc(1.0, 0.0, np.pi / 2)(np.array([np.pi / 2])) == pytest.approx(
+        np.array([[0.0, 1.0]]), abs=1e-15
+    )

@@ -1,6 +1,8 @@
-"""Ogden's rubber: energies of principal stretches, its terms that are neo-Hookean, and equal stretches.
+"""Ogden's rubber: energies of principal stretches, its terms that are neo-Hookean, and equal
+stretches.
 
-The references are the sum over three stretches, Rubber's laws, finite differences, and the energy of layers.
+The references are the sum over three stretches, Rubber's laws, finite differences, and the energy
+of layers.
 """
 
 import numpy as np
@@ -18,7 +20,10 @@ from magshell_fenicsx.shells.shell import ShellModel
 
 H, UP, RNG = 0.1, np.eye(2), np.random.default_rng(7)
 STEEP = (1 / 12, 1 / 3), (5.0, 0.75)  # mu/E and alpha
-LAWS = [Ogden(H, 0.0, mu=mu, alpha=alpha) for mu, alpha in (TRELOAR, STEEP, ((-1 / 3,), (-2.0,)), ((-2 / 3,), (-1.0,)))]
+LAWS = [
+    Ogden(H, 0.0, mu=mu, alpha=alpha)
+    for mu, alpha in (TRELOAR, STEEP, ((-1 / 3,), (-2.0,)), ((-2 / 3,), (-1.0,)))
+]
 
 
 def by_stretches(law: Ogden, E: np.ndarray) -> np.ndarray:
@@ -35,7 +40,9 @@ def strains(count: int, size: float) -> np.ndarray:
 
 
 def near_equal() -> np.ndarray:
-    """Strains whose principal stretches are equal, and less and less so, through what is a series and what is none."""
+    """Strains whose principal stretches are equal, and less and less so, through what is a series
+    and what is none.
+    """
     apart = np.array([0.0, 1e-12, 1e-8, 1e-4, 0.01, 0.1, 0.17, 0.18, 0.185, 0.19, 0.2, 0.3, 0.5])
     return np.asarray(0.3 * np.eye(2) + apart[:, None, None] * np.array([[0.6, 0.8], [0.8, -0.6]]))
 
@@ -46,13 +53,21 @@ def test_energy_of_three_stretches(law: Ogden, E: np.ndarray) -> None:
     assert law.membrane(E, UP) == pytest.approx(by_stretches(law, E), rel=1e-12, abs=1e-15)
 
 
-@pytest.mark.parametrize(("mu", "alpha", "share"), [((1 / 3,), (2.0,), 0.0), ((0.7 / 3, -0.1), (2.0, -2.0), 0.3)])
-def test_neo_hookean_and_mooney_rivlin_terms(mu: tuple[float, ...], alpha: tuple[float, ...], share: float) -> None:
-    """alpha = 2 is neo-Hookean in all; 2 and -2 are Mooney-Rivlin, in bending where stretches are equal."""
+@pytest.mark.parametrize(
+    ("mu", "alpha", "share"), [((1 / 3,), (2.0,), 0.0), ((0.7 / 3, -0.1), (2.0, -2.0), 0.3)]
+)
+def test_neo_hookean_and_mooney_rivlin_terms(
+    mu: tuple[float, ...], alpha: tuple[float, ...], share: float
+) -> None:
+    """alpha = 2 is neo-Hookean in all; 2 and -2 are Mooney-Rivlin, in bending where stretches are
+    equal.
+    """
     law, rubber = Ogden(H, 0.0, mu=mu, alpha=alpha), Rubber(H, share)
     E, K = strains(50, 0.5), strains(50, 0.3)
     assert law.membrane(E, UP) == pytest.approx(rubber.membrane(E, UP), rel=1e-12)
-    assert np.array(law.stress(E, UP)) == pytest.approx(np.array(rubber.stress(E, UP)), rel=1e-12, abs=1e-15)
+    assert np.array(law.stress(E, UP)) == pytest.approx(
+        np.array(rubber.stress(E, UP)), rel=1e-12, abs=1e-15
+    )
     bent = E if not share else np.linspace(-0.3, 4, 50)[:, None, None] * np.eye(2)
     assert law.bending(bent, K, UP) == pytest.approx(rubber.bending(bent, K, UP), rel=1e-12)
 
@@ -69,7 +84,9 @@ def test_no_bending_is_free(law: Ogden) -> None:
 
 @pytest.mark.parametrize("s", [1.0, 1.3, 2.0])
 def test_bending_across_a_pull_is_that_of_the_layers(s: float) -> None:
-    """A strip pulled to s along its axis and bent about it, without stress across: the mean energy of its layers."""
+    """A strip pulled to s along its axis and bent about it, without stress across: the mean energy
+    of its layers.
+    """
     law, K, e = LAWS[0], np.diag([1.0, 0.0]), 1e-3
 
     def pulled(square: float) -> np.ndarray:
@@ -78,7 +95,9 @@ def test_bending_across_a_pull_is_that_of_the_layers(s: float) -> None:
     square = brentq(lambda square: law.stress(pulled(square), UP)[0], 0.05, 2)
     at = [by_stretches(law, pulled(square) + n * e * K) for n in (-2, -1, 0, 1, 2)]
     twice = (-at[0] + 16 * at[1] - 30 * at[2] + 16 * at[3] - at[4]) / (12 * e**2)
-    assert law.bending(pulled(square), K, UP) == pytest.approx(H**2 / (24 * square * s**2) * twice, rel=1e-6)
+    assert law.bending(pulled(square), K, UP) == pytest.approx(
+        H**2 / (24 * square * s**2) * twice, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -98,6 +117,10 @@ def test_small_strains_are_koiters(law: Ogden) -> None:
 def test_residual_and_tangent(stretch: float) -> None:
     """By differences of the energy: about no stretch, where both are equal, and about 1.3."""
     edges: dict[str, Condition] = {"rim": "clamped", "symmetry": "symmetry"}
-    model = ShellModel(hemisphere(0.8, half=True), Material(0.5, 0.05, TRELOAR), 3, edges, Loads(pressure=True))
-    u = random_displacement(model, 2e-3) + model.system.held(stretch * model.r0.x.array[: model.system.size])
+    model = ShellModel(
+        hemisphere(0.8, half=True), Material(0.5, 0.05, TRELOAR), 3, edges, Loads(pressure=True)
+    )
+    u = random_displacement(model, 2e-3) + model.system.held(
+        stretch * model.r0.x.array[: model.system.size]
+    )
     check(model.system, u, {"pressure": 0.3})

@@ -1,4 +1,6 @@
-"""Live pressure beside edges that move: its virtual work, its potential where there is one, and what it does."""
+"""Live pressure beside edges that move: its virtual work, its potential where there is one, and
+what it does.
+"""
 
 from math import pi, sqrt
 from typing import Any
@@ -18,15 +20,29 @@ from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
-CYLINDER = {"geometry": "cylinder", "radius": 1.0, "length": 1.0, "thickness": 0.1, "poisson_ratio": 0.3}
+CYLINDER = {
+    "geometry": "cylinder",
+    "radius": 1.0,
+    "length": 1.0,
+    "thickness": 0.1,
+    "poisson_ratio": 0.3,
+}
 PLATE = {"geometry": "plate", "length": 1.0, "width": 0.1, "thickness": 1e-3, "poisson_ratio": 0.0}
 SLIDING, FLAT, FREE = {"held": ["x", "y"]}, {"held": ["z"]}, "free"
 EDGES: list[tuple[Any, bool]] = [(SLIDING, True), (FLAT, True), ("symmetry", True), (FREE, False)]
 MODELS = [("shell", "none"), ("shell", "half"), ("shell", "axisymmetric"), ("solid", "none")]
 
 
-def scene(shell: dict[str, Any], boundary: dict[str, Any], mesh: dict[str, Any], **more: Any) -> ms.Scene:
-    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05, "points": 1}
+def scene(
+    shell: dict[str, Any], boundary: dict[str, Any], mesh: dict[str, Any], **more: Any
+) -> ms.Scene:
+    loading = {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": 0.05,
+        "points": 1,
+    }
     data = {"shell": shell, "boundary": boundary, "loading": loading, "mesh": mesh, **more}
     return ms.Scene(ms.Case.from_source(data))
 
@@ -49,11 +65,15 @@ def times(tangent: Tangent, v: Array) -> Array:
         K.mult(x, y)
         return np.array(y.array_r)
 
-    return product(tangent.K) + product(tangent.N) if isinstance(tangent, Skewed) else product(tangent)
+    return (
+        product(tangent.K) + product(tangent.N) if isinstance(tangent, Skewed) else product(tangent)
+    )
 
 
 def work(of: ms.Scene, u: Array, v: Array) -> float:
-    """p int n . v da of p/p_c = 1 by Nanson's formula, with a rule of another degree; of a solid on its outer face."""
+    """p int n . v da of p/p_c = 1 by Nanson's formula, with a rule of another degree; of a solid on
+    its outer face.
+    """
     model = of.model
     model.u.x.array[:] = u
     w = fem.Function(model.V)
@@ -73,7 +93,9 @@ def work(of: ms.Scene, u: Array, v: Array) -> float:
     J = ufl.Jacobian(domain)
     a1, a2 = (ufl.dot(ufl.grad(model.r0 + model.u), J[:, i]) for i in range(2))
     area = ufl.cross(J[:, 0], J[:, 1])
-    return unit * fem.assemble_scalar(fem.form(ufl.dot(w, ufl.cross(a1, a2)) / ufl.sqrt(ufl.dot(area, area)) * dx))
+    return unit * fem.assemble_scalar(
+        fem.form(ufl.dot(w, ufl.cross(a1, a2)) / ufl.sqrt(ufl.dot(area, area)) * dx)
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,19 +104,28 @@ def work(of: ms.Scene, u: Array, v: Array) -> float:
         (*edge, *model)
         for edge in EDGES
         for model in MODELS
-        if edge[0] == FREE or model[1] == "axisymmetric" or (edge[0] == FLAT) == (model == ("shell", "half"))
+        if edge[0] == FREE
+        or model[1] == "axisymmetric"
+        or (edge[0] == FLAT) == (model == ("shell", "half"))
     ],
 )
 def test_virtual_work_and_tangent(top: Any, potential: bool, model: str, symmetry: str) -> None:
-    """The load is the integral of n . v, its tangent the difference of it, symmetric where there is a potential."""
+    """The load is the integral of n . v, its tangent the difference of it, symmetric where there is
+    a potential.
+    """
     tube = cylinder(top, model, symmetry)
     system, (u, v, w) = tube.model.system, (displacement(tube, seed) for seed in range(3))
     assert bool(tube.model.without_potential) != potential
     load = system.load(u, {}, "pressure")
-    if model != "solid" or top in ("symmetry", FREE):  # else the half of the end above its middle line is pressed too
+    if model != "solid" or top in (
+        "symmetry",
+        FREE,
+    ):  # else the half of the end above its middle line is pressed too
         assert load @ v == pytest.approx(work(tube, u, v), rel=1e-10)
     none, some, e = {"pressure": 0.0}, {"pressure": 1e3}, 1e-4
-    change = (system.load(u + e * v, {}, "pressure") - system.load(u - e * v, {}, "pressure")) / (2 * e)
+    change = (system.load(u + e * v, {}, "pressure") - system.load(u - e * v, {}, "pressure")) / (
+        2 * e
+    )
     tangent = (times(system.tangent(u, some), v) - times(system.tangent(u, none), v)) / 1e3
     assert tangent == pytest.approx(change, rel=1e-6, abs=1e-8 * np.abs(change).max())
     reverse = (times(system.tangent(u, some), w) - times(system.tangent(u, none), w)) / 1e3
@@ -106,15 +137,24 @@ def test_virtual_work_and_tangent(top: Any, potential: bool, model: str, symmetr
 
 
 @pytest.mark.parametrize(("top", "ends"), [(SLIDING, 2), (FREE, 1)])
-@pytest.mark.parametrize(("symmetry", "h", "error"), [("axisymmetric", 1e-3, 2e-5), ("half", 1e-2, 2e-3)])
+@pytest.mark.parametrize(
+    ("symmetry", "h", "error"), [("axisymmetric", 1e-3, 2e-5), ("half", 1e-2, 2e-3)]
+)
 def test_open_cylinder(top: Any, ends: int, symmetry: str, h: float, error: float) -> None:
-    """Membrane and edge bending of a hinged tube that is free to shorten: w = w_p (1 - exp(-b x) cos b x) at each end.
+    """Membrane and edge bending of a hinged tube that is free to shorten: w = w_p (1 - exp(-b x)
+    cos b x) at each end.
 
-    Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, art. 114. No axial force, so it shortens by
-    nu w/R per length; the volume is 2 pi R times the integral of w.
+    Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, art. 114. No axial force, so it
+    shortens by nu w/R per length; the volume is 2 pi R times the integral of w.
     """
     mesh = {} if symmetry == "axisymmetric" else {"degree": 4, "size": 0.25}
-    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-4, "points": 1}
+    loading = {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": 1e-4,
+        "points": 1,
+    }
     more = {"points": {"A": [1, 0, 1]}, "loading": loading, "symmetry": symmetry}
     tube = scene({**CYLINDER, "thickness": h}, {"bottom": "hinged", "top": top}, mesh, **more)
     *_, last = ms.follow(tube)
@@ -128,7 +168,9 @@ def test_open_cylinder(top: Any, ends: int, symmetry: str, h: float, error: floa
 
 
 def elastica(q: float) -> Array:
-    """Displacement (2,) of the tip of an inextensible cantilever, L = EI = 1, under a follower load q per length."""
+    """Displacement (2,) of the tip of an inextensible cantilever, L = EI = 1, under a follower load
+    q per length.
+    """
     s, y = np.linspace(0, 1, 101), np.zeros((6, 101))
     for load in np.linspace(0, q, 6)[1:]:
 
@@ -147,10 +189,18 @@ def elastica(q: float) -> Array:
 
 @pytest.mark.slow
 def test_strip_under_pressure() -> None:
-    """Clamped at one end, its tip turned by 89 degrees, against the elastica; at most ten iterations a step."""
+    """Clamped at one end, its tip turned by 89 degrees, against the elastica; at most ten
+    iterations a step.
+    """
     h, q = 1e-3, 10.0
     mu = -q * h**3 / 12 / (2 / sqrt(3) * h**2)
-    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": mu, "points": 2}
+    loading = {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": mu,
+        "points": 2,
+    }
     more = {"points": {"A": [1, 0.05, 0]}, "loading": loading}
     strip = scene(PLATE, {"left": "clamped"}, {"degree": 4, "size": 0.1}, **more)
     assert set(strip.model.without_potential) == {"right", "top"}

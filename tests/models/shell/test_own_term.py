@@ -37,9 +37,16 @@ def weight(r0: Jet, u: Jet, g: Expr) -> Expr:
 
 
 def hydrostatic(r0: Jet, u: Jet, depth: Expr) -> Expr:
-    """A live pressure that grows downwards, on a surface per undeformed area; not a potential at free edges."""
+    """A live pressure that grows downwards, on a surface per undeformed area; not a potential at
+    free edges.
+    """
     r = r0 + u
-    return (depth - r.r[2] / 2) * r.r[2] * ufl.dot(kin.area_vector(r), ufl.as_vector([0, 0, 1])) / kin.area_ratio(r0)
+    return (
+        (depth - r.r[2] / 2)
+        * r.r[2]
+        * ufl.dot(kin.area_vector(r), ufl.as_vector([0, 0, 1]))
+        / kin.area_ratio(r0)
+    )
 
 
 def stretching(r0: Jet, u: Jet) -> Expr:
@@ -61,7 +68,9 @@ def tilted(r0: Jet, u: Jet) -> Expr:
     return -ufl.dot(kin.normal(r0 + u), ufl.as_vector([0.6, 0.0, 0.8]))
 
 
-DENSITIES: dict[str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, ...], bool, bool, bool]] = {
+DENSITIES: dict[
+    str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, ...], bool, bool, bool]
+] = {
     # of what, whether linear, whether it turns about e3, whether it is mirrored in y = 0
     "winkler": (winkler, (), ("r",), False, True, True),
     "weight along e3": (weight, (E3,), ("r",), True, True, True),
@@ -79,12 +88,20 @@ DENSITIES: dict[str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, .
 def test_what_is_found_from_a_density(name: str) -> None:
     of, parameters, parts, linear, turns, mirrors = DENSITIES[name]
     term = OwnTerm("own", of, parameters)
-    assert (term.parts, term.linear, term.turns, term.mirrored(Y0)) == (parts, linear, turns, mirrors)
+    assert (term.parts, term.linear, term.turns, term.mirrored(Y0)) == (
+        parts,
+        linear,
+        turns,
+        mirrors,
+    )
 
 
 def test_far_floor_is_not_taken_for_linear() -> None:
     """Where it is not touched the energy is zero, but not everywhere."""
-    term = OwnTerm("floor", lambda r0, u: ufl.conditional(ufl.lt((r0 + u).r[2], -10), ((r0 + u).r[2] + 10) ** 2, 0))
+    term = OwnTerm(
+        "floor",
+        lambda r0, u: ufl.conditional(ufl.lt((r0 + u).r[2], -10), ((r0 + u).r[2] + 10) ** 2, 0),
+    )
     assert not term.linear
 
 
@@ -115,17 +132,33 @@ def test_symmetry_of_what_is_observed(name: str) -> None:
 def test_another_observed_density_is_another_term() -> None:
     """A run is resumed with the same columns alone."""
     one, other = (
-        OwnTerm("own", None, observed={"first": winkler, "second": lambda r0, u, n=n: ufl.dot(u.r, u.r) ** n})
+        OwnTerm(
+            "own",
+            None,
+            observed={"first": winkler, "second": lambda r0, u, n=n: ufl.dot(u.r, u.r) ** n},
+        )
         for n in (1, 2)
     )
     assert one.digest != other.digest
 
 
 def test_whole_value_of_what_is_observed() -> None:
-    """A cap under a load along x: the sum of u_y cancels, and that of u_x is the same on the model that is found."""
-    shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.05, "poisson_ratio": 0.3, "youngs_modulus": 1.0}
+    """A cap under a load along x: the sum of u_y cancels, and that of u_x is the same on the model
+    that is found.
+    """
+    shell = {
+        "geometry": "cap",
+        "radius": 1.0,
+        "thickness": 0.05,
+        "poisson_ratio": 0.3,
+        "youngs_modulus": 1.0,
+    }
     loads = [{"over": "all", "per_area": [1e-7, 0, 0]}]
-    data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2, "refinement": 0.4}}
+    data = {
+        "shell": shell,
+        "boundary": {"rim": "clamped"},
+        "mesh": {"degree": 2, "refinement": 0.4},
+    }
     data |= {"loading": {"kind": "dead", "loads": loads, "factor": 1, "points": 1}}
 
     def observed(symmetry: str, **columns: Density) -> tuple[str, dict[str, float]]:
@@ -142,11 +175,15 @@ def test_whole_value_of_what_is_observed() -> None:
     assert full.startswith("full")
     assert found["along"] == pytest.approx(both["along"], rel=1e-2)  # the two meshes differ
     assert abs(both["across"]) < 1e-3 * abs(both["along"])
-    with pytest.raises(CaseError, match="symmetry: half: the energy springs or what it observes does not share it"):
+    with pytest.raises(
+        CaseError, match="symmetry: half: the energy springs or what it observes does not share it"
+    ):
         observed("half", across=across)
 
 
-@pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
+@pytest.mark.parametrize(
+    "energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"]
+)
 def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
     """Fields along e3 turn and mirror; in the plane y = 0 they mirror; across it they do not."""
     of = getattr(densities, energy)
@@ -162,8 +199,16 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
         ("a b", winkler, "identifier"),
         ("own", lambda r0, u: u.r, "shape"),
         ("own", lambda r0, u: ufl.dot(r0.r, r0.r), "does not depend"),
-        ("own", lambda r0, u: u.r[0] * ufl.SpatialCoordinate(hemisphere(0.8).mesh)[0], "jets and parameters alone"),
-        ("own", lambda r0, u: densities.bending(r0, u, law=Koiter(0.1, 0.3)), "u.r11, u.r12, u.r22"),
+        (
+            "own",
+            lambda r0, u: u.r[0] * ufl.SpatialCoordinate(hemisphere(0.8).mesh)[0],
+            "jets and parameters alone",
+        ),
+        (
+            "own",
+            lambda r0, u: densities.bending(r0, u, law=Koiter(0.1, 0.3)),
+            "u.r11, u.r12, u.r22",
+        ),
     ],
 )
 def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
@@ -171,14 +216,19 @@ def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
         OwnTerm(name, of)
 
 
-@pytest.mark.parametrize("name", ["winkler", "weight along e1", "hydrostatic", "stretching", "one-sided", "tilted"])
+@pytest.mark.parametrize(
+    "name", ["winkler", "weight along e1", "hydrostatic", "stretching", "one-sided", "tilted"]
+)
 def test_residual_and_tangent(name: str) -> None:
     """Of the point derivatives against those of the forms; on a shell that has all other terms too."""
     of, parameters, *_ = DENSITIES[name]
     loads = Loads(pressure=True, magnetic=TILTED, own=(OwnTerm("own", of, parameters),))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads)
     u = random_displacement(model, 1e-2)
-    for mu in ({"lambda_m": 0.4, "pressure": 0.3, "own": 1.3}, {"lambda_m": 0.0, "pressure": 0.0, "own": 20.0}):
+    for mu in (
+        {"lambda_m": 0.4, "pressure": 0.3, "own": 1.3},
+        {"lambda_m": 0.0, "pressure": 0.0, "own": 20.0},
+    ):
         assert tangent_difference(model.system, u, mu) <= 1e-12
         assert residual_difference(model.system, u, mu) <= 1e-12
 
@@ -189,11 +239,14 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     of, parameters, *_ = DENSITIES[name]
     loads = Loads(own=(OwnTerm("own", of, parameters),))
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
-    model_u, v = (system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
-    step = 1e-3
-    slope = (system.potential(model_u + step * v, {}, "own") - system.potential(model_u - step * v, {}, "own")) / (
-        2 * step
+    model_u, v = (
+        system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
     )
+    step = 1e-3
+    slope = (
+        system.potential(model_u + step * v, {}, "own")
+        - system.potential(model_u - step * v, {}, "own")
+    ) / (2 * step)
     assert slope == pytest.approx(dot(system.comm, system.load(model_u, {}, "own"), v), rel=1e-6)
 
 
@@ -208,7 +261,10 @@ def test_the_shells_own_pressure_as_ones_own(file: str, symmetry: str, size: flo
     """The same density by both ways: potentials, load columns and residuals agree."""
     settings = ["mesh.degree=2", "mesh.refinement=0.5", f"symmetry={symmetry}"]
     case = Case.load(CASES / file, settings)
-    unit = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h).classical_pressure * case.shell.R_over_h
+    unit = (
+        Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h).classical_pressure
+        * case.shell.R_over_h
+    )
 
     def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
         return unit * densities.volume(r0, u) / kin.area_ratio(r0)
@@ -216,7 +272,9 @@ def test_the_shells_own_pressure_as_ones_own(file: str, symmetry: str, size: flo
     scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
     system = scene.model.system
     u = system.held(size * np.random.default_rng(0).standard_normal(system.size))
-    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "pressure"), rel=1e-11)
+    assert system.potential(u, {}, "own") == pytest.approx(
+        system.potential(u, {}, "pressure"), rel=1e-11
+    )
     ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "pressure")
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
     mu = {"own": -0.7, "pressure": 0.7}
@@ -239,7 +297,11 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
                     "poisson_ratio": 0.3,
                 },
                 "boundary": {"bottom": "clamped"},
-                "loading": {"kind": "dead", "loads": [{"over": "all", "per_area": [0.1, 0.2, -0.3]}], "factor": 1},
+                "loading": {
+                    "kind": "dead",
+                    "loads": [{"over": "all", "per_area": [0.1, 0.2, -0.3]}],
+                    "factor": 1,
+                },
                 "mesh": {"size": 50, "degree": 3},
             },
         )
@@ -251,7 +313,9 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
     ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "load")
     assert np.abs(theirs).max() > 0
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
-    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "load"), rel=1e-9)
+    assert system.potential(u, {}, "own") == pytest.approx(
+        system.potential(u, {}, "load"), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -268,7 +332,9 @@ def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
 
 def test_half_model_of_another_plane() -> None:
     """The half shell's frame is turned to its mirror plane, and a direction in this plane with it."""
-    settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
+    settings = [
+        "magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"
+    ]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     assert make_problem(case, [OwnTerm("own", winkler)]).half
     assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
@@ -299,7 +365,9 @@ def test_a_solid_has_no_curvature() -> None:
 
     def mean_curvature(r0: Jet) -> Expr:
         b11, b12, b22 = (ufl.dot(kin.normal(r0), second) for second in (r0.r11, r0.r12, r0.r22))
-        return ufl.tr(kin.mixed(ufl.as_matrix([[b11, b12], [b12, b22]]), kin.inverse_metric(r0))) / 2
+        return (
+            ufl.tr(kin.mixed(ufl.as_matrix([[b11, b12], [b12, b22]]), kin.inverse_metric(r0))) / 2
+        )
 
     curved = OwnTerm("own", lambda r0, u: mean_curvature(r0) * u.r[2])
     with pytest.raises(CaseError, match=r"own depends on r0\.r11, r0\.r12, r0\.r22, which only"):
@@ -310,24 +378,40 @@ def test_parameters_need_no_new_kernel() -> None:
     """Densities are compiled by what they are, not by the numbers in them."""
     models = [
         ShellModel(
-            hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, Loads(own=(OwnTerm("own", weight, (g,)),))
+            hemisphere(0.8),
+            Material(0.3, 0.05),
+            2,
+            {"rim": "clamped"},
+            Loads(own=(OwnTerm("own", weight, (g,)),)),
         )
         for g in (E3, 2 * E3)
     ]
     served = [next(t for t in m.system.terms if t.name == "own").points for m in models]  # type: ignore[attr-defined]
-    kernels = [next(site for site in each._sites if "own" in site.names)._points.gradient for each in served]
+    kernels = [
+        next(site for site in each._sites if "own" in site.names)._points.gradient
+        for each in served
+    ]
     one, other = (ctypes.cast(kernel._function, ctypes.c_void_p).value for kernel in kernels)
     assert one == other
     u = random_displacement(models[0], 1e-2)
-    assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))
+    assert models[1].system.potential(u, {}, "own") == pytest.approx(
+        2 * models[0].system.potential(u, {}, "own")
+    )
 
 
 @pytest.mark.parametrize(("model", "symmetry"), [("shell", "half"), ("solid", "half")])
 def test_a_term_that_only_observes(model: str, symmetry: str) -> None:
-    """The mean displacement of the hanging strip is ρ g L²/(3 E), its area before that L²/10; no amplitude is added."""
+    """The mean displacement of the hanging strip is ρ g L²/(3 E), its area before that L²/10; no
+    amplitude is added.
+    """
     sections = {
         "model": model,
-        "shell": {"geometry": "strip", "width": 0.1, "radius_to_thickness": 50.0, "poisson_ratio": 0.0},
+        "shell": {
+            "geometry": "strip",
+            "width": 0.1,
+            "radius_to_thickness": 50.0,
+            "poisson_ratio": 0.0,
+        },
         "boundary": {"root": "clamped"},
         "loading": {"kind": "gravity", "direction": [1, 0, 0], "acceleration": 1e-3, "points": 1},
         "symmetry": symmetry,
@@ -355,11 +439,14 @@ ALONG = (lambda r0, u: ufl.dot(u.r1, u.r1), lambda r0, u: ufl.dot(u.r1, u.r1) + 
         (lambda r0, u, edge: edge.stretch * u.r[2], {}, "rim"),
     ],
 )
-def test_cells_have_no_directions(density: Density | None, observed: dict[str, Density], on: str | None) -> None:
+def test_cells_have_no_directions(
+    density: Density | None, observed: dict[str, Density], on: str | None
+) -> None:
     """r1 and r2 are along the sides of each cell: their lengths and directions are of the mesh, not
     of the shell."""
     with pytest.raises(
-        ValueError, match=rf"own{': seen' if observed else ''}: depends on the coordinates of r1 and r2"
+        ValueError,
+        match=rf"own{': seen' if observed else ''}: depends on the coordinates of r1 and r2",
     ):
         OwnTerm("own", density, observed=observed, on=on)
 

@@ -1,4 +1,6 @@
-"""Magnetisation patterns and gradients on the swelling hemisphere, u = e r0, and under translation: closed forms."""
+"""Magnetisation patterns and gradients on the swelling hemisphere, u = e r0, and under translation:
+closed forms.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,13 @@ from conftest import hemisphere
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
+from magshell_fenicsx.models.shell.patterns import (
+    Components,
+    Pattern,
+    WithinRims,
+    radial,
+    tangential,
+)
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.loads import Loads
@@ -23,7 +31,11 @@ def model(
 ) -> ShellModel:
     surface = hemisphere(0.3, dimple=Dimple(0.0, circle) if circle else None)
     return ShellModel(
-        surface, Material(0.3, 0.05), 3, {}, Loads(magnetic=Magnetisation(remanent, UP, "full", gradient))
+        surface,
+        Material(0.3, 0.05),
+        3,
+        {},
+        Loads(magnetic=Magnetisation(remanent, UP, "full", gradient)),
     )
 
 
@@ -76,7 +88,8 @@ def test_gradient_pulls_a_rigid_shell() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["x +", "__import__('os')", "x.real", "a", "x if y else z", "'x'", "(lambda: 1)()", "x[0]"]
+    "text",
+    ["x +", "__import__('os')", "x.real", "a", "x if y else z", "'x'", "(lambda: 1)()", "x[0]"],
 )
 def test_only_arithmetic_is_a_formula(text: str) -> None:
     with pytest.raises(ValueError, match=r"formula|allowed are numbers"):
@@ -85,7 +98,14 @@ def test_only_arithmetic_is_a_formula(text: str) -> None:
 
 def test_operations_are_those_of_python() -> None:
     x, y, z = np.array([[0.3], [-0.7], [1.9]])
-    for text in ("2 - x - y", "z / x / 2", "2 ** x ** y", "-x ** 2", "arctan2(x, -y) - +sqrt(z)", "(x - y) * (z - 1)"):
+    for text in (
+        "2 - x - y",
+        "z / x / 2",
+        "2 ** x ** y",
+        "-x ** 2",
+        "arctan2(x, -y) - +sqrt(z)",
+        "(x - y) * (z - 1)",
+    ):
         names = {"x": x, "y": y, "z": z, "sqrt": np.sqrt, "arctan2": np.arctan2}
         assert formula(text)(x, y, z) == eval(text, names)
 
@@ -93,7 +113,9 @@ def test_operations_are_those_of_python() -> None:
 @pytest.mark.parametrize("terms", [900, 4000])
 def test_long_sums(terms: int) -> None:
     """The terms i x of a series add up to n (n - 1)/2 x; a table of a field may be as long."""
-    found = formula(" + ".join(f"{i}*x" for i in range(terms)))(np.array([0.5]), np.zeros(1), np.zeros(1))
+    found = formula(" + ".join(f"{i}*x" for i in range(terms)))(
+        np.array([0.5]), np.zeros(1), np.zeros(1)
+    )
     assert found == pytest.approx(terms * (terms - 1) / 4, rel=1e-12)
     assert formula("-" * terms + "x")(np.ones(1), np.zeros(1), np.zeros(1)) == 1.0
 

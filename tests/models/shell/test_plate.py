@@ -1,4 +1,6 @@
-"""Clamped circular plate under pressure, w = p (R^2 - r^2)^2/(64 D): Timoshenko, Plates and Shells, art. 16."""
+"""Clamped circular plate under pressure, w = p (R^2 - r^2)^2/(64 D): Timoshenko, Plates and Shells,
+art. 16.
+"""
 
 import numpy as np
 import pytest
@@ -33,14 +35,20 @@ def solve(size: float, degree: int, w0_over_h: float = 1e-4) -> tuple[float, flo
     model.u.x.array[:] = u
     jets = kin.jet(model.r0, model.V.mesh), kin.jet(model.u, model.V.mesh)
     r, c = jets[0].r, -p / (64 * D)
-    H = c * (8 * ufl.outer(r, r) - 4 * (1 - ufl.dot(r, r)) * ufl.Identity(3))  # Hessian of c (1 - r^2)^2
+    H = c * (
+        8 * ufl.outer(r, r) - 4 * (1 - ufl.dot(r, r)) * ufl.Identity(3)
+    )  # Hessian of c (1 - r^2)^2
     basis = (jets[0].r1, jets[0].r2)
     exact = ufl.as_matrix([[ufl.dot(a, ufl.dot(H, b)) for b in basis] for a in basis])
     up = kin.inverse_metric(jets[0])
     dx = ufl.dx(metadata={"quadrature_degree": 2 * degree + 2})
 
     def square(K: Expr) -> float:
-        return float(fem.assemble_scalar(fem.form(MATERIAL.law.bending(K, K, up) * kin.area_ratio(jets[0]) * dx)))
+        return float(
+            fem.assemble_scalar(
+                fem.form(MATERIAL.law.bending(K, K, up) * kin.area_ratio(jets[0]) * dx)
+            )
+        )
 
     error = np.sqrt(square(kin.curvature_change(*jets) - exact) / square(exact))
     return abs(w0 / (w0_over_h * h) - 1), float(error)
@@ -49,7 +57,9 @@ def solve(size: float, degree: int, w0_over_h: float = 1e-4) -> tuple[float, flo
 def orders(sizes: list[float], degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Errors (sizes, 2) and their orders in h."""
     errors = np.array([solve(size, degree) for size in sizes])
-    return errors, np.log(errors[:-1] / errors[1:]) / np.log(np.divide(sizes[:-1], sizes[1:]))[:, None]
+    return errors, np.log(errors[:-1] / errors[1:]) / np.log(np.divide(sizes[:-1], sizes[1:]))[
+        :, None
+    ]
 
 
 def test_deflection() -> None:
@@ -72,7 +82,8 @@ def test_simply_supported_edge() -> None:
 def test_order_of_convergence(degree: int) -> None:
     """O(h^(k-1)) in the energy norm (Brenner and Sung, J. Sci. Comput. 22, 2005).
 
-    The deflection at the centre converges at least as h^2, h^(2k-2), h^4: the last is the order of the cubic rim.
+    The deflection at the centre converges at least as h^2, h^(2k-2), h^4: the last is the order of
+    the cubic rim.
     """
     errors, order = orders([0.4, 0.2, 0.1], degree)
     overall = np.log(errors[0] / errors[-1]) / np.log(4)

@@ -31,10 +31,15 @@ MU = {"pressure": 0.3, "natural_curvature": 0.5, "natural_stretch": 0.6}
 def test_a_ply_is_a_turned_tensor() -> None:
     """Q of fibres at 25 degrees is the tensor of fibres at 0, each of its four indices turned."""
     nu21 = 0.25 / 3
-    plain = np.array([[3.0, 0.25, 0], [0.25, 1.0, 0], [0, 0, 0.6 * (1 - 0.25 * nu21)]]) / (1 - 0.25 * nu21)
+    plain = np.array([[3.0, 0.25, 0], [0.25, 1.0, 0], [0, 0, 0.6 * (1 - 0.25 * nu21)]]) / (
+        1 - 0.25 * nu21
+    )
     pairs = {(0, 0): 0, (1, 1): 1, (0, 1): 2, (1, 0): 2}
     tensor = np.array(
-        [[[[plain[pairs[i, j], pairs[k, m]] for m in (0, 1)] for k in (0, 1)] for j in (0, 1)] for i in (0, 1)]
+        [
+            [[[plain[pairs[i, j], pairs[k, m]] for m in (0, 1)] for k in (0, 1)] for j in (0, 1)]
+            for i in (0, 1)
+        ]
     )
     c, s = np.cos(np.radians(25)), np.sin(np.radians(25))
     turn = np.array([[c, -s], [s, c]])
@@ -50,9 +55,15 @@ def test_a_ply_is_a_turned_tensor() -> None:
 def test_a_plane_nearly_across_the_fibres_is_no_mirror() -> None:
     """1e-3 rad off, of which the cosine is 1 to 5e-7; exactly along and across it is one."""
     plies = Laminate(CROSS.matrices(1.0), np.array([2.0, 0.0, 0.0]))
-    assert [plies.mirrored(Mirror.of(np.array(n))) for n in ([1, 0, 0], [0, 1, 0], [1, 1e-3, 0])] == [True, True, False]
+    assert [
+        plies.mirrored(Mirror.of(np.array(n))) for n in ([1, 0, 0], [0, 1, 0], [1, 1e-3, 0])
+    ] == [True, True, False]
     of_meridians = Laminate(CROSS.matrices(1.0), None)
-    planes = [Mirror.of(np.array([1.0, 2.0, 0.0])), Mirror.of(np.array([1.0, 0, 0]), 0.1), Mirror.of(np.eye(3)[2], 0.1)]
+    planes = [
+        Mirror.of(np.array([1.0, 2.0, 0.0])),
+        Mirror.of(np.array([1.0, 0, 0]), 0.1),
+        Mirror.of(np.eye(3)[2], 0.1),
+    ]
     assert [of_meridians.mirrored(plane) for plane in planes] == [True, False, True]
 
 
@@ -65,14 +76,18 @@ def test_cross_ply() -> None:
     assert D[[0, 2]] == pytest.approx([(Q11 + Q22) / 24] * 2)
 
 
-def shell(of: Laminate | None, *, half: bool = False, natural: bool = False, varies: bool = False) -> ShellModel:
+def shell(
+    of: Laminate | None, *, half: bool = False, natural: bool = False, varies: bool = False
+) -> ShellModel:
     loads = Loads(pressure=True, natural=NATURAL if natural else None)
     surface = hemisphere(0.8, half=True) if half else hemisphere(0.8)
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2) if varies else None
     edges: dict[str, Condition] = {"rim": "clamped"}
     if half:
         edges["symmetry"] = "symmetry"
-    return ShellModel(surface, Material(0.3, 0.05, laminate=of), 2, edges, loads, thickness=thickness)
+    return ShellModel(
+        surface, Material(0.3, 0.05, laminate=of), 2, edges, loads, thickness=thickness
+    )
 
 
 def meridian(of: Laminate | None) -> MeridianModel:
@@ -81,7 +96,9 @@ def meridian(of: Laminate | None) -> MeridianModel:
         return np.column_stack([np.sin(s), 0 * s, np.cos(s)])
 
     line = make_meridian(ball, np.linspace(0, np.pi / 2, 6), (None, "rim"))
-    return MeridianModel(line, Material(0.3, 0.05, laminate=of), 4, {"rim": "clamped"}, Loads(pressure=True))
+    return MeridianModel(
+        line, Material(0.3, 0.05, laminate=of), 4, {"rim": "clamped"}, Loads(pressure=True)
+    )
 
 
 @pytest.mark.parametrize("kind", [{"half": True}, {"natural": True, "varies": True}])
@@ -90,7 +107,9 @@ def test_isotropic_plies_are_koiters(kind: dict[str, bool]) -> None:
     models = [shell(of, **kind) for of in (None, ALIKE)]
     u = random_displacement(models[0], 2e-3)
     mu = {
-        name: MU[name] for name in {t.amplitude for t in models[0].system.terms} | set(models[0].factory.free) if name
+        name: MU[name]
+        for name in {t.amplitude for t in models[0].system.terms} | set(models[0].factory.free)
+        if name
     }
     forces = [model.system.residual(u, mu) for model in models]
     assert np.abs(forces[0] - forces[1]).max() <= 1e-12 * np.abs(forces[0]).max()
@@ -108,9 +127,15 @@ def test_isotropic_plies_on_a_meridian() -> None:
 
 @pytest.mark.parametrize("kind", [{}, {"natural": True, "varies": True}])
 def test_residual_and_tangent(kind: dict[str, bool]) -> None:
-    """Of coupled plies, by differences of the energy, and against FFCx's forms: interior and clamped edges too."""
+    """Of coupled plies, by differences of the energy, and against FFCx's forms: interior and
+    clamped edges too.
+    """
     model = shell(COUPLED, **kind)
-    mu = {name: MU[name] for name in {t.amplitude for t in model.system.terms} | set(model.factory.free) if name}
+    mu = {
+        name: MU[name]
+        for name in {t.amplitude for t in model.system.terms} | set(model.factory.free)
+        if name
+    }
     u = random_displacement(model, 2e-3)
     check(model.system, u, mu)
     assert difference(model.system, u, mu) <= 1e-12
@@ -135,7 +160,11 @@ def test_energy_of_a_stretched_disc() -> None:
     """E_11 = e in a direction at 30 degrees from the fibres of a ply, by Hooke's law of the ply."""
     one = section(ply(0, 3.0), along=[np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
     model = ShellModel(
-        disc(0.8), Material(0.3, 0.1, laminate=Laminate(one.matrices(1.0), one.direction("disc"))), 2, {}, Loads()
+        disc(0.8),
+        Material(0.3, 0.1, laminate=Laminate(one.matrices(1.0), one.direction("disc"))),
+        2,
+        {},
+        Loads(),
     )
     x = model.r0.x.array.reshape(-1, 3)
     u = (x * [0.02, 0.0, 0.0]).ravel()
@@ -143,19 +172,32 @@ def test_energy_of_a_stretched_disc() -> None:
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     strain = E * np.array([c * c, s * s, -2 * c * s])
     Q = section(ply(0, 3.0)).plies[0].stiffness
-    area = ShellModel(disc(0.8), Material(0.3, 0.1), 2, {}, Loads()).system.energies(u)["membrane"] / (E**2 / 2 / 0.91)
-    assert model.system.energies(u)["membrane"] == pytest.approx(area * strain @ Q @ strain / 2, rel=1e-12)
+    area = ShellModel(disc(0.8), Material(0.3, 0.1), 2, {}, Loads()).system.energies(u)[
+        "membrane"
+    ] / (E**2 / 2 / 0.91)
+    assert model.system.energies(u)["membrane"] == pytest.approx(
+        area * strain @ Q @ strain / 2, rel=1e-12
+    )
 
 
 def test_moments_in_pictures() -> None:
-    """A flat [0/90], fibres along x in a frame whose first vector is along y: M_11 = D k - B e about x, over D/R."""
+    """A flat [0/90], fibres along x in a frame whose first vector is along y: M_11 = D k - B e
+    about x, over D/R.
+    """
     jet = np.zeros((6, 1, 1, 3))
     jet[1, ..., 1], jet[2, ..., 0] = 1.0, -1.0
     u, e, k = np.zeros((6, 1, 1, 3)), 1e-4, 1e-3
     u[2, ..., 0], u[5, ..., 2] = -e, k
-    found = Stresses(jet, Material(0.3, 0.1, laminate=laminate(ply(0, 3.0), ply(90, 3.0))), None).of(u, {})
+    found = Stresses(
+        jet, Material(0.3, 0.1, laminate=laminate(ply(0, 3.0), ply(90, 3.0))), None
+    ).of(u, {})
     _, B, D = CROSS.matrices(1.0)
     (M,) = found["M"][0] * 0.1**2 / (12 * (1 - 0.3**2))
     assert (
-        pytest.approx([0.1**2 * D[1] * k, 0, 0.1**2 * D[0] * k - 0.1 * B[0] * (e + e**2 / 2)], abs=1e-15, rel=1e-6) == M
+        pytest.approx(
+            [0.1**2 * D[1] * k, 0, 0.1**2 * D[0] * k - 0.1 * B[0] * (e + e**2 / 2)],
+            abs=1e-15,
+            rel=1e-6,
+        )
+        == M
     )

@@ -1,8 +1,8 @@
 """A strip of rubber rolled up, thick to thin, against the body of three dimensions.
 
-Rivlin (Proceedings of the Royal Society A 195, 1949) bends a block of incompressible rubber into a sector of a ring:
-of the place (X, Y, Z) r^2 = 2 X/(C s) + B, the angle is C Y, and Z is stretched by s. C is the angle per length, and B
-has the least energy.
+Rivlin (Proceedings of the Royal Society A 195, 1949) bends a block of incompressible rubber into a
+sector of a ring: of the place (X, Y, Z) r^2 = 2 X/(C s) + B, the angle is C Y, and Z is stretched
+by s. C is the angle per length, and B has the least energy.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,9 @@ def block(s: float, share: float) -> Energy:
             W = (1 - share) * (squares.sum(0) - 3) + share * ((1 / squares).sum(0) - 3)
             return float(H / 2 * weights @ W / 6)
 
-        return float(minimize_scalar(of, bracket=(0.8 / (s * C**2), 1.2 / (s * C**2)), tol=1e-14).fun)
+        return float(
+            minimize_scalar(of, bracket=(0.8 / (s * C**2), 1.2 / (s * C**2)), tol=1e-14).fun
+        )
 
     return energy
 
@@ -57,7 +59,9 @@ def moment(energy: Energy, C: float, d: float = 1e-3) -> float:
 
 @pytest.mark.parametrize(("s", "share"), [(1.0, 0.0), (1.3, 0.2)])
 def test_moment_is_that_of_the_body_to_the_order_of_the_square(s: float, share: float) -> None:
-    """1.17 (h/R)^2 less than the body's, at any stretch across and for both rubbers: the table of docs/accuracy.md."""
+    """1.17 (h/R)^2 less than the body's, at any stretch across and for both rubbers: the table of
+    docs/accuracy.md.
+    """
     bends = 1 / (H * np.array([5, 10, 20, 40]))
     less = np.array([1 - moment(sheet(s, share), C) / moment(block(s, share), C) for C in bends])
     assert less == pytest.approx([4.388e-2, 1.172e-2, 2.98e-3, 7.5e-4], rel=5e-3)

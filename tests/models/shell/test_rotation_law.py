@@ -1,4 +1,6 @@
-"""A remanence that turns and does not stretch, R Br: against SciPy's polar decomposition and finite differences."""
+"""A remanence that turns and does not stretch, R Br: against SciPy's polar decomposition and finite
+differences.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,11 +42,16 @@ DEFORMATIONS = {
 
 @pytest.mark.parametrize("name", DEFORMATIONS)
 def test_homogeneous_deformations(name: str) -> None:
-    """The energy per area is -Ba . (R - 1) Br, and -Ba . (F - 1) Br of the other law; at 10 % they differ by 10 %."""
+    """The energy per area is -Ba .
+
+    (R - 1) Br, and -Ba . (F - 1) Br of the other law; at 10 % they differ by 10 %.
+    """
     F = DEFORMATIONS[name]
     laws: dict[RemanenceLaw, np.ndarray] = {"deformation": F, "rotation": scipy.linalg.polar(F)[0]}
     for law, carrier in laws.items():
-        model = ShellModel(disc(0.8), MATERIAL, 2, {}, Loads(magnetic=Magnetisation(BR, BA, law=law)))
+        model = ShellModel(
+            disc(0.8), MATERIAL, 2, {}, Loads(magnetic=Magnetisation(BR, BA, law=law))
+        )
         X = model.r0.x.array.reshape(-1, 3)
         area = 3 * model.volume_change(np.tile(E3, len(X)))
         found = model.system.potential((X @ (F - np.eye(3)).T).ravel(), {}, "lambda_m") / area
@@ -57,7 +64,9 @@ def test_as_it_is_drawn() -> None:
     """The same rotation at random points of any curvature."""
     jet, u = np.random.default_rng(0).standard_normal((2, 6, 50, 3))
     frame, v = TangentFrame.of(jet), np.random.default_rng(1).standard_normal((50, 3))
-    identity = np.stack([frame.convected(np.broadcast_to(e, v.shape), u) for e in np.eye(3)], axis=-1)
+    identity = np.stack(
+        [frame.convected(np.broadcast_to(e, v.shape), u) for e in np.eye(3)], axis=-1
+    )
     expected = np.array([scipy.linalg.polar(F)[0] @ w for F, w in zip(identity, v, strict=True)])
     assert frame.rotated(v, u) == pytest.approx(expected, abs=1e-12)
 
@@ -67,7 +76,9 @@ def energy() -> Callable[[MagneticEnergy, float], float]:
     """The energy of `size` times a smooth displacement."""
     surface = hemisphere()
     models = {
-        kind: ShellModel(surface, MATERIAL, 3, {}, Loads(magnetic=Magnetisation(BR, BA, kind, law="rotation")))
+        kind: ShellModel(
+            surface, MATERIAL, 3, {}, Loads(magnetic=Magnetisation(BR, BA, kind, law="rotation"))
+        )
         for kind in get_args(MagneticEnergy)
     }
 
@@ -78,8 +89,12 @@ def energy() -> Callable[[MagneticEnergy, float], float]:
     return value
 
 
-@pytest.mark.parametrize(("kind", "remainder"), [("second_consistent", 3), ("second", 1), ("first", 1), ("torque", 1)])
-def test_remainder(energy: Callable[[MagneticEnergy, float], float], kind: MagneticEnergy, remainder: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "remainder"), [("second_consistent", 3), ("second", 1), ("first", 1), ("torque", 1)]
+)
+def test_remainder(
+    energy: Callable[[MagneticEnergy, float], float], kind: MagneticEnergy, remainder: int
+) -> None:
     found = order(lambda e: energy("full", e), lambda e: energy(kind, e))
     assert found == pytest.approx(remainder, abs=0.15)
 
@@ -89,7 +104,9 @@ def test_each_order_alone(energy: Callable[[MagneticEnergy, float], float]) -> N
     assert energy("first", 0.02) == pytest.approx(2 * energy("first", 0.01))
     assert energy("torque", 0.02) == pytest.approx(4 * energy("torque", 0.01))
     for kind in ("first", "torque"):
-        other = ShellModel(hemisphere(), MATERIAL, 3, {}, Loads(magnetic=Magnetisation(BR, BA, kind)))
+        other = ShellModel(
+            hemisphere(), MATERIAL, 3, {}, Loads(magnetic=Magnetisation(BR, BA, kind))
+        )
         of_deformation = other.system.potential(0.01 * smooth(other.r0.x.array), {}, "lambda_m")
         assert abs(energy(kind, 0.01) / of_deformation - 1) > 0.1
 
@@ -103,10 +120,18 @@ def test_derivatives(kind: MagneticEnergy) -> None:
     field = replace(FIELD, remanent=tangential, energy=kind, gradient=G if kind == "full" else None)
     model = ShellModel(hemisphere(0.8), MATERIAL, 2, {}, Loads(pressure=True, magnetic=field))
     u = random_displacement(model, 1e-3)
-    for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0, "pressure": 0.0}, {**MU, "lambda_m": 10.0}):
+    for mu in (
+        MU,
+        {"lambda_m": 0.0, "lambda_across": 1.0, "pressure": 0.0},
+        {**MU, "lambda_m": 10.0},
+    ):
         assert tangent_difference(model.system, u, mu) <= 1e-12
         assert residual_difference(model.system, u, mu) <= 1e-12
-    names = ["magnetic", "magnetic across", "magnetic gradient"] if kind == "full" else ["U1", "Uq", "Utau", "couple"]
+    names = (
+        ["magnetic", "magnetic across", "magnetic gradient"]
+        if kind == "full"
+        else ["U1", "Uq", "Utau", "couple"]
+    )
     for name in names:
         check(alone(model, name), u / 5, {"lambda_m": 1.0, "lambda_across": 1.0})
 

@@ -1,6 +1,8 @@
-"""Incompressible rubber: its energies, its small strains, residual and tangent, its magnetic energy.
+"""Incompressible rubber: its energies, its small strains, residual and tangent, its magnetic
+energy.
 
-The references are the energy of Mooney and Rivlin in three principal stretches, Koiter's law, and finite differences.
+The references are the energy of Mooney and Rivlin in three principal stretches, Koiter's law, and
+finite differences.
 """
 
 import numpy as np
@@ -24,7 +26,9 @@ RNG = np.random.default_rng(7)
 
 
 def by_stretches(E: np.ndarray, share: float) -> np.ndarray:
-    """Energy per volume over E of a sheet (..., 2, 2) whose faces are free: I1 and I2 of three stretches."""
+    """Energy per volume over E of a sheet (..., 2, 2) whose faces are free: I1 and I2 of three
+    stretches.
+    """
     first, second = np.moveaxis(1 + 2 * np.linalg.eigvalsh(E), -1, 0)
     third = 1 / (first * second)
     one = first + second + third - 3
@@ -42,12 +46,16 @@ def strains(count: int, size: float) -> np.ndarray:
 @pytest.mark.parametrize("share", SHARES)
 def test_energy_of_three_stretches(share: float) -> None:
     E = strains(20, 0.3)
-    assert Rubber(H, share).membrane(E, np.eye(2)) == pytest.approx(by_stretches(E, share), rel=1e-11)
+    assert Rubber(H, share).membrane(E, np.eye(2)) == pytest.approx(
+        by_stretches(E, share), rel=1e-11
+    )
 
 
 @pytest.mark.parametrize("share", SHARES)
 def test_bending_about_one_axis_is_that_of_the_layers(share: float) -> None:
-    """Of K = c c the mean energy of layers with the strains E - z K/sqrt(d), to the order h^2, at any stretch."""
+    """Of K = c c the mean energy of layers with the strains E - z K/sqrt(d), to the order h^2, at
+    any stretch.
+    """
     law, E, c = Rubber(H, share), strains(20, 0.2), RNG.standard_normal((20, 2))
     K = c[:, :, None] * c[:, None, :]
     d = np.linalg.det(np.eye(2) + 2 * E)
@@ -59,7 +67,9 @@ def test_bending_about_one_axis_is_that_of_the_layers(share: float) -> None:
 
 @pytest.mark.parametrize("share", SHARES)
 def test_no_bending_is_free(share: float) -> None:
-    """The energy of bending is positive at every stretch, so that no wave of the size of an element grows."""
+    """The energy of bending is positive at every stretch, so that no wave of the size of an element
+    grows.
+    """
     law, E = Rubber(H, share), strains(2000, 0.7)
     basis = np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]], dtype=float)
     stiff = np.array([np.stack(law.moment(E, K, np.eye(2)), axis=-1) for K in basis])
@@ -70,7 +80,12 @@ def test_no_bending_is_free(share: float) -> None:
 @pytest.mark.parametrize("share", SHARES)
 def test_small_strains_are_koiters(share: float) -> None:
     """The difference from Koiter's energies is of the order of the strain, over two decades."""
-    law, koiter, K, E1 = Rubber(H, share), Rubber(H, share).linear, strains(1, 0.3)[0], strains(1, 0.3)[0]
+    law, koiter, K, E1 = (
+        Rubber(H, share),
+        Rubber(H, share).linear,
+        strains(1, 0.3)[0],
+        strains(1, 0.3)[0],
+    )
     sizes, up = np.array([1e-3, 1e-4, 1e-5]), np.eye(2)
     for of, known in (
         (lambda E: law.membrane(E, up), lambda E: koiter.membrane(E, up)),
@@ -83,12 +98,18 @@ def test_small_strains_are_koiters(share: float) -> None:
 
 NATURAL = Natural(np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.05, 0.08]), meridians)
 FIELD = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.6, 0.8]))
-GRADED = Magnetisation(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), gradient=np.diag([0.5, 0.5, -1.0]))
+GRADED = Magnetisation(
+    np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), gradient=np.diag([0.5, 0.5, -1.0])
+)
 MU = {"pressure": 0.3, "lambda_m": 0.4, "natural_curvature": 0.5, "natural_stretch": 0.6}
 
 
-def shell(share: float, *, half: bool = False, natural: bool = False, varies: bool = False) -> ShellModel:
-    loads = Loads(pressure=True, magnetic=GRADED if half else FIELD, natural=NATURAL if natural else None)
+def shell(
+    share: float, *, half: bool = False, natural: bool = False, varies: bool = False
+) -> ShellModel:
+    loads = Loads(
+        pressure=True, magnetic=GRADED if half else FIELD, natural=NATURAL if natural else None
+    )
     surface = hemisphere(0.8, half=True) if half else hemisphere(0.8)
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2) if varies else None
     edges: dict[str, Condition] = {"rim": "clamped"}
@@ -99,9 +120,15 @@ def shell(share: float, *, half: bool = False, natural: bool = False, varies: bo
 
 @pytest.mark.parametrize("kind", [{}, {"half": True}, {"natural": True, "varies": True}])
 def test_residual_and_tangent(kind: dict[str, bool]) -> None:
-    """By differences of the energy, and against FFCx's forms: interior, clamped and mirror edges too."""
+    """By differences of the energy, and against FFCx's forms: interior, clamped and mirror edges
+    too.
+    """
     model = shell(0.2, **kind)
-    mu = {name: MU[name] for name in {t.amplitude for t in model.system.terms} | set(model.factory.free) if name}
+    mu = {
+        name: MU[name]
+        for name in {t.amplitude for t in model.system.terms} | set(model.factory.free)
+        if name
+    }
     u = random_displacement(model, 2e-3)
     check(model.system, u, mu)
     assert difference(model.system, u, mu) <= 1e-12
@@ -115,18 +142,29 @@ def test_modes_that_a_half_excludes() -> None:
 
 
 def test_thinned_remanence() -> None:
-    """A disc stretched by 1.2 and 0.9, magnetised and in a field along its normal: 1 - 1/(1.2 0.9) per volume."""
+    """A disc stretched by 1.2 and 0.9, magnetised and in a field along its normal: 1 - 1/(1.2 0.9)
+    per volume.
+    """
     along = np.array([0.0, 0.0, 1.0])
-    model = ShellModel(disc(0.8), Material(0.5, H, 0.0), 2, {}, Loads(magnetic=Magnetisation(along, along)))
+    model = ShellModel(
+        disc(0.8), Material(0.5, H, 0.0), 2, {}, Loads(magnetic=Magnetisation(along, along))
+    )
     x = model.r0.x.array.reshape(-1, 3)
     u = (x * [0.2, -0.1, 0.0]).ravel()
     per_volume = by_stretches(np.diag([1.2**2 - 1, 0.9**2 - 1]) / 2, 0.0)
     energies = model.system.energies(u)
-    assert energies["magnetic"] / energies["membrane"] == pytest.approx((1 - 1 / (1.2 * 0.9)) / per_volume)
+    assert energies["magnetic"] / energies["membrane"] == pytest.approx(
+        (1 - 1 / (1.2 * 0.9)) / per_volume
+    )
     jet = np.zeros((3, 1, 3))
     jet[1:] = np.eye(3)[:2, None]
-    frame, moved = TangentFrame.of(np.concatenate([jet, np.zeros((3, 1, 3))])), jet * [0.2, -0.1, 0.0]
-    assert frame.convected(along[None], moved, thins=True)[0] == pytest.approx([0, 0, 1 / (1.2 * 0.9)])
+    frame, moved = (
+        TangentFrame.of(np.concatenate([jet, np.zeros((3, 1, 3))])),
+        jet * [0.2, -0.1, 0.0],
+    )
+    assert frame.convected(along[None], moved, thins=True)[0] == pytest.approx(
+        [0, 0, 1 / (1.2 * 0.9)]
+    )
 
 
 def test_meridian() -> None:
@@ -137,6 +175,11 @@ def test_meridian() -> None:
         return np.column_stack([np.sin(s), 0 * s, np.cos(s)])
 
     meridian = make_meridian(ball, np.linspace(0, np.pi / 2, 6), (None, "rim"))
-    thickness, loads = Thickness(lambda x, y, z: 1 + 0.5 * z**2), Loads(pressure=True, magnetic=GRADED)
-    model = MeridianModel(meridian, Material(0.5, 0.05, 0.2), 4, {"rim": "clamped"}, loads, thickness=thickness)
+    thickness, loads = (
+        Thickness(lambda x, y, z: 1 + 0.5 * z**2),
+        Loads(pressure=True, magnetic=GRADED),
+    )
+    model = MeridianModel(
+        meridian, Material(0.5, 0.05, 0.2), 4, {"rim": "clamped"}, loads, thickness=thickness
+    )
     check(model.system, random_displacement(model, 1e-3), {"pressure": 0.3, "lambda_m": 0.4})

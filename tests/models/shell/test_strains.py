@@ -1,4 +1,6 @@
-"""Strains and moments at points against closed forms, and what is gathered of them from every model."""
+"""Strains and moments at points against closed forms, and what is gathered of them from every
+model.
+"""
 
 from typing import Any
 
@@ -97,7 +99,9 @@ PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure":
 
 
 def test_sphere_under_pressure() -> None:
-    """E = -p R (1 - nu)/(2 E h) a0 away from the clamped equator; there E_1 = 0 and M_1 = nu M_2: held and turned."""
+    """E = -p R (1 - nu)/(2 E h) a0 away from the clamped equator; there E_1 = 0 and M_1 = nu M_2:
+    held and turned.
+    """
     found = last(scene_of(shell=HEMISPHERE, boundary={"equator": "clamped"}, loading=PRESSED))
     material = Material(NU, 1 / 90)
     inner, edge = found.r0[:, 2] > 0.8, np.abs(found.r0[:, 2]) < 1e-9
@@ -105,7 +109,9 @@ def test_sphere_under_pressure() -> None:
         expected = -1e-3 * material.classical_pressure * (1 - NU) / (2 * material.h)
         assert found.fields[name][inner] == pytest.approx(expected, rel=2e-3)
     size = np.abs(found.fields["E_2"]).max()
-    assert found.fields["E_1"][edge] == pytest.approx(0, abs=1e-5 * size)  # recovered from inside the cells
+    assert found.fields["E_1"][edge] == pytest.approx(
+        0, abs=1e-5 * size
+    )  # recovered from inside the cells
     assert found.fields["M_1"][edge] == pytest.approx(NU * found.fields["M_2"][edge], rel=1e-6)
     assert found.fields["M_2"].min() == pytest.approx(found.fields["M_2"][edge].mean())
 
@@ -114,7 +120,12 @@ def test_sphere_under_pressure() -> None:
 def test_meridian_and_half_shell_agree() -> None:
     """Two discretisations of the same fields, away from the layer at the clamped edge."""
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "radial"}}
-    case = {"shell": HEMISPHERE, "boundary": {"equator": "clamped"}, "magnetic": magnetic, "loading": PRESSED}
+    case = {
+        "shell": HEMISPHERE,
+        "boundary": {"equator": "clamped"},
+        "magnetic": magnetic,
+        "loading": PRESSED,
+    }
     one, half = (last(scene_of(**case, symmetry=symmetry)) for symmetry in ("axisymmetric", "half"))
     inner = half.r0[:, 2] > 0.35
     order = np.argsort(-one.r0[:, 2])
@@ -126,23 +137,34 @@ def test_meridian_and_half_shell_agree() -> None:
         line = np.interp(-half.r0[inner, 2], -one.r0[order, 2], along[0][order])
         assert along[1][inner] == pytest.approx(line, abs=1e-3 * np.abs(line).max())
     whole = half.fields["E"]
-    assert whole[: len(whole) // 2] * [[1, -1, 1], [-1, 1, -1], [1, -1, 1]] == pytest.approx(whole[len(whole) // 2 :])
+    assert whole[: len(whole) // 2] * [[1, -1, 1], [-1, 1, -1], [1, -1, 1]] == pytest.approx(
+        whole[len(whole) // 2 :]
+    )
 
 
 def test_moments_take_the_thickness_that_is_there() -> None:
     """D grows with its third power."""
     jet, u = RNG.standard_normal((2, 6, 4, 3, 3))
-    fields = [principal_fields(Stresses(jet, Material(NU, H), t).of(u, {})) for t in (None, np.full((4, 3), 2.0))]
+    fields = [
+        principal_fields(Stresses(jet, Material(NU, H), t).of(u, {}))
+        for t in (None, np.full((4, 3), 2.0))
+    ]
     assert fields[1]["M_1"] == pytest.approx(8 * fields[0]["M_1"])
     assert fields[1]["E_1"] == pytest.approx(fields[0]["E_1"])
 
 
 def test_remanence_turns_with_the_shell() -> None:
-    """A plate bent to an angle t about e2: Br = e1 becomes (cos t, 0, -sin t), and keeps its length."""
-    model = ShellModel(disc(0.5), Material(NU, H), 4, {}, Loads(magnetic=Magnetisation(np.eye(3)[0], np.eye(3)[2])))
+    """A plate bent to an angle t about e2: Br = e1 becomes (cos t, 0, -sin t), and keeps its
+    length.
+    """
+    model = ShellModel(
+        disc(0.5), Material(NU, H), 4, {}, Loads(magnetic=Magnetisation(np.eye(3)[0], np.eye(3)[2]))
+    )
     nodes = model.r0.x.array.reshape(-1, 3)
     found = SurfaceGatherer(model).gather(np.ravel(bent(*nodes.T)), {"lambda_m": -2e-3})
     assert found is not None
     t = 0.5 * found.r0[:, 0]
-    assert found.fields["Br"] == pytest.approx(np.column_stack([np.cos(t), 0 * t, -np.sin(t)]), abs=1e-3)
+    assert found.fields["Br"] == pytest.approx(
+        np.column_stack([np.cos(t), 0 * t, -np.sin(t)]), abs=1e-3
+    )
     assert found.fields["Ba"] == pytest.approx(np.tile([0, 0, -2e-3], (len(t), 1)), abs=1e-15)

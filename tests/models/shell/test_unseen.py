@@ -10,8 +10,13 @@ from magshell_fenicsx.problem.formulas import Together
 
 def test_a_rank_without_parts() -> None:
     """As of three ranks one often is, where few cells are divided."""
-    lattice, none = Lattice.of(basix.CellType.triangle, 4), Parts(np.zeros(0, int), np.zeros((0, 2)), np.ones((0, 2)))
+    lattice, none = (
+        Lattice.of(basix.CellType.triangle, 4),
+        Parts(np.zeros(0, int), np.zeros((0, 2)), np.ones((0, 2))),
+    )
     formulas = Together([formula("exp(0.6*x + 0.8*y)"), formula("x")], None, 1.0)
-    seen = _seen(formulas, none, lambda parts: (np.zeros((0, len(lattice.places), 3)), np.zeros(0)), lattice)
+    seen = _seen(
+        formulas, none, lambda parts: (np.zeros((0, len(lattice.places), 3)), np.zeros(0)), lattice
+    )
     assert seen.values.shape == (0, len(lattice.places), 2)
     assert seen.between.shape == (0,)

@@ -14,11 +14,15 @@ from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 
-def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:
+def hemisphere(
+    size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None
+) -> Body:
     """A body around the hemisphere of radius 1; the triangles' size holds everywhere."""
     shape = DiscShape(np.pi / 2, half, (dimple.width,) if dimple else ())
     points = {"pole": np.zeros(2)}
-    return sweep(triangulate(shape, lambda x: size, points, spherical(dimple)), h, layers, MPI.COMM_SELF)
+    return sweep(
+        triangulate(shape, lambda x: size, points, spherical(dimple)), h, layers, MPI.COMM_SELF
+    )
 
 
 def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body:
@@ -27,8 +31,15 @@ def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body
     return sweep(patch, h, layers, MPI.COMM_SELF)
 
 
-def body_of(shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None) -> Body:
+def body_of(
+    shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None
+) -> Body:
     """A body around a shell as a case describes it."""
-    data = {"shell": {"poisson_ratio": 0.3, **shell}, "boundary": {}, "points": points or {}, "mesh": {"size": size}}
+    data = {
+        "shell": {"poisson_ratio": 0.3, **shell},
+        "boundary": {},
+        "points": points or {},
+        "mesh": {"size": size},
+    }
     problem = make_problem(Case.from_source(data))
     return sweep(problem.triangulated(), problem.material.h, layers, MPI.COMM_SELF, factor)

@@ -1,4 +1,6 @@
-"""Near incompressibility must not stiffen thin elements: a clamped plate of one layer, kappa/mu from 10 to 10 000."""
+"""Near incompressibility must not stiffen thin elements: a clamped plate of one layer, kappa/mu
+from 10 to 10 000.
+"""
 
 from dataclasses import replace
 
@@ -18,7 +20,8 @@ H = 0.05
 
 
 def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> float:
-    """Of the centre under a small pressure p, over w0 = p R^4/(64 D) (Timoshenko) with the solid's own E and nu.
+    """Of the centre under a small pressure p, over w0 = p R^4/(64 D) (Timoshenko) with the solid's
+    own E and nu.
 
     With `whole`, compression takes all 27 quadrature points.
     """
@@ -30,7 +33,9 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
         factory = TermFactory(model.body, model.u, material, H, model.kernels)
         density = replace(factory.compression().density, degree=WHOLE)
         terms = [
-            factory._bulk(t.name, density) if isinstance(t, SolidTerm) and t.name == "compression" else t
+            factory._bulk(t.name, density)
+            if isinstance(t, SolidTerm) and t.name == "compression"
+            else t
             for t in system.terms
         ]
         system = FiniteElementSystem(model.u, terms, system.clamped, model._pattern, H)

@@ -1,4 +1,6 @@
-"""The patch test: a uniform deformation is a solution on distorted, straight-edged hexahedra, and Newton finds it."""
+"""The patch test: a uniform deformation is a solution on distorted, straight-edged hexahedra, and
+Newton finds it.
+"""
 
 import numpy as np
 from dolfinx import fem, mesh

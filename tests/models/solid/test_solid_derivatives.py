@@ -20,7 +20,14 @@ from magshell_fenicsx.shells.solid import SolidModel
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 DISTORTIONS = {"distortion", "areal distortion"}
-EVERYWHERE = {*DISTORTIONS, "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
+EVERYWHERE = {
+    *DISTORTIONS,
+    "compression",
+    "magnetic",
+    "magnetic across",
+    "magnetic gradient",
+    "pressure",
+}
 AT_ENDS = {"pressure whole", "pressure upper", "load moment rim 0"}
 FIELD = Magnetisation(
     np.array([0.6, 0.0, 0.8]),
@@ -32,12 +39,18 @@ FIELD = Magnetisation(
 
 @pytest.fixture(scope="module", params=["uniform", "varying"])
 def model(request: pytest.FixtureRequest) -> SolidModel:
-    """A coarse dimpled half with every load: clamped, or of three layers, hinged and bent at its edge."""
+    """A coarse dimpled half with every load: clamped, or of three layers, hinged and bent at its
+    edge.
+    """
     dimple, h, uniform = Dimple(0.05, 0.5), 0.1, request.param == "uniform"
-    body = hemisphere(0.6 if uniform else 0.9, h, layers=1 if uniform else 3, half=True, dimple=dimple)
+    body = hemisphere(
+        0.6 if uniform else 0.9, h, layers=1 if uniform else 3, half=True, dimple=dimple
+    )
     conditions = {"rim": "clamped" if uniform else "simply supported", "symmetry": "symmetry"}
     field = FIELD if uniform else replace(FIELD, remanent=radial)
-    loads = Loads(pressure=True, magnetic=field, dead={} if uniform else {"load": (EdgeMoment("rim", 0.7),)})
+    loads = Loads(
+        pressure=True, magnetic=field, dead={} if uniform else {"load": (EdgeMoment("rim", 0.7),)}
+    )
     return SolidModel(body, Material(0.5, h), MooneyRivlin.of(0.5, 100.0, 0.4), conditions, loads)  # type: ignore[arg-type]
 
 
@@ -57,7 +70,9 @@ def test_residuals_are_derivatives_of_energies(model: SolidModel) -> None:
     terms = [t for t in model.system.terms if t.name != "load"]
     assert {t.name for t in terms} >= (EVERYWHERE | AT_ENDS if model.loads.dead else EVERYWHERE)
     for term in terms:
-        system = FiniteElementSystem(model.u, [term], [], model._pattern, 1.0, model.system._assembler)
+        system = FiniteElementSystem(
+            model.u, [term], [], model._pattern, 1.0, model.system._assembler
+        )
 
         def energy(step: float, system: FiniteElementSystem = system) -> float:
             return sum(system.energies(u + step * v).values())
@@ -76,10 +91,14 @@ def test_tangent_is_the_derivative_of_the_residual(model: SolidModel) -> None:
     assert np.linalg.norm(Kv - rate) <= 1e-6 * np.linalg.norm(rate)
 
 
-def test_pressure_is_conservative_and_its_conjugate_is_the_enclosed_volume(model: SolidModel) -> None:
-    """A uniform stretch s that keeps the planes of the mirror and of the equator: V grows by s^3 - 1.
+def test_pressure_is_conservative_and_its_conjugate_is_the_enclosed_volume(
+    model: SolidModel,
+) -> None:
+    """A uniform stretch s that keeps the planes of the mirror and of the equator: V grows by s^3 -
+    1.
 
-    V/R^3 of the half under the outer face is pi/3 (1 + h/2)^3 without the dimple; here the whole's by the same form.
+    V/R^3 of the half under the outer face is pi/3 (1 + h/2)^3 without the dimple; here the whole's
+    by the same form.
     """
     stretched = model.r0.x.array[: model.system.size].copy()
     V, s = model.volume_change(-stretched), 1.1  # -X brings the face to the origin: -V
@@ -88,7 +107,11 @@ def test_pressure_is_conservative_and_its_conjugate_is_the_enclosed_volume(model
 
 
 def test_the_outer_face_of_an_annulus() -> None:
-    """It is not the end above the edge that is named outer: the area is that of the ring, pi (1 - 0.25)."""
-    body = body_of({"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "thickness": 0.1}, 0.3)
+    """It is not the end above the edge that is named outer: the area is that of the ring, pi (1 -
+    0.25).
+    """
+    body = body_of(
+        {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "thickness": 0.1}, 0.3
+    )
     area = fem.form(fem.Constant(body.mesh, 1.0) * face_measure(body.mesh, [body.faces[OUTER]])(1))
     assert fem.assemble_scalar(area) == pytest.approx(0.75 * np.pi, rel=1e-3)

@@ -1,4 +1,6 @@
-"""A solid's remanence that does not stretch, and its field by formulas: against SciPy, forms and finite differences."""
+"""A solid's remanence that does not stretch, and its field by formulas: against SciPy, forms and
+finite differences.
+"""
 
 from dataclasses import replace
 
@@ -40,13 +42,16 @@ def formulas(texts: list[str]) -> FormulasInSpace:
 
 
 def block(law: RemanenceLaw) -> SolidModel:
-    return SolidModel(plate(0.8, H), MATERIAL, NEO_HOOKEAN, {}, Loads(magnetic=Magnetisation(BR, BA, law=law)))
+    return SolidModel(
+        plate(0.8, H), MATERIAL, NEO_HOOKEAN, {}, Loads(magnetic=Magnetisation(BR, BA, law=law))
+    )
 
 
 @pytest.mark.telling
 @pytest.mark.parametrize("name", DEFORMATIONS)
 def test_homogeneous_deformations(name: str) -> None:
-    """The energy is -Ba . (R - 1) Br of the volume, and its tangent and residual have values at equal stretches too.
+    """The energy is -Ba . (R - 1) Br of the volume, and its tangent and residual have values at
+    equal stretches too.
 
     The volume is that of the law that is linear; the energy of that under F is -Ba . (F - 1) Br.
     """
@@ -63,15 +68,25 @@ def test_homogeneous_deformations(name: str) -> None:
 
 
 def test_derivatives_at_equal_stretches() -> None:
-    """At u = 0 and where the solid swells, by central differences: -Ba . W Br with dF = W R for a small turn W."""
+    """At u = 0 and where the solid swells, by central differences: -Ba .
+
+    W Br with dF = W R for a small turn W.
+    """
     model = block("rotation")
     X, v = model.r0.x.array, np.random.default_rng(3).standard_normal(model.system.size)
     magnetic = next(t for t in model.system.terms if t.name == "magnetic")
-    system = FiniteElementSystem(model.u, [magnetic], [], model._pattern, 1.0, model.system._assembler)
+    system = FiniteElementSystem(
+        model.u, [magnetic], [], model._pattern, 1.0, model.system._assembler
+    )
     for u in (0 * X, 0.3 * X):
         e = 1e-5
-        rate = (system.residual(u + e * v, {"lambda_m": 1.0}) - system.residual(u - e * v, {"lambda_m": 1.0})) / (2 * e)
-        assert np.linalg.norm(along(system, u, {"lambda_m": 1.0}, v) - rate) <= 1e-6 * np.linalg.norm(rate)
+        rate = (
+            system.residual(u + e * v, {"lambda_m": 1.0})
+            - system.residual(u - e * v, {"lambda_m": 1.0})
+        ) / (2 * e)
+        assert np.linalg.norm(
+            along(system, u, {"lambda_m": 1.0}, v) - rate
+        ) <= 1e-6 * np.linalg.norm(rate)
         w = np.cross([0.2, -0.5, 0.7], (X + u).reshape(-1, 3)).ravel()
         slope = system.residual(u, {"lambda_m": 1.0}) @ w
         # to first order R becomes (1 + W) R: the energy falls by Ba . (w x Br) of the volume
@@ -81,10 +96,18 @@ def test_derivatives_at_equal_stretches() -> None:
 
 
 def test_tangent_and_residual() -> None:
-    """A pattern with gradient and a part across: points against forms, and these against finite differences."""
+    """A pattern with gradient and a part across: points against forms, and these against finite
+    differences.
+    """
     field = replace(FIELD, law="rotation", remanent=radial)
     body = hemisphere(0.8, H, half=True)
-    model = SolidModel(body, MATERIAL, NEO_HOOKEAN, {"rim": "clamped", "symmetry": "symmetry"}, Loads(magnetic=field))
+    model = SolidModel(
+        body,
+        MATERIAL,
+        NEO_HOOKEAN,
+        {"rim": "clamped", "symmetry": "symmetry"},
+        Loads(magnetic=field),
+    )
     u, fast = displacement(model), model.system
     assert difference(fast, u, MU) <= 1e-12
     v, e = fast.held(np.random.default_rng(2).standard_normal(fast.size)), 1e-5
@@ -98,31 +121,48 @@ def test_tangent_and_residual() -> None:
         slope = (8 * (energy(e) - energy(-e)) - (energy(2 * e) - energy(-2 * e))) / (12 * e)
         assert system.residual(u, alone) @ v == pytest.approx(slope, rel=1e-6), term.name
         rate = (system.residual(u + e * v, alone) - system.residual(u - e * v, alone)) / (2 * e)
-        assert np.linalg.norm(along(system, u, alone, v) - rate) <= 1e-6 * np.linalg.norm(rate), term.name
+        assert np.linalg.norm(along(system, u, alone, v) - rate) <= 1e-6 * np.linalg.norm(rate), (
+            term.name
+        )
 
 
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_field_known_by_values(law: RemanenceLaw) -> None:
-    """A linear field equals the built-in gradient to 1e-10. The tangent of another field: finite differences."""
+    """A linear field equals the built-in gradient to 1e-10.
+
+    The tangent of another field: finite differences.
+    """
     known = replace(FIELD, law=law, across=(), gradient=None, in_space=formulas(LINEAR))
     body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=())
     here, there = (
-        SolidModel(body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, Loads(magnetic=field)).system
+        SolidModel(
+            body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, Loads(magnetic=field)
+        ).system
         for field in (known, built_in)
     )
     u = here.held(2e-3 * np.random.default_rng(0).standard_normal(here.size))
-    assert here.potential(u, {}, "lambda_m") == pytest.approx(there.potential(u, {}, "lambda_m"), rel=1e-12)
+    assert here.potential(u, {}, "lambda_m") == pytest.approx(
+        there.potential(u, {}, "lambda_m"), rel=1e-12
+    )
     columns = [system.load(u, {}, "lambda_m") for system in (here, there)]
     assert np.abs(columns[0] - columns[1]).max() <= 1e-10 * np.abs(columns[1]).max()
     zero, one = {"lambda_m": 0.0}, {"lambda_m": 1.0}
-    K = [csr(system.tangent(u, one).copy()) - csr(system.tangent(u, zero)) for system in (here, there)]
+    K = [
+        csr(system.tangent(u, one).copy()) - csr(system.tangent(u, zero))
+        for system in (here, there)
+    ]
     assert abs(K[0] - K[1]).max() <= 1e-10 * abs(K[1]).max()
     wild = Loads(magnetic=replace(known, in_space=formulas(["x*exp(y)", "z**2*y", "1/(2 + x*z)"])))
     model = SolidModel(body, MATERIAL, NEO_HOOKEAN, {}, wild)
     magnetic = next(t for t in model.system.terms if t.name == "magnetic")
-    system, e = FiniteElementSystem(model.u, [magnetic], [], model._pattern, 1.0, model.system._assembler), 1e-5
+    system, e = (
+        FiniteElementSystem(model.u, [magnetic], [], model._pattern, 1.0, model.system._assembler),
+        1e-5,
+    )
     v = np.random.default_rng(2).standard_normal(system.size)
-    slope = (system.potential(u + e * v, {}, "lambda_m") - system.potential(u - e * v, {}, "lambda_m")) / (2 * e)
+    slope = (
+        system.potential(u + e * v, {}, "lambda_m") - system.potential(u - e * v, {}, "lambda_m")
+    ) / (2 * e)
     assert system.residual(u, one) @ v == pytest.approx(slope, rel=1e-6)
     rate = (system.residual(u + e * v, one) - system.residual(u - e * v, one)) / (2 * e)
     assert np.linalg.norm(along(system, u, one, v) - rate) <= 1e-6 * np.linalg.norm(rate)

@@ -34,7 +34,9 @@ def radial(material: MooneyRivlin, pressure: float) -> tuple[float, float]:
         J, I1, I2 = a * t**2, a**2 + 2 * t**2, t**2 * (2 * a**2 + t**2)
         one, two = (1 - share) * mu * J ** (-2 / 3), share * mu * J ** (-4 / 3)
         shared = kappa * (J - 1) * J - one * I1 / 3 - two * 2 / 3 * I2
-        return one * a + two * 2 * a * t**2 + shared / a, one * t + two * t * (a**2 + t**2) + shared / t
+        return one * a + two * 2 * a * t**2 + shared / a, one * t + two * t * (
+            a**2 + t**2
+        ) + shared / t
 
     def stretch(P: np.ndarray, t: np.ndarray) -> np.ndarray:
         a = t**-2.0
@@ -60,24 +62,32 @@ def radial(material: MooneyRivlin, pressure: float) -> tuple[float, float]:
 
 
 def test_inflation() -> None:
-    """Drawn outwards until the inner radius has grown by an eighth: each face to 1e-3 of its displacement."""
+    """Drawn outwards until the inner radius has grown by an eighth: each face to 1e-3 of its
+    displacement.
+    """
     material, pressure = MooneyRivlin.of(0.5, 100.0, 0.6), -0.1
     body = hemisphere(0.35, THICKNESS, layers=2, half=True)
     model = SolidModel(body, Material(0.5, THICKNESS), material, {}, Loads())
     factory = TermFactory(body, model.u, material, THICKNESS, model.kernels)
     V, across = model.V, 1
     planes = [(V.sub(across), body.faces["symmetry"]), (V.sub(2), body.faces["rim"])]
-    held = [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 2, facets), W) for W, facets in planes]
+    held = [
+        fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 2, facets), W) for W, facets in planes
+    ]
     W, _ = V.sub(0).collapse()
     axis, _ = fem.locate_dofs_geometrical((V.sub(0), W), lambda x: np.hypot(x[0], x[1]) < 1e-9)
     held.append(fem.dirichletbc(0.0, axis, V.sub(0)))  # else the sphere drifts along e1
-    system = FiniteElementSystem(model.u, [*model._terms, *factory.pressure(1.0)], held, model._pattern, THICKNESS)
+    system = FiniteElementSystem(
+        model.u, [*model._terms, *factory.pressure(1.0)], held, model._pattern, THICKNESS
+    )
     path = Path(BorderedNewton(system), "pressure", "load", StepOptions(0.05, 0.1, 1e-3))
     *_, (last, _) = path.towards(path.start(State(model.zero(), {"pressure": 0.0})), [pressure])
     X, u = (f.reshape(-1, 3) for f in (model.r0.x.array, last.state.u))
     radius = np.linalg.norm(X, axis=1)
     outwards = np.sum(u * X, axis=1) / radius
-    for face, exact in zip((1 - THICKNESS / 2, 1 + THICKNESS / 2), radial(material, pressure), strict=True):
+    for face, exact in zip(
+        (1 - THICKNESS / 2, 1 + THICKNESS / 2), radial(material, pressure), strict=True
+    ):
         on_face = np.abs(radius - face) < 5e-3 * THICKNESS
         assert on_face.sum() > 50
         assert outwards[on_face] == pytest.approx(exact, rel=1e-3)

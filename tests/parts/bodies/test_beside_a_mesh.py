@@ -12,10 +12,14 @@ BRACKET = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("point", "normal"), [([0, 0.2, 0.5], [1, 0, 0]), ([0.5, 0.2, 1], [0, 0, 1])])
+@pytest.mark.parametrize(
+    ("point", "normal"), [([0, 0.2, 0.5], [1, 0, 0]), ([0.5, 0.2, 1], [0, 0, 1])]
+)
 @pytest.mark.parametrize("side", ["outside", "inside"])
 def test_on_each_sheet(point: list[float], normal: list[float], side: str) -> None:
-    """The flange of the bracket has the plane x = 0, its shelf z = 1; the sides of both are opposite."""
+    """The flange of the bracket has the plane x = 0, its shelf z = 1; the sides of both are
+    opposite.
+    """
     ball = {"kind": "sphere", "radius": 0.1, "at": {"point": point}, "side": side}
     case = {
         "shell": BRACKET,

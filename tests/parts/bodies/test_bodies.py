@@ -1,4 +1,6 @@
-"""Bodies of a case: their distances against differences and plain geometry, their places, and what is refused."""
+"""Bodies of a case: their distances against differences and plain geometry, their places, and what
+is refused.
+"""
 
 from typing import Any
 
@@ -21,13 +23,21 @@ ABOVE = [0, 0, 2.5]
 
 
 def problem(bodies: dict[str, Any], **sections: Any) -> Problem:
-    data = {"shell": SHELL, "boundary": {"equator": "clamped"}, "bodies": bodies, "symmetry": "none", **sections}
+    data = {
+        "shell": SHELL,
+        "boundary": {"equator": "clamped"},
+        "bodies": bodies,
+        "symmetry": "none",
+        **sections,
+    }
     return make_problem(Case.model_validate(data))
 
 
 @pytest.mark.parametrize("kind", BODIES)
 def test_distance(kind: str) -> None:
-    """|grad g| = 1 outside, gradient and Hessian by central differences, and g grows along its gradient."""
+    """|grad g| = 1 outside, gradient and Hessian by central differences, and g grows along its
+    gradient.
+    """
     (contact,) = problem({"a": {**BODIES[kind], "position": ABOVE}}).loads.contacts
     x = np.random.default_rng(1).uniform([-1, -1, 0.5], [1, 1, 2.5], (200, 3))
     g, n, H = contact.distance(x)
@@ -35,10 +45,16 @@ def test_distance(kind: str) -> None:
     x, g, n, H = x[kept], g[kept], n[kept], H[kept]
     assert len(x) > 100
     assert np.linalg.norm(n, axis=1) == pytest.approx(1)
-    assert contact.distance(x + 0.1 * n)[0] == pytest.approx(g + 0.1)  # convex: the nearest place is the same
-    low, high = (np.stack([contact.distance(x + s * e)[0] for e in np.eye(3)], -1) for s in (-step, step))
+    assert contact.distance(x + 0.1 * n)[0] == pytest.approx(
+        g + 0.1
+    )  # convex: the nearest place is the same
+    low, high = (
+        np.stack([contact.distance(x + s * e)[0] for e in np.eye(3)], -1) for s in (-step, step)
+    )
     assert (high - low) / (2 * step) == pytest.approx(n, abs=1e-8)
-    low, high = (np.stack([contact.distance(x + s * e)[1] for e in np.eye(3)], -1) for s in (-step, step))
+    low, high = (
+        np.stack([contact.distance(x + s * e)[1] for e in np.eye(3)], -1) for s in (-step, step)
+    )
     smooth = np.abs((high - low) / (2 * step) - H).max(axis=(1, 2)) < 1e-6
     assert smooth.mean() > 0.97  # the curvature jumps where a rounding begins
     foot = x - g[:, None] * n
@@ -52,13 +68,17 @@ def test_distance(kind: str) -> None:
 
 
 def test_places() -> None:
-    """By default the front touches the face at `at`, from its side; a frame that turns takes the body along."""
+    """By default the front touches the face at `at`, from its side; a frame that turns takes the
+    body along.
+    """
     h, at = 1 / 50, {"polar": 30, "azimuth": 50}
     normal = Case.model_validate(
         {"shell": SHELL, "boundary": {"equator": "clamped"}, "bodies": {"a": {"kind": "plane", "at": at}}}
     ).bodies["a"].at.vector()  # fmt: skip
     (outside,) = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at}}).loads.contacts
-    (inside,) = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at, "side": "inside"}}).loads.contacts
+    (inside,) = problem(
+        {"a": {"kind": "sphere", "radius": 0.2, "at": at, "side": "inside"}}
+    ).loads.contacts
     assert outside.front == pytest.approx((1 + h / 2) * normal)
     assert outside.direction == pytest.approx(-normal)
     assert inside.front == pytest.approx((1 - h / 2) * normal)
@@ -79,7 +99,16 @@ def test_places() -> None:
         ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 0, 0]}, "half"),
         ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 2, 0]}, "half"),
         ({"kind": "plane", "at": {"polar": 20}}, "half"),
-        ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 1, 0], "at": {"polar": 20}}, "full"),
+        (
+            {
+                "kind": "box",
+                "size": [0.2, 0.3, 0.3],
+                "edge": 0.05,
+                "axis": [1, 1, 0],
+                "at": {"polar": 20},
+            },
+            "full",
+        ),
     ],
 )
 def test_symmetry(body: dict[str, Any], model: str) -> None:
@@ -95,7 +124,12 @@ def test_plane_of_an_oblique_box() -> None:
     along = np.degrees(np.arctan2(2, 1))
     assert np.degrees(found.azimuth) % 90 == pytest.approx(along)
     across = np.array([-2, 1]) / np.sqrt(5)
-    ball = {"kind": "sphere", "radius": 0.1, "position": [*(0.6 * across), 2.0], "direction": [0, 0, -1]}
+    ball = {
+        "kind": "sphere",
+        "radius": 0.1,
+        "position": [*(0.6 * across), 2.0],
+        "direction": [0, 0, -1],
+    }
     found = problem({"a": box, "b": ball}, symmetry="auto")
     assert found.half
     assert np.degrees(found.azimuth) % 180 == pytest.approx((along + 90) % 180)
@@ -107,10 +141,22 @@ APART = {"kind": "sphere", "radius": 0.2, "position": [0.3, 0, 1.5]}
 @pytest.mark.parametrize(
     ("bodies", "words"),
     [
-        ({"a": {"kind": "plane", "position": [0, 0, 0.9]}}, "penetrates the undeformed shell by 5.5 h"),
-        ({"a": {"kind": "sphere", "radius": 1.2, "side": "inside"}}, "bodies.a.at: the body penetrates"),
-        ({"a": APART, "b": {**APART, "position": [0, 0, 1.5]}}, "bodies.b.position: overlaps bodies.a"),
-        ({"a": {"kind": "cylinder", "radius": 0.1, "axis": [0, 0, 1]}}, "bodies.a.axis: is along the approach"),
+        (
+            {"a": {"kind": "plane", "position": [0, 0, 0.9]}},
+            "penetrates the undeformed shell by 5.5 h",
+        ),
+        (
+            {"a": {"kind": "sphere", "radius": 1.2, "side": "inside"}},
+            "bodies.a.at: the body penetrates",
+        ),
+        (
+            {"a": APART, "b": {**APART, "position": [0, 0, 1.5]}},
+            "bodies.b.position: overlaps bodies.a",
+        ),
+        (
+            {"a": {"kind": "cylinder", "radius": 0.1, "axis": [0, 0, 1]}},
+            "bodies.a.axis: is along the approach",
+        ),
     ],
 )
 def test_refused(bodies: dict[str, Any], words: str) -> None:

@@ -1,4 +1,6 @@
-"""An ellipsoid as a body: its distance against brute force and a sphere, its place, and a shell pressed by it."""
+"""An ellipsoid as a body: its distance against brute force and a sphere, its place, and a shell
+pressed by it.
+"""
 
 from typing import Any
 
@@ -25,10 +27,15 @@ def places(count: int, reach: float = 1.0) -> Array:
 
 def test_distance_is_that_of_the_nearest_of_many_places() -> None:
     """By angles, from the best of 40 000 places on, inside and outside."""
-    theta, phi = (angles.ravel() for angles in np.meshgrid(np.linspace(0, np.pi, 200), np.linspace(0, 2 * np.pi, 200)))
+    theta, phi = (
+        angles.ravel()
+        for angles in np.meshgrid(np.linspace(0, np.pi, 200), np.linspace(0, 2 * np.pi, 200))
+    )
 
     def surface(theta: Array, phi: Array) -> Array:
-        unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+        unit = np.stack(
+            [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
+        )
         return np.asarray(CENTRE + SEMI * unit @ AXES)
 
     x = np.vstack([places(12), places(8, 0.15)])
@@ -55,7 +62,8 @@ def test_gradient_and_hessian() -> None:
     x, g, n, H = x[near], g[near], n[near], H[near]
     assert BODY(x + 0.1 * n)[0] == pytest.approx(g + 0.1)
     (low, along_low), (high, along_high) = (
-        [np.stack([BODY(x + s * e)[i] for e in np.eye(3)], axis=-1) for i in (0, 1)] for s in (-step, step)
+        [np.stack([BODY(x + s * e)[i] for e in np.eye(3)], axis=-1) for i in (0, 1)]
+        for s in (-step, step)
     )
     assert (high - low) / (2 * step) == pytest.approx(n, abs=1e-8)
     assert (along_high - along_low) / (2 * step) == pytest.approx(H, abs=1e-6 * np.abs(H).max())
@@ -63,9 +71,13 @@ def test_gradient_and_hessian() -> None:
 
 @pytest.mark.parametrize("semi", [np.full(3, 0.3), np.array([0.5, 0.5, 0.3])])
 def test_planes_of_symmetry(semi: Array) -> None:
-    """At places on its axes and in its planes, its centre and its surface among them, all is finite."""
+    """At places on its axes and in its planes, its centre and its surface among them, all is
+    finite.
+    """
     body = Ellipsoid(np.zeros(3), np.eye(3), semi)
-    x = np.vstack([np.zeros(3), np.diag(0.5 * semi), np.diag(semi), np.diag(2 * semi), [[0.2, 0.0, 0.1]]])
+    x = np.vstack(
+        [np.zeros(3), np.diag(0.5 * semi), np.diag(semi), np.diag(2 * semi), [[0.2, 0.0, 0.1]]]
+    )
     g, n, H = body(x)
     assert all(np.isfinite(each).all() for each in (g, n, H))
     assert g[4:7] == pytest.approx(0, abs=1e-15)
@@ -104,7 +116,8 @@ def test_place_and_symmetry() -> None:
     assert make_problem(case(axis=[1, 2, 0])).half
     assert make_problem(case(semi_axes=[0.3, 0.3, 0.2])).axisymmetric
     short, unit = (
-        make_problem(case(axis=[size, 2 * size, 0], direction=[0, 0, -size])).loads.contacts[0] for size in (1e-300, 1)
+        make_problem(case(axis=[size, 2 * size, 0], direction=[0, 0, -size])).loads.contacts[0]
+        for size in (1e-300, 1)
     )
     assert np.array_equal(short.distance.axes, unit.distance.axes)  # type: ignore[attr-defined]
 
@@ -114,7 +127,9 @@ def test_mistakes() -> None:
     with pytest.raises(CaseError, match="axis: is along the approach"):
         make_problem(case(axis=[0, 0, 1]))
     for key in ("position", "semi_axes"):
-        with pytest.raises(ValueError, match=f"bodies.egg.{key}.0: has a unit, but the shell's lengths have none"):
+        with pytest.raises(
+            ValueError, match=f"bodies.egg.{key}.0: has a unit, but the shell's lengths have none"
+        ):
             case(**{key: ["1 mm", "2 mm", "30 mm"]})
 
 
@@ -132,5 +147,7 @@ def test_half_and_full_shells_push_back_alike() -> None:
     assert full > 0.1
     assert half == pytest.approx(full, rel=1e-2)
     egg = case(semi_axes=[0.3] * 3)
-    ball = egg.model_dump(exclude_unset=True) | {"bodies": {"ball": {"kind": "sphere", "radius": 0.3}}}
+    ball = egg.model_dump(exclude_unset=True) | {
+        "bodies": {"ball": {"kind": "sphere", "radius": 0.3}}
+    }
     assert force(egg) == pytest.approx(force(Case.model_validate(ball)), rel=1e-9)

@@ -1,4 +1,6 @@
-"""A body on rubber touches half the deformed thickness from the mid-surface: gaps in closed form, and tangents."""
+"""A body on rubber touches half the deformed thickness from the mid-surface: gaps in closed form,
+and tangents.
+"""
 
 from typing import Any
 
@@ -28,20 +30,31 @@ def pressing(distance: Any) -> Contact:
     return Contact("ball", "a_ball", distance, DOWN, np.array([0.0, 0.0, 1.0]), 1e3, 1.0, 0.5)
 
 
-BALL = pressing(Sphere(np.array([0.0, 0.0, 1.5]), 0.5 - H / 4))  # half within the upper half of the shell
+BALL = pressing(
+    Sphere(np.array([0.0, 0.0, 1.5]), 0.5 - H / 4)
+)  # half within the upper half of the shell
 
 
 def test_gap_of_a_stretched_disc() -> None:
-    """Stretched by 1.5 and 1.2 it is h/1.8 thick; where it has grown by 1.1 in all directions 1.1^3 times that."""
-    plane, natural = pressing(Plane(np.array([0.0, 0.0, 0.1]), DOWN)), Natural(None, np.full(3, 0.1), meridians)
+    """Stretched by 1.5 and 1.2 it is h/1.8 thick; where it has grown by 1.1 in all directions 1.1^3
+    times that.
+    """
+    plane, natural = (
+        pressing(Plane(np.array([0.0, 0.0, 0.1]), DOWN)),
+        Natural(None, np.full(3, 0.1), meridians),
+    )
     for grown, factor in ((None, 1 / 1.8), (natural, 1.1**3 / 1.8)):
-        model = ShellModel(disc(0.8), Material(0.5, H, 0.0), 2, {}, Loads(contacts=(plane,), natural=grown))
+        model = ShellModel(
+            disc(0.8), Material(0.5, H, 0.0), 2, {}, Loads(contacts=(plane,), natural=grown)
+        )
         x = model.r0.x.array.reshape(-1, 3)
         u = (x * [0.5, 0.2, 0.0]).ravel()
         known = model.contacts["a_ball"][0]
         mu = {"a_ball": 0.0} | ({"natural_stretch": 1.0} if grown else {})
         state = State(u, mu)
-        assert model.system.at(state).of(lambda known=known: known.gap) == pytest.approx(0.1 - H / 2 * factor)
+        assert model.system.at(state).of(lambda known=known: known.gap) == pytest.approx(
+            0.1 - H / 2 * factor
+        )
 
 
 @pytest.mark.slow
@@ -51,7 +64,9 @@ def test_residual_and_tangent(kind: str) -> None:
     varied = kind != "plain"
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2) if varied else None
     loads = Loads(contacts=(BALL,), natural=NATURAL if varied else None)
-    model = ShellModel(hemisphere(0.5), Material(0.5, H, 0.2), 3, {"rim": "clamped"}, loads, thickness=thickness)
+    model = ShellModel(
+        hemisphere(0.5), Material(0.5, H, 0.2), 3, {"rim": "clamped"}, loads, thickness=thickness
+    )
     mu = {"a_ball": 0.3} | ({"natural_curvature": 0.5, "natural_stretch": 0.6} if varied else {})
     u = random_displacement(model, 1e-3)
     assert model.system.energies(u, mu)["contact ball"] > 1e-5
@@ -66,7 +81,9 @@ def test_meridian() -> None:
         return np.column_stack([np.sin(s), 0 * s, np.cos(s)])
 
     meridian = make_meridian(dome, np.linspace(0, np.pi / 2, 9), (None, "rim"))
-    model = MeridianModel(meridian, Material(0.5, H, 0.2), 4, {"rim": "clamped"}, Loads(contacts=(BALL,)))
+    model = MeridianModel(
+        meridian, Material(0.5, H, 0.2), 4, {"rim": "clamped"}, Loads(contacts=(BALL,))
+    )
     u = random_displacement(model, 1e-3)
     assert model.system.energies(u, {"a_ball": 0.3})["contact ball"] > 1e-6
     check(model.system, u, {"a_ball": 0.3})
@@ -75,12 +92,25 @@ def test_meridian() -> None:
 @pytest.mark.slow
 def test_balloon_under_a_plate() -> None:
     """A blown-up dome under a plate that stays: its pole is half the deformed thickness below."""
-    shell = {"geometry": "cap", "polar": 60, "radius": 1, "thickness": 0.05, "poisson_ratio": 0.5, "law": "neo-hookean"}
+    shell = {
+        "geometry": "cap",
+        "polar": 60,
+        "radius": 1,
+        "thickness": 0.05,
+        "poisson_ratio": 0.5,
+        "law": "neo-hookean",
+    }
     sections = {
         "shell": shell,
         "boundary": {"rim": "clamped"},
         "bodies": {"plate": {"kind": "plane", "position": [0, 0, 1.4]}},
-        "loading": {"kind": "pressure", "control": "volume", "until": "target", "volume_change": 1.4, "points": 6},
+        "loading": {
+            "kind": "pressure",
+            "control": "volume",
+            "until": "target",
+            "volume_change": 1.4,
+            "points": 6,
+        },
     }
     scene = ms.Scene(ms.Case.from_source(sections))
     *_, last = ms.follow(scene)
@@ -91,5 +121,7 @@ def test_balloon_under_a_plate() -> None:
     stretch = r[near, 0] / r0[near, 0]
     assert stretch > 1.2
     pressing = scene.model.contacts[next(iter(scene.model.contacts))][0]
-    assert model.system.at(state).of(lambda: float(pressing.gap.min())) == pytest.approx(0, abs=1.01e-3 * 0.05)
+    assert model.system.at(state).of(lambda: float(pressing.gap.min())) == pytest.approx(
+        0, abs=1.01e-3 * 0.05
+    )
     assert r[pole, 1] == pytest.approx(1.4 - 0.025 / stretch**2, abs=2e-3 * 0.05)

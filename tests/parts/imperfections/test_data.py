@@ -20,7 +20,10 @@ CYLINDER = {"geometry": "cylinder", "radius": 1.0, "length": 1.5}
 SHAPES: list[dict[str, Any]] = [
     CYLINDER,
     {"geometry": "torus", "radius": 1.0, "tube_radius": 0.3},
-    {"geometry": "revolution", "profile": {"points": [[1.0, 0.0], [0.9, 0.5], [0.5, 0.9], [0.0, 1.0]]}},
+    {
+        "geometry": "revolution",
+        "profile": {"points": [[1.0, 0.0], [0.9, 0.5], [0.5, 0.9], [0.0, 1.0]]},
+    },
     {"geometry": "plate", "length": 1.0, "width": 0.5},
     {"geometry": "cap", "radius": 1.0, "polar": 60.0},
 ]
@@ -28,7 +31,10 @@ SHAPES: list[dict[str, Any]] = [
 
 def made(shell: dict[str, Any], folder: Path = Path(), **item: Any) -> Case:
     items = [{"kind": "data", "file": "scan.csv", **item}]
-    content = {"shell": {"thickness": H, "poisson_ratio": 0.3, "imperfections": items, **shell}, "boundary": {}}
+    content = {
+        "shell": {"thickness": H, "poisson_ratio": 0.3, "imperfections": items, **shell},
+        "boundary": {},
+    }
     return Case.from_source(Source("case.yaml", content, folder=folder))
 
 
@@ -44,7 +50,9 @@ def places(drawn: Outline, count: int) -> tuple[Array, Array]:
 
 
 def write(folder: Path, header: str, *columns: Array) -> None:
-    np.savetxt(folder / "scan.csv", np.column_stack(columns), header=header, comments="", delimiter=",")
+    np.savetxt(
+        folder / "scan.csv", np.column_stack(columns), header=header, comments="", delimiter=","
+    )
 
 
 @pytest.mark.parametrize("shell", SHAPES, ids=lambda shell: shell["geometry"])
@@ -62,7 +70,9 @@ def test_feet_on_the_nodes_of_a_mesh_file() -> None:
     """A sphere by 4000 nodes: third order in their distance, 0.04."""
     z = np.linspace(-0.99, 0.99, 4000)
     theta = np.pi * (1 + 5**0.5) * np.arange(4000)
-    nodes = np.column_stack([np.sqrt(1 - z * z) * np.cos(theta), np.sqrt(1 - z * z) * np.sin(theta), z])
+    nodes = np.column_stack(
+        [np.sqrt(1 - z * z) * np.cos(theta), np.sqrt(1 - z * z) * np.sin(theta), z]
+    )
     x = nodes[500:3500:50] + 0.01 * RNG.standard_normal((60, 3))
     found, heights = _on_quadrics(np.hstack([nodes, nodes]), x)
     assert heights == pytest.approx(np.linalg.norm(x, axis=1) - 1, abs=1e-5)
@@ -77,7 +87,9 @@ def wave(x: Array) -> Array:
 @pytest.mark.parametrize("way", ["w0", "lengths", "real surface", "angles"])
 def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
     """Places and w0, the same with units, places of the real surface, azimuth and z."""
-    lengths = {"thickness": "0.5 mm", "radius": "25 mm", "length": "37.5 mm"} if way == "lengths" else {}
+    lengths = (
+        {"thickness": "0.5 mm", "radius": "25 mm", "length": "37.5 mm"} if way == "lengths" else {}
+    )
     case = made({**CYLINDER, **lengths}, tmp_path)
     drawn = outline(case.shell)
     x, n = places(drawn, 600)
@@ -88,7 +100,10 @@ def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
     elif way == "angles":
         write(tmp_path, "azimuth,z,w0", theta, z, w)
     else:
-        write(tmp_path, *(("x,y,z", x + H * w[:, None] * n) if way == "real surface" else ("x,y,z,w0", x, w)))
+        write(
+            tmp_path,
+            *(("x,y,z", x + H * w[:, None] * n) if way == "real surface" else ("x,y,z,w0", x, w)),
+        )
     flaw = read(case)
     elsewhere, _ = places(drawn, 300)
     assert flaw.deviation(elsewhere) / H == pytest.approx(wave(elsewhere), abs=1e-2)
@@ -113,7 +128,11 @@ def test_what_is_refused(tmp_path: Path) -> None:
     w = wave(x)
     hole = np.linalg.norm(x - [1, 0, 0.75], axis=1) > 0.5
     for header, columns, words in (
-        ("x,y,z,w0", (x, w / H**2), "w0 reaches .* h; allowed at most 25; without a unit in the header, w0 is over h"),
+        (
+            "x,y,z,w0",
+            (x, w / H**2),
+            "w0 reaches .* h; allowed at most 25; without a unit in the header, w0 is over h",
+        ),
         ("x,y,z,w0", (25.2 * x, w), "R from the shell: give the columns their unit, such as x"),
         ("x,y,z,w0", (x + 0.2 * n, w), "the unit of one of them is wrong"),
         ("x,y,z", (x + np.array([0.0, 0.0, 0.6]),), "R from the shell|frame|no value lies within"),
@@ -121,7 +140,9 @@ def test_what_is_refused(tmp_path: Path) -> None:
         ("polar,azimuth,w0", (x[:, :2], w), "polar and azimuth are of a sphere"),
     ):
         write(tmp_path, header, *columns)
-        with pytest.raises(CaseError, match=rf"shell\.imperfections\.0\.file: scan\.csv: .*({words})"):
+        with pytest.raises(
+            CaseError, match=rf"shell\.imperfections\.0\.file: scan\.csv: .*({words})"
+        ):
             read(made(CYLINDER, tmp_path))
     with pytest.raises(CaseError, match="cannot be read: No such file"):
         read(made(CYLINDER, tmp_path / "elsewhere"))

@@ -34,7 +34,10 @@ SHAPES: dict[str, tuple[dict[str, Any], str]] = {
     "cylinder": ({"geometry": "cylinder", "length": 2.0}, "bottom"),
     "annulus": ({"geometry": "annulus", "inner_radius": 0.3}, "outer"),
     "torus": ({"geometry": "torus", "tube_radius": 0.3}, ""),
-    "revolution": ({"geometry": "revolution", "profile": {"radius": "sqrt(1-z**2)", "heights": [0.0, 1.0]}}, "bottom"),
+    "revolution": (
+        {"geometry": "revolution", "profile": {"radius": "sqrt(1-z**2)", "heights": [0.0, 1.0]}},
+        "bottom",
+    ),
 }
 
 
@@ -44,8 +47,15 @@ def shaped(name: str, *imperfections: dict[str, Any], **others: Any) -> Case:
     if shape["geometry"] in ("hemisphere", "disc", "strip"):
         shell["radius_to_thickness"] = 90.0
     else:
-        shell |= {"thickness": H} | ({"radius": 1.0} if shape["geometry"] not in ("plate", "revolution") else {})
-    data = {"shell": shell, "boundary": {edge: "clamped"} if edge else {}, "mesh": {"refinement": 0.5}, **others}
+        shell |= {"thickness": H} | (
+            {"radius": 1.0} if shape["geometry"] not in ("plate", "revolution") else {}
+        )
+    data = {
+        "shell": shell,
+        "boundary": {edge: "clamped"} if edge else {},
+        "mesh": {"refinement": 0.5},
+        **others,
+    }
     return Case.from_source({"loading": {"kind": "pressure"}, **data})
 
 
@@ -63,7 +73,9 @@ def on_torus(theta: float, tube: float) -> tuple[float, float, float]:
     return r * np.cos(theta), r * np.sin(theta), 0.3 * np.sin(tube)
 
 
-def beside_rim(problem: Problem, centre: np.ndarray, *, angle: bool, near: float = 1e-5) -> tuple[int, int]:
+def beside_rim(
+    problem: Problem, centre: np.ndarray, *, angle: bool, near: float = 1e-5
+) -> tuple[int, int]:
     """The number of cells with nodes of their sides on both sides of a rim, and of nodes inside."""
     assert isinstance(problem.embedding, Deviated)
     patch = problem.triangulated()
@@ -71,7 +83,9 @@ def beside_rim(problem: Problem, centre: np.ndarray, *, angle: bool, near: float
     x = problem.embedding.perfect(patch.nodes)
     chord = np.linalg.norm(x - centre, axis=1)
     away = (2 * np.arcsin(np.minimum(chord / 2, 1)) if angle else chord)[patch.cells[:, :9]] - PHI_O
-    return int(((away < -near).any(axis=1) & (away > near).any(axis=1)).sum()), int((away < -near).sum())
+    return int(((away < -near).any(axis=1) & (away > near).any(axis=1)).sum()), int(
+        (away < -near).sum()
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +114,9 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
     if case.symmetry == "auto" and name not in ("plate", "torus", "strip", "disc"):
         problem = make_problem(case)
         assert problem.half
-        place = np.array([np.hypot(*place[:2]), 0.0, place[2]])  # the frame is turned into the plane
+        place = np.array(
+            [np.hypot(*place[:2]), 0.0, place[2]]
+        )  # the frame is turned into the plane
     else:
         problem = make_problem(shaped(name, dimple(*centre), symmetry="none"))
     across, inside = beside_rim(problem, place, angle=spherical)
@@ -109,14 +125,20 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
 
 
 @pytest.mark.parametrize(
-    ("polar", "near"), [(15.0, 1e-5), pytest.param(2 * np.degrees(PHI_O), 1e-3, marks=pytest.mark.slow), (22.3, 1e-5)]
+    ("polar", "near"),
+    [(15.0, 1e-5), pytest.param(2 * np.degrees(PHI_O), 1e-3, marks=pytest.mark.slow), (22.3, 1e-5)],
 )
 def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None:
     """Where they touch, the mesh has them a little wider."""
     problem = make_problem(shaped("hemisphere", dimple(), towards(polar)))
     assert problem.half
     for angle in (0.0, np.radians(polar)):
-        assert beside_rim(problem, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[0] == 0
+        assert (
+            beside_rim(problem, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[
+                0
+            ]
+            == 0
+        )
 
 
 @pytest.mark.parametrize(
@@ -140,17 +162,26 @@ def test_symmetry_that_is_left(imperfections: list[dict[str, Any]], model: str) 
 
 @pytest.mark.parametrize("kind", ["gaussian", "dimple"])
 def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
-    """Pairs across a plane, a depth in two parts, depths that cancel, a width or a depth that differs a little."""
+    """Pairs across a plane, a depth in two parts, depths that cancel, a width or a depth that
+    differs a little.
+    """
     ground = ground_of(shaped("hemisphere").shell)
     drawn = ground.perfect
 
     def answers(*places: tuple[float, float, float, float], formula: bool = False) -> list[bool]:
         every = [
-            {"kind": kind, "amplitude": depth, "width": width, "at": {"polar": polar, "azimuth": azimuth}}
+            {
+                "kind": kind,
+                "amplitude": depth,
+                "width": width,
+                "at": {"polar": polar, "azimuth": azimuth},
+            }
             for polar, azimuth, depth, width in places
         ]
         every += [{"kind": "formula", "w0": "0*x"}] * formula
-        (left,) = leaves(flaws(shaped("hemisphere", *every).imperfections, ground), drawn, each=False)
+        (left,) = leaves(
+            flaws(shaped("hemisphere", *every).imperfections, ground), drawn, each=False
+        )
         return [left.mirrors(Mirror.upright(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
     one, image = (40.0, 10.0, 0.1, 2.0), (40.0, 50.0, 0.1, 2.0)
@@ -166,7 +197,9 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
     ):
         found = answers(*places)
         assert found == [expected, False]
-        assert found == answers(*places, formula=True)  # a formula has no numbers: all are compared at places
+        assert found == answers(
+            *places, formula=True
+        )  # a formula has no numbers: all are compared at places
 
 
 class Unasked(Angle):
@@ -177,24 +210,38 @@ class Unasked(Angle):
 
 
 def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
-    """400 on a parallel at random, as many planes through pairs of them: none is tried by values all over the shell."""
-    ats = [{"polar": 50.0, "azimuth": float(a)} for a in np.random.default_rng(1).uniform(-180, 180, 400)]
-    case = shaped("hemisphere", *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats))
+    """400 on a parallel at random, as many planes through pairs of them: none is tried by values
+    all over the shell.
+    """
+    ats = [
+        {"polar": 50.0, "azimuth": float(a)}
+        for a in np.random.default_rng(1).uniform(-180, 180, 400)
+    ]
+    case = shaped(
+        "hemisphere",
+        *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats),
+    )
     drawn, found = outline(case.shell), dict[str, Flaw]()
     for key, flaw in flaws(case.imperfections, ground_of(case.shell)).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
         assert isinstance(deviation.distance, Angle)
-        found[key] = replace(flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis)))
+        found[key] = replace(
+            flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis))
+        )
     (left,) = leaves(found, drawn, each=False)
     assert len(left.azimuths) == 400
     assert not any(left.mirrors(Mirror.upright(a)) for a in left.azimuths)
 
 
 def test_deviations_add_up_along_the_normal() -> None:
-    """On a cylinder: w0/h = -1 at the centre of a dimple plus 0.5 z there; 1/e at the width of a Gaussian dimple."""
+    """On a cylinder: w0/h = -1 at the centre of a dimple plus 0.5 z there; 1/e at the width of a
+    Gaussian dimple.
+    """
     gauss = {"kind": "gaussian", "amplitude": -2.0, "width": 3.2, "at": {"point": [1.0, 0.0, 1.0]}}
-    problem = make_problem(shaped("cylinder", dimple(1, 0, 1), {"kind": "formula", "w0": "z", "amplitude": 0.5}, gauss))
+    problem = make_problem(
+        shaped("cylinder", dimple(1, 0, 1), {"kind": "formula", "w0": "z", "amplitude": 0.5}, gauss)
+    )
     far = 2 * np.arcsin(PHI_O / 2)
     found = problem.embedding(np.array([[0.0, 1.0], [far, 1.0]]))
     expected = 1 + H * np.array([2 - 1 + 0.5, 2 / np.e + 0.5])
@@ -218,14 +265,34 @@ def test_defect_is_one_of_them() -> None:
     ("name", "imperfections", "said"),
     [
         ("cylinder", [dimple()], "on a cylinder give its place"),
-        ("cylinder", [dimple(0.5, 0, 1)], r"at\.point: is not on the surface; a place near it that is: \[1, 0, 1\]"),
-        ("hemisphere", [towards(95.0)], r"imperfections\.0\.at\.polar: 95: is not on the shell: allowed 0 to 90"),
+        (
+            "cylinder",
+            [dimple(0.5, 0, 1)],
+            r"at\.point: is not on the surface; a place near it that is: \[1, 0, 1\]",
+        ),
+        (
+            "hemisphere",
+            [towards(95.0)],
+            r"imperfections\.0\.at\.polar: 95: is not on the shell: allowed 0 to 90",
+        ),
         ("hemisphere", [dimple(amplitude=30.0, width=0.5)], "steepest slope"),
         ("hemisphere", [{"kind": "formula", "w0": "1/z"}], "has no finite value"),
         ("holed cap", [towards(12.0)], "it would reach around the shell or its axis"),
-        ("hemisphere", [dimple(at={"polar": 3.0, "point": [0.0, 0.0, 1.0]})], "give a point, or polar and azimuth"),
-        ("hemisphere", [dimple(at={"point": ["0 mm", "0 mm", "1 mm"]})], r"0\.at\.point\.0: has a unit"),
-        ("hemisphere", [{"kind": "bump"}], r"imperfections\.0\.kind: 'bump'; allowed: dimple, gaussian, formula"),
+        (
+            "hemisphere",
+            [dimple(at={"polar": 3.0, "point": [0.0, 0.0, 1.0]})],
+            "give a point, or polar and azimuth",
+        ),
+        (
+            "hemisphere",
+            [dimple(at={"point": ["0 mm", "0 mm", "1 mm"]})],
+            r"0\.at\.point\.0: has a unit",
+        ),
+        (
+            "hemisphere",
+            [{"kind": "bump"}],
+            r"imperfections\.0\.kind: 'bump'; allowed: dimple, gaussian, formula",
+        ),
         ("hemisphere", [dimple(widht=1.0)], "did you mean width"),
     ],
 )
@@ -237,19 +304,30 @@ def test_refusals(name: str, imperfections: list[dict[str, Any]], said: str) -> 
 def test_defect_and_a_list_are_refused_together() -> None:
     one = "{kind: dimple, amplitude: 1, width: 3}"
     with pytest.raises(CaseError, match="give these or defect"):
-        Case.load(CASES / "dimple_buckling.yaml", [f"shell.imperfections=[{one}]", f"shell.defect={one}"])
+        Case.load(
+            CASES / "dimple_buckling.yaml", [f"shell.imperfections=[{one}]", f"shell.defect={one}"]
+        )
 
 
 def test_check_lists_them() -> None:
     said = describe(Case.load(CASES / "two_dimples.yaml", ["mesh.refinement=0.4"]))
-    assert "imperfections: dimple of 1.64 h at the pole, dimple of 1 h at polar 40, azimuth 0" in said
-    many = shaped("hemisphere", *({"kind": "gaussian", "amplitude": 0.1, "width": 3.0} for _ in range(500)))
+    assert (
+        "imperfections: dimple of 1.64 h at the pole, dimple of 1 h at polar 40, azimuth 0" in said
+    )
+    many = shaped(
+        "hemisphere", *({"kind": "gaussian", "amplitude": 0.1, "width": 3.0} for _ in range(500))
+    )
     assert "imperfections: 500 of kind gaussian" in describe(many)
 
 
 def test_patches_within_each_rim() -> None:
-    """Of a remanence: the first of two dimples, the second, and the rest; in a frame that is turned."""
-    remanent = {"kind": "patches", "patches": {"dimple": {"polar": 90.0}, "dimple_2": {"polar": 180.0}, "rest": {}}}
+    """Of a remanence: the first of two dimples, the second, and the rest; in a frame that is
+    turned.
+    """
+    remanent = {
+        "kind": "patches",
+        "patches": {"dimple": {"polar": 90.0}, "dimple_2": {"polar": 180.0}, "rest": {}},
+    }
     magnetic = {"lambda_m": 1e-3, "remanent": remanent}
     problem = make_problem(shaped("hemisphere", towards(60.0), towards(20.0), magnetic=magnetic))
     assert problem.half
@@ -261,8 +339,12 @@ def test_patches_within_each_rim() -> None:
 
 
 def test_a_mesh_file_moves_along_its_normals() -> None:
-    """On the flat faces of the bracket by w0 = 0.01 sin(3 y), and at its fold along the mean of their normals."""
-    case = Case.load(CASES / "bracket.yaml", ["shell.imperfections=[{kind: formula, w0: sin(3*y)}]"])
+    """On the flat faces of the bracket by w0 = 0.01 sin(3 y), and at its fold along the mean of
+    their normals.
+    """
+    case = Case.load(
+        CASES / "bracket.yaml", ["shell.imperfections=[{kind: formula, w0: sin(3*y)}]"]
+    )
     problem = make_problem(case)
     patch = problem.triangulated()
     x, moved = patch.nodes[:, :3], patch.embedding(patch.nodes)

@@ -14,19 +14,33 @@ DIMPLES = {"count": 4, "amplitude": {"kind": "uniform", "above": 0.2, "below": 1
 
 
 def case(item: dict[str, Any], **keys: Any) -> Case:
-    shell = {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3, "imperfections": [item]}
-    data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": {"kind": "pressure"}, **keys}
+    shell = {
+        "geometry": "hemisphere",
+        "radius_to_thickness": 50,
+        "poisson_ratio": 0.3,
+        "imperfections": [item],
+    }
+    data = {
+        "shell": shell,
+        "boundary": {"equator": "clamped"},
+        "loading": {"kind": "pressure"},
+        **keys,
+    }
     return Case.from_source(Source("case.yaml", data))
 
 
 def test_size_and_correlation_of_the_field() -> None:
-    """Over 400 seeds the variance is 1 and the correlation exp(-d^2/(2 l^2)), within three standard errors."""
+    """Over 400 seeds the variance is 1 and the correlation exp(-d^2/(2 l^2)), within three standard
+    errors.
+    """
     x = np.column_stack([np.linspace(0, 0.6, 13), np.zeros(13), np.ones(13)])
     w0 = np.array([Waves(1.0, 0.2, seed)(x) for seed in range(400)])
     correlation = np.mean(w0[:, :1] * w0, axis=0)
     assert np.mean(w0**2) == pytest.approx(1, abs=0.09)
     assert correlation == pytest.approx(np.exp(-((x[:, 0] / 0.2) ** 2) / 2), abs=3 / np.sqrt(400))
-    assert np.mean(w0[:, 0] ** 4) == pytest.approx(3, abs=3 * np.sqrt(96 / 400))  # of a normal distribution
+    assert np.mean(w0[:, 0] ** 4) == pytest.approx(
+        3, abs=3 * np.sqrt(96 / 400)
+    )  # of a normal distribution
 
 
 def test_a_seed_is_one_field_everywhere() -> None:

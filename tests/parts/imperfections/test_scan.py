@@ -32,7 +32,9 @@ def written(folder: Path, header: str, rows: np.ndarray = ROWS, delimiter: str =
 def test_units(tmp_path: Path, header: str, lengths: Lengths, factors: tuple[float, ...]) -> None:
     """A place without a unit is in the shell's length, w0 without one over h."""
     found = read_scan(written(tmp_path, header), lengths)
-    assert np.column_stack([found.columns[name] for name in ("x", "y", "z", "w0")]) == pytest.approx(ROWS * factors)
+    assert np.column_stack(
+        [found.columns[name] for name in ("x", "y", "z", "w0")]
+    ) == pytest.approx(ROWS * factors)
 
 
 def test_angles_grids_and_rows_without_numbers(tmp_path: Path) -> None:
@@ -43,7 +45,9 @@ def test_angles_grids_and_rows_without_numbers(tmp_path: Path) -> None:
     found = read_scan(tmp_path / "grid.npz", BARE)
     assert (len(found.columns["w0"]), found.lost) == (9 * 36 - 1, 1)
     assert found.columns["polar"].max() == pytest.approx(np.radians(80))
-    text = "polar;azimuth;w0\n" + "\n".join(f"{i};{10 * i};{'' if i == 5 else 0.1 * i}" for i in range(30))
+    text = "polar;azimuth;w0\n" + "\n".join(
+        f"{i};{10 * i};{'' if i == 5 else 0.1 * i}" for i in range(30)
+    )
     (tmp_path / "a.csv").write_text(text)
     again = read_scan(tmp_path / "a.csv", BARE)
     assert (len(again.columns["w0"]), again.lost) == (29, 1)
@@ -55,7 +59,11 @@ def test_angles_grids_and_rows_without_numbers(tmp_path: Path) -> None:
     [
         ("x,y,w0", ROWS[:, :3], "needed are x, y, z, w0"),
         ("x,y,z,w0", ROWS[:5], "needed are 20"),
-        ("x,y,z,w0", np.where(np.arange(30)[:, None] < 16, np.nan, ROWS), "14 rows of finite numbers in 30"),
+        (
+            "x,y,z,w0",
+            np.where(np.arange(30)[:, None] < 16, np.nan, ROWS),
+            "14 rows of finite numbers in 30",
+        ),
         ("x,y,z", ROWS, "3 names in its header and 4 columns"),
         ("x [mm],y [mm],z [mm],w0", ROWS, "column w0: has no unit"),
         ("x [kg],y [kg],z [kg],w0 [h]", ROWS, "column x: its unit kg is not convertible to metre"),

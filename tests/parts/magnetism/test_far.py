@@ -20,7 +20,9 @@ H, SIDES = 0.02, 5
 
 def two_bowls() -> tuple[Shape, NDArray[np.intp]]:
     """A sphere of 8 x 25 triangles, and which half of it each is in; the upper one is moved away."""
-    element = basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 2, basix.LagrangeVariant.gll_warped)
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.triangle, 2, basix.LagrangeVariant.gll_warped
+    )
     X, cells = element.points, list[Array]()
     for signs in np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, -1).T:
         corners = np.diag(signs)[:: int(np.prod(signs))]
@@ -43,16 +45,22 @@ def two_bowls() -> tuple[Shape, NDArray[np.intp]]:
 def charged() -> tuple[Charged, Array]:
     shape, parts = two_bowls()
     none, x = np.zeros(0, dtype=np.intp), shape.r0
-    bend = 0.03 * np.stack([np.sin(3 * x[..., 1]), np.cos(2 * x[..., 0]), np.sin(2 * x[..., 0] + x[..., 1])], axis=-1)
+    bend = 0.03 * np.stack(
+        [np.sin(3 * x[..., 1]), np.cos(2 * x[..., 0]), np.sin(2 * x[..., 0] + x[..., 1])], axis=-1
+    )
     return Charged(shape, parts, none, none, MPI.COMM_SELF), x + bend
 
 
 def test_translations() -> None:
-    """1/|D + a - b| of random places, and the error of a box less when its size is halved: as its power ORDER + 1."""
+    """1/|D + a - b| of random places, and the error of a box less when its size is halved: as its
+    power ORDER + 1.
+    """
     a, b = np.random.default_rng(1).uniform(-0.3, 0.3, (2, 100, 3))
     D, errors = np.array([[2.0, -1.0, 0.5]]), []
     for size in (1.0, 0.5):
-        found = np.einsum("bn,bc,cn->n", harmonics(size * b), translations(D)[0], harmonics(size * a))
+        found = np.einsum(
+            "bn,bc,cn->n", harmonics(size * b), translations(D)[0], harmonics(size * a)
+        )
         exact = 1 / np.linalg.norm(D + size * (a - b), axis=1)
         errors.append(np.abs(found / exact - 1).max())
     assert errors[0] < 1e-4
@@ -60,7 +68,9 @@ def test_translations() -> None:
 
 
 def test_far_sum_against_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Energy 1e-6 and forces on nodes 1e-4 of the sum over all pairs of charges; without net force, to rounding."""
+    """Energy 1e-6 and forces on nodes 1e-4 of the sum over all pairs of charges; without net force,
+    to rounding.
+    """
     monkeypatch.setattr(coulomb, "PRECISION", 1e-8)
     found = []
     for apart in (tree.APART, 0.0):
@@ -77,19 +87,27 @@ def test_far_sum_against_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forces are the slope of the energy, the stiffness that of the forces: differences with the same rules, 1e-6."""
+    """Forces are the slope of the energy, the stiffness that of the forces: differences with the
+    same rules, 1e-6.
+    """
     charges, nodes = charged()
     own, step, v = range(len(nodes)), 1e-5, np.cos(2 * nodes[..., [1, 2, 0]] + nodes)
-    numbers = np.arange(nodes[..., 0].size).reshape(len(nodes), -1)  # each cell has nodes of its own
+    numbers = np.arange(nodes[..., 0].size).reshape(
+        len(nodes), -1
+    )  # each cell has nodes of its own
     rules = charges.rules(nodes, own)
     monkeypatch.setattr(charges, "rules", lambda nodes, own: rules)
     far, near = charges.boxes(nodes, own)
-    beside = np.kron(near | np.eye(len(nodes), dtype=bool), np.ones(2 * [numbers.shape[1]], dtype=bool))
+    beside = np.kron(
+        near | np.eye(len(nodes), dtype=bool), np.ones(2 * [numbers.shape[1]], dtype=bool)
+    )
     stiffness = Stiffness(beside, 1.0, numbers, numbers, np.eye(3)[None])
     _, gradient = charges.evaluate(nodes, own, stiffness)
     cells = Cells(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
     kept, turning = np.ones(len(stiffness.columns), dtype=bool), Turning(MPI.COMM_SELF)
-    acting = ActingOnEachOther(stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning)
+    acting = ActingOnEachOther(
+        stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning
+    )
     product = acting.stored @ v.ravel() + acting.times_others(v.reshape(-1, 1))[:, 0]
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     moved = [(w / step, charges.evaluate(nodes + k * step * v, own)) for k, w in ways]

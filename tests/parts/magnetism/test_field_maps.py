@@ -1,4 +1,6 @@
-"""Maps of the field: the sensors' values and magpylib's at their places, files, picture and what is refused."""
+"""Maps of the field: the sensors' values and magpylib's at their places, files, picture and what is
+refused.
+"""
 
 from itertools import combinations, product
 from pathlib import Path
@@ -19,7 +21,13 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.grids import grid_content, read_map
 from magshell_fenicsx.output.fields.vtu import FieldSeries
-from magshell_fenicsx.output.pictures.field_maps import field_maps_figure, outlines, plane_of, section, with_holes
+from magshell_fenicsx.output.pictures.field_maps import (
+    field_maps_figure,
+    outlines,
+    plane_of,
+    section,
+    with_holes,
+)
 from magshell_fenicsx.output.pictures.plot import Drawn, plot
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import MapGrid
@@ -29,27 +37,54 @@ CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "
        "poisson_ratio": 0.3}  # fmt: skip
 BOX = {"corner": ["-12 mm", "1 mm", "8 mm"], "sides": [["24 mm", 0, 0], [0, "8 mm", 0], [0, 0, "9 mm"]],
        "points": [3, 2, 2], "field": "total"}  # fmt: skip
-BELOW = {"corner": ["-2 mm", "-1 mm", "4 mm"], "sides": [["5 mm", 0, 0], [0, "3 mm", 0]], "points": [2, 2]}
-ACROSS = {"corner": [0, 0, "18.7 mm"], "sides": [["1 mm", 0, 0], [0, 0, "2.8 mm"]], "points": [2, 5]}
+BELOW = {
+    "corner": ["-2 mm", "-1 mm", "4 mm"],
+    "sides": [["5 mm", 0, 0], [0, "3 mm", 0]],
+    "points": [2, 2],
+}
+ACROSS = {
+    "corner": [0, 0, "18.7 mm"],
+    "sides": [["1 mm", 0, 0], [0, 0, "2.8 mm"]],
+    "points": [2, 5],
+}
 POLAR = {"remanent": {"polar": 0, "flux_density": "60 mT"}, "applied": {"flux_density": "5 mT"}}
 TILTED = {"remanent": {"polar": 40, "azimuth": 30, "flux_density": "60 mT"},
           "applied": {"polar": 20, "azimuth": 30, "flux_density": "5 mT"}}  # fmt: skip
 
 
-def case(magnetic: dict[str, Any] | None = None, symmetry: str = "auto", **sections: Any) -> dict[str, Any]:
+def case(
+    magnetic: dict[str, Any] | None = None, symmetry: str = "auto", **sections: Any
+) -> dict[str, Any]:
     given = {"shell": CAP, "boundary": {"rim": "clamped"}, "magnetic": magnetic or POLAR}
     given |= {"symmetry": symmetry} if symmetry != "auto" else {"mesh": {"size": "3 mm"}}
     given |= {"mesh": {"degree": 2, "size": "6 mm"}} if symmetry in ("half", "none") else {}
-    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1, "points": 1}
+    loading = {
+        "kind": "pressure",
+        "control": "load",
+        "until": "target",
+        "pressure": 0.1,
+        "points": 1,
+    }
     return given | {"loading": loading} | sections
 
 
-@pytest.mark.parametrize(("symmetry", "magnetic"), [("auto", POLAR), ("half", TILTED), ("none", TILTED)])
+@pytest.mark.parametrize(
+    ("symmetry", "magnetic"), [("auto", POLAR), ("half", TILTED), ("none", TILTED)]
+)
 def test_a_map_is_many_sensors(symmetry: str, magnetic: dict[str, Any]) -> None:
-    """On each model the values are those of sensors there and of magpylib's charged triangles; nan in the material."""
-    at = MapGrid("box", MM * np.array([-12.0, 1, 8]), MM * np.diag([24.0, 8, 9]), (3, 2, 2), "T", "total").places
+    """On each model the values are those of sensors there and of magpylib's charged triangles; nan
+    in the material.
+    """
+    at = MapGrid(
+        "box", MM * np.array([-12.0, 1, 8]), MM * np.diag([24.0, 8, 9]), (3, 2, 2), "T", "total"
+    ).places
     sensors = {f"s{i}": {"position": x.tolist(), "field": "total"} for i, x in enumerate(at)}
-    given = case(magnetic, symmetry, sensors=sensors, field_maps={"box": BOX, "across": ACROSS, "below": BELOW})
+    given = case(
+        magnetic,
+        symmetry,
+        sensors=sensors,
+        field_maps={"box": BOX, "across": ACROSS, "below": BELOW},
+    )
     here = Scene(Case.from_source(given).problem())
     larger = 0.005 * here.model.r0.x.array[: here.model.system.size]
     state = State(larger, {**here.unloaded().mu, "lambda_m": 1e-3})
@@ -57,18 +92,29 @@ def test_a_map_is_many_sensors(symmetry: str, magnetic: dict[str, Any]) -> None:
     row = here.observe(state)
     read = np.array([[row[f"s{i}_B{axis}"] for axis in "xyz"] for i in range(len(at))])
     np.testing.assert_allclose(box.values, read, rtol=1e-9, atol=1e-15)
-    inside = np.abs(np.linalg.norm(here.problem.length * across.places, axis=1) - 20.1 * MM) < 0.5 * MM
+    inside = (
+        np.abs(np.linalg.norm(here.problem.length * across.places, axis=1) - 20.1 * MM) < 0.5 * MM
+    )
     np.testing.assert_array_equal(np.isnan(across.values), np.repeat(inside[:, None], 3, axis=1))
 
     record: Any = SimpleNamespace(point=SimpleNamespace(state=state))
-    rough, fine = (here.to_magpylib(record, parts).getB(here.problem.length * below.places) for parts in (2, 4))
+    rough, fine = (
+        here.to_magpylib(record, parts).getB(here.problem.length * below.places) for parts in (2, 4)
+    )
     np.testing.assert_allclose((4 * fine - rough) / 3, below.values, atol=1e-4 * np.abs(fine).max())
 
 
 @pytest.mark.slow
 def test_files_picture_and_report(tmp_path: Path) -> None:
-    """A map is in fields/ at each point and on a list; it is drawn with the section of the shell, a circle's arc."""
-    given = case(TILTED, "half", field_maps={"box": BOX, "across": ACROSS}, mesh={"degree": 2, "size": "4 mm"})
+    """A map is in fields/ at each point and on a list; it is drawn with the section of the shell, a
+    circle's arc.
+    """
+    given = case(
+        TILTED,
+        "half",
+        field_maps={"box": BOX, "across": ACROSS},
+        mesh={"degree": 2, "size": "4 mm"},
+    )
     (tmp_path / "case.yaml").write_text(yaml.safe_dump(given))
     out = tmp_path / "out"
     done = magshell("run", tmp_path / "case.yaml", "--out", out)
@@ -87,23 +133,41 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     surface, about = run.at(run.rows[0])
     level = MapGrid("level", np.array([-1.0, -1.0, 0.9]), 2 * np.eye(3)[:2], (2, 2), "T", "own")
     lines = section(surface, level)
-    np.testing.assert_allclose(np.linalg.norm(lines[..., :2], axis=-1), np.sqrt(1 - 0.81), atol=5e-3)
-    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * np.pi * 0.19**0.5, rel=5e-3)
-    figure = field_maps_figure([(box, R), (across, R), (box, R)], surface, about.h, run.resolved, run.style)
+    np.testing.assert_allclose(
+        np.linalg.norm(lines[..., :2], axis=-1), np.sqrt(1 - 0.81), atol=5e-3
+    )
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(
+        2 * np.pi * 0.19**0.5, rel=5e-3
+    )
+    figure = field_maps_figure(
+        [(box, R), (across, R), (box, R)], surface, about.h, run.resolved, run.style
+    )
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[:2] == ["box\ntotal field, $z$ = 17 mm", "across\nown field, $y$ = 0 mm"]
     figure.draw_without_rendering()
-    texts = [text for axes in figure.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label)]
+    texts = [
+        text for axes in figure.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label)
+    ]
     boxes = [text.get_window_extent() for text in texts if text.get_text()]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     assert all(figure.bbox.count_contains(box.corners()) == 4 for box in boxes)
     assert "field_maps_0001.png" in plot(out, 1)
-    (out / "fields" / f"map_across_{points - 1:04d}.vtu").unlink()  # that point is written again if a run goes on
+    (
+        out / "fields" / f"map_across_{points - 1:04d}.vtu"
+    ).unlink()  # that point is written again if a run goes on
     assert FieldSeries(out / "fields", about, "", run.rows, ["box", "across"]).kept == points - 1
 
 
 def test_a_file_gives_back_its_grid(tmp_path: Path) -> None:
-    grid = MapGrid("g", np.zeros(3), np.diag([1.0, 2.0, 3.0])[:2], (3, 2), "|Br|", "own", np.arange(18.0).reshape(6, 3))
+    grid = MapGrid(
+        "g",
+        np.zeros(3),
+        np.diag([1.0, 2.0, 3.0])[:2],
+        (3, 2),
+        "|Br|",
+        "own",
+        np.arange(18.0).reshape(6, 3),
+    )
     (tmp_path / "g.vtu").write_bytes(grid_content(grid, float("nan")))
     again, R = read_map(tmp_path / "g.vtu")
     assert np.isnan(R)
@@ -119,7 +183,9 @@ def test_the_section_of_a_solid() -> None:
     square = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1.0]])
     lines = np.stack([square, np.roll(square, -1, axis=0)], axis=1)
     lines[::3] = lines[::3, ::-1]
-    both = np.random.default_rng(1).permutation(np.concatenate([lines, 3 + 1.5 * lines, [[[1, 0], [1, 1e-12]]]]))
+    both = np.random.default_rng(1).permutation(
+        np.concatenate([lines, 3 + 1.5 * lines, [[[1, 0], [1, 1e-12]]]])
+    )
     areas = []
     for polygon in outlines(both):
         x, y = polygon.T
@@ -128,7 +194,9 @@ def test_the_section_of_a_solid() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sections", [{}, {"model": "solid", "mesh": {"refinement": 0.4}}], ids=["shell", "solid"])
+@pytest.mark.parametrize(
+    "sections", [{}, {"model": "solid", "mesh": {"refinement": 0.4}}], ids=["shell", "solid"]
+)
 def test_ranks_and_resume(tmp_path: Path, sections: dict[str, Any]) -> None:
     """The same map on 1 and 2 ranks, of which one goes on from its first point."""
     given = case(TILTED, "half", field_maps={"box": BOX, "across": ACROSS}) | sections
@@ -139,7 +207,9 @@ def test_ranks_and_resume(tmp_path: Path, sections: dict[str, Any]) -> None:
         assert done.returncode == (3 if more else 0), done.stderr
         if more:
             assert not (tmp_path / name / "fields" / "map_box_0001.vtu").exists()
-            done = magshell("run", tmp_path / "case.yaml", "--out", tmp_path / name, "--resume", ranks=ranks)
+            done = magshell(
+                "run", tmp_path / "case.yaml", "--out", tmp_path / name, "--resume", ranks=ranks
+            )
             assert done.returncode == 0, done.stderr
         fields.append(read_map(tmp_path / name / "fields" / "map_box_0001.vtu")[0].values)
     for values in fields[1:]:
@@ -158,17 +228,33 @@ def test_what_check_says() -> None:
         ({"points": [1000, 1000, 2]}, {}, r"field_maps\.box: points: more than 1000000 places"),
         ({"points": [3, 2, 1]}, {}, r"field_maps\.box\.points\.2"),
         ({"sides": [["1 mm", 0, 0]], "points": [3]}, {}, r"field_maps\.box\.sides"),
-        ({"sides": [["1 mm", 0, 0], [0, 0, 0], [0, "1 mm", 0]]}, {}, r"field_maps\.box: sides: a side has no length"),
-        ({"sides": [[1, 0, 0], [1, 1, 0], [0, 0, 1]]}, {}, r"field_maps\.box: sides: are not perpendicular"),
+        (
+            {"sides": [["1 mm", 0, 0], [0, 0, 0], [0, "1 mm", 0]]},
+            {},
+            r"field_maps\.box: sides: a side has no length",
+        ),
+        (
+            {"sides": [[1, 0, 0], [1, 1, 0], [0, 0, 1]]},
+            {},
+            r"field_maps\.box: sides: are not perpendicular",
+        ),
         ({"corner": [0, 0]}, {}, r"field_maps\.box\.corner"),
         ({}, {"magnetic": None}, "field_maps: need magnetic"),
         ({"field": "none"}, {}, r"field_maps\.box\.field"),
         ({}, {"field_maps": {"../box": BOX}}, "field_maps: ../box: a name is made of"),
-        ({}, {"magnetic": {"lambda_m": 1e-3}}, "field_maps.box.field: total: lambda_m does not say"),
+        (
+            {},
+            {"magnetic": {"lambda_m": 1e-3}},
+            "field_maps.box.field: total: lambda_m does not say",
+        ),
     ],
 )
 def test_what_is_refused(changed: dict[str, Any], sections: dict[str, Any], said: str) -> None:
-    data = {k: v for k, v in (case(field_maps={"box": BOX | changed}) | sections).items() if v is not None}
+    data = {
+        k: v
+        for k, v in (case(field_maps={"box": BOX | changed}) | sections).items()
+        if v is not None
+    }
     with pytest.raises(CaseError, match=said):
         Case.from_source(data).problem()
 

@@ -62,7 +62,9 @@ def discs(file: Path, radius: float, apart: float, size: float) -> None:
     meshed(file, size, 2)
 
 
-def strips(file: Path, length: float, width: float, apart: float, size: float, *, halved: bool = False) -> None:
+def strips(
+    file: Path, length: float, width: float, apart: float, size: float, *, halved: bool = False
+) -> None:
     """Two parallel strips along x (mm); if `halved`, with edges of cells along their middle."""
     for z in (0.0, apart):
         gmsh.model.occ.addRectangle(0, -width / 2, z, length, width)
@@ -109,9 +111,12 @@ def force(scene: Scene, h: float) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("gap", "size", "radius"), [(1, 1.2, 2.5), pytest.param(3, 2.5, 5, marks=pytest.mark.slow), (20, 2.5, 5)]
+    ("gap", "size", "radius"),
+    [(1, 1.2, 2.5), pytest.param(3, 2.5, 5, marks=pytest.mark.slow), (20, 2.5, 5)],
 )
-def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, size: float, radius: float) -> None:
+def test_force_between_coaxial_discs(
+    model: Any, tmp_path: Path, gap: float, size: float, radius: float
+) -> None:
     """Magpylib's field of one cylinder on the faces of the other, at gaps of 1, 3 and 20 h: 1e-3."""
     h = 0.2
     discs(tmp_path / "discs.msh", radius, (gap + 1) * h, size)
@@ -119,7 +124,10 @@ def test_force_between_coaxial_discs(model: Any, tmp_path: Path, gap: float, siz
     x, w = np.polynomial.legendre.leggauss(200)
     t = (1 - x) / 2
     r, weight = radius * MM * (1 - t**3), radius * MM * 1.5 * w * t**2  # points gather at the rim
-    faces = [magnet.getB(np.column_stack([r, 0 * r, 0 * r + (gap + k) * h * MM]))[:, 2] for k in (0.5, 1.5)]
+    faces = [
+        magnet.getB(np.column_stack([r, 0 * r, 0 * r + (gap + k) * h * MM]))[:, 2]
+        for k in (0.5, 1.5)
+    ]
     exact = BR / MU_0 * np.sum(2 * np.pi * r * weight * (faces[1] - faces[0]))
     found = force(Scene(case_of(tmp_path / "discs.msh", h)), h)
     assert found == pytest.approx([0, 0, exact], rel=1e-3, abs=1e-3 * abs(exact))
@@ -140,7 +148,9 @@ def test_force_between_parallel_strips(model: Any, tmp_path: Path, gap: float, a
     magnetic = {"interaction": "others", "remanent": {"polar": polar, "flux_density": f"{BR} T"}}
     axis = np.eye(3)["xyz".index(along)]
     size = np.array([L, w, h]) * MM
-    magnet = magpylib.magnet.Cuboid(polarization=BR * axis, dimension=size, position=(L * MM / 2, 0, 0))
+    magnet = magpylib.magnet.Cuboid(
+        polarization=BR * axis, dimension=size, position=(L * MM / 2, 0, 0)
+    )
     x, weight = np.polynomial.legendre.leggauss(40 if gap >= 1 else 200)
     x = np.sin(np.pi / 2 * x)  # points gather at the edges
     weight = weight * np.pi / 2 * np.sqrt(1 - x**2)
@@ -164,14 +174,18 @@ def bent(model: Any, tmp_path: Path) -> tuple[Scene, Vector]:
     held = {"edge0": "clamped", "edge1": "clamped"}
     given = {"kind": "expression", "components": ["0.6", "0.2", "0.8"], "flux_density": f"{BR} T"}
     magnetic = {"interaction": "others", "remanent": given}
-    scene = Scene(case_of(tmp_path / "strips.msh", 0.3, boundary=held, magnetic=magnetic, mesh={"degree": 3}))
+    scene = Scene(
+        case_of(tmp_path / "strips.msh", 0.3, boundary=held, magnetic=magnetic, mesh={"degree": 3})
+    )
     x, y, z = scene.model.r0.x.array.reshape(-1, 3).T
     u = [0.01 * np.sin(5 * y + z), 0.02 * np.cos(6 * x), 0.03 * np.sin(7 * x + 3 * y + 5 * z)]
     return scene, scene.model.system.held(np.column_stack(u).ravel()[: scene.model.system.size])
 
 
 def test_derivatives(bent: tuple[Scene, Vector]) -> None:
-    """Forces are the slope of the energy, the tangent is that of the forces, symmetric: differences, 1e-6."""
+    """Forces are the slope of the energy, the tangent is that of the forces, symmetric:
+    differences, 1e-6.
+    """
     scene, u = bent
     system, mu = scene.model.system, {"interaction": 1.0}
     (term,) = (each for each in system.terms if each.name == "interaction")
@@ -185,7 +199,10 @@ def test_derivatives(bent: tuple[Scene, Vector]) -> None:
     change = sum(w * gradient(scene, each) for w, each in moved)
     assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
     assert np.abs(rows - rows.T).max() < 1e-12 * np.abs(rows).max()
-    K, out = symmetric_part(system.tangent(u, mu)), sum(w * system.residual(each, mu) for w, each in moved)
+    K, out = (
+        symmetric_part(system.tangent(u, mu)),
+        sum(w * system.residual(each, mu) for w, each in moved),
+    )
     x, y = K.createVecs()
     x.array[:] = v
     K.mult(x, y)
@@ -199,15 +216,19 @@ def test_inertia(bent: tuple[Scene, Vector], factor: float) -> None:
     K = scene.model.system.tangent(0.01 * u, {"interaction": factor})
     factors = Factorisation(scene.model.system.comm)
     factors.factor(K)
-    dense = symmetric_part(K).getValues(range(scene.model.system.size), range(scene.model.system.size))
+    dense = symmetric_part(K).getValues(
+        range(scene.model.system.size), range(scene.model.system.size)
+    )
     assert factors.negative_pivots == np.sum(np.linalg.eigvalsh(dense) < 0)
     assert (factors.negative_pivots > 0) == (factor > 1)
 
 
 def elastica(L: float, w: float, h: float, apart: float, E: float) -> Array:
-    """How the tip of a magnetised cantilever above an equal rigid strip moves, in mm: SciPy, magpylib's cuboid.
+    """How the tip of a magnetised cantilever above an equal rigid strip moves, in mm: SciPy,
+    magpylib's cuboid.
 
-    Both are magnetised across. The forces are those on the charged faces, their mean over the width.
+    Both are magnetised across. The forces are those on the charged faces, their mean over the
+    width.
     """
     magnet = magpylib.magnet.Cuboid(
         polarization=(0, 0, BR), dimension=(L * MM, w * MM, h * MM), position=(L * MM / 2, 0, 0)
@@ -219,13 +240,19 @@ def elastica(L: float, w: float, h: float, apart: float, E: float) -> Array:
         x, z, angle, moment, Fx, Fz = state
         n, f, couple = (-np.sin(angle), np.cos(angle)), np.zeros((len(s), 3)), np.zeros(len(s))
         for side in (1, -1):
-            places = (x + side * half * n[0])[:, None], y * w * MM / 2, (z + side * half * n[1])[:, None]
+            places = (
+                (x + side * half * n[0])[:, None],
+                y * w * MM / 2,
+                (z + side * half * n[1])[:, None],
+            )
             B = magnet.getB(np.stack(np.broadcast_arrays(*places), axis=-1).reshape(-1, 3))
             on = side * charge * (B.reshape(len(s), -1, 3) * weight[:, None] / 2).sum(axis=1)
             f += on
             couple += side * half * (n[0] * on[:, 2] - n[1] * on[:, 0])
         bend = -(np.cos(angle) * Fz - np.sin(angle) * Fx) - couple
-        return np.array([np.cos(angle), np.sin(angle), moment / stiffness, bend, -f[:, 0], -f[:, 2]])
+        return np.array(
+            [np.cos(angle), np.sin(angle), moment / stiffness, bend, -f[:, 0], -f[:, 2]]
+        )
 
     def ends(a: Array, b: Array) -> Array:
         return np.array([a[0], a[1] - apart * MM, a[2], b[3], b[4], b[5]])
@@ -248,13 +275,19 @@ def test_strip_above_a_strip(model: Any, tmp_path: Path) -> None:
     gmsh.write(str(tmp_path / "strips.msh"))
     points = {"tip": [f"{L} mm", f"{w / 2} mm", f"{apart} mm"]}
     case = case_of(
-        tmp_path / "strips.msh", h, "200 MPa", boundary={"part0": "clamped", "root": "clamped"}, points=points
+        tmp_path / "strips.msh",
+        h,
+        "200 MPa",
+        boundary={"part0": "clamped", "root": "clamped"},
+        points=points,
     )
     found = run(case)
     row = found.rows[-1]
     assert row["interaction"] == 1.0
     exact = elastica(L, w, h, apart, 200e6)
-    assert np.linalg.norm([row["tip_ux_mm"], row["tip_uz_mm"]] - exact) < 1e-3 * np.linalg.norm(exact)
+    assert np.linalg.norm([row["tip_ux_mm"], row["tip_uz_mm"]] - exact) < 1e-3 * np.linalg.norm(
+        exact
+    )
     assert exact[1] < -0.2
     assert row["negative_pivots"] == 0
     system, mu = found.scene.model.system, {"interaction": 1.0}
@@ -306,29 +339,57 @@ def test_parts_that_are_in_each_other(bent: tuple[Scene, Vector]) -> None:
 
 
 def test_parts_that_are_near_from_the_start(model: Any, tmp_path: Path) -> None:
-    """In each other, their energy were no number: refused before anything is written, with what to do."""
+    """In each other, their energy were no number: refused before anything is written, with what to
+    do.
+    """
     strips(tmp_path / "near.msh", 4.0, 1.0, 0.04, 2.0)
     for refused in (Scene, describe):
-        with pytest.raises(CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"):
+        with pytest.raises(
+            CaseError, match=r"undeformed, two parts are nearer to each other .* take smaller cells"
+        ):
             refused(case_of(tmp_path / "near.msh", 0.1))
 
 
-SHELL = {"geometry": "mesh", "unit": "mm", "radius": "5 mm", "thickness": "0.2 mm", "youngs_modulus": "1 MPa"}
+SHELL = {
+    "geometry": "mesh",
+    "unit": "mm",
+    "radius": "5 mm",
+    "thickness": "0.2 mm",
+    "youngs_modulus": "1 MPa",
+}
 REMANENT = {"polar": 0, "flux_density": "0.1 T"}
 WRONG = [
     ({"remanent": None, "susceptibility": 2, "lambda_m": 1e-3}, {}, "not with remanent: none"),
-    ({"remanent": REMANENT, "susceptibility": 2, "applied": REMANENT}, {}, "not with susceptibility"),
-    ({"remanent": REMANENT, "remanence": "rotation", "applied": REMANENT}, {}, "not with remanence: rotation"),
+    (
+        {"remanent": REMANENT, "susceptibility": 2, "applied": REMANENT},
+        {},
+        "not with susceptibility",
+    ),
+    (
+        {"remanent": REMANENT, "remanence": "rotation", "applied": REMANENT},
+        {},
+        "not with remanence: rotation",
+    ),
     ({"remanent": REMANENT, "energy": "first", "applied": REMANENT}, {}, "not with energy: first"),
-    ({"remanent": {"polar": 0}, "lambda_m": 1e-3}, {}, "how strong it is follows from remanent.flux_density"),
-    ({"remanent": REMANENT}, {"loading": [{"kind": "pressure"}]}, "no step of the programme drives it"),
+    (
+        {"remanent": {"polar": 0}, "lambda_m": 1e-3},
+        {},
+        "how strong it is follows from remanent.flux_density",
+    ),
+    (
+        {"remanent": REMANENT},
+        {"loading": [{"kind": "pressure"}]},
+        "no step of the programme drives it",
+    ),
     ({"remanent": REMANENT}, {"model": "solid"}, "geometry: mesh|needs a mid-surface"),
     ({"remanent": REMANENT}, {}, "here all is one part"),
 ]
 
 
 @pytest.mark.parametrize(("magnetic", "sections", "said"), WRONG)
-def test_bad_input(model: Any, tmp_path: Path, magnetic: dict[str, Any], sections: dict[str, Any], said: str) -> None:
+def test_bad_input(
+    model: Any, tmp_path: Path, magnetic: dict[str, Any], sections: dict[str, Any], said: str
+) -> None:
     gmsh.model.occ.addRectangle(0, 0, 0, 1, 1)
     meshed(tmp_path / "one.msh", 0.5)
     data = {
@@ -347,10 +408,14 @@ def test_a_step_without_interaction_is_refused(model: Any, tmp_path: Path) -> No
         case_of(tmp_path / "strips.msh", 0.1, magnetic={"lambda_m": 1e-3})
 
 
-def test_models_that_are_too_large(model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_that_are_too_large(
+    model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(interacting, "LARGEST", 100)
     strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
-    with pytest.raises(CaseError, match="as all of them act on each other, at most 100 are allowed"):
+    with pytest.raises(
+        CaseError, match="as all of them act on each other, at most 100 are allowed"
+    ):
         Scene(case_of(tmp_path / "strips.msh", 0.1))
 
 
@@ -373,15 +438,31 @@ def rooted_strips(file: Path) -> None:
 def test_motion_in_a_neighbours_field(model: Any, tmp_path: Path) -> None:
     """A strip whose neighbour's field doubles swings: kinetic and stored energy are the work, 1e-3."""
     rooted_strips(tmp_path / "strips.msh")
-    shell = {"geometry": "mesh", "file": str(tmp_path / "strips.msh"), "unit": "mm", "radius": "5 mm"}
-    shell |= {"thickness": "0.2 mm", "youngs_modulus": "20 MPa", "poisson_ratio": 0, "density": "1200 kg/m^3"}
+    shell = {
+        "geometry": "mesh",
+        "file": str(tmp_path / "strips.msh"),
+        "unit": "mm",
+        "radius": "5 mm",
+    }
+    shell |= {
+        "thickness": "0.2 mm",
+        "youngs_modulus": "20 MPa",
+        "poisson_ratio": 0,
+        "density": "1200 kg/m^3",
+    }
     magnetic = {"interaction": "others", "remanent": {"polar": 30, "flux_density": f"{BR} T"}}
     history = {"interaction": [["0 ms", 1], ["1 ms", 2], ["20 ms", 2]]}
     moves = {"kind": "time", "duration": "20 ms", "points": 20, "history": history}
     loading = [{"kind": "interaction", "points": 2}, moves]
     held = {"part0": "clamped", "root": "clamped"}
     case = case_of(
-        tmp_path / "strips.msh", 0.2, shell=shell, boundary=held, magnetic=magnetic, loading=loading, mesh={"degree": 2}
+        tmp_path / "strips.msh",
+        0.2,
+        shell=shell,
+        boundary=held,
+        magnetic=magnetic,
+        loading=loading,
+        mesh={"degree": 2},
     )
     rows = [row for row in run(case).rows if row["time"]]
     assert max(row["kinetic"] / row["stored"] for row in rows) > 0.1
@@ -413,9 +494,15 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
 def test_derivatives_by_thickness_and_place(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interaction: str, symmetry: str
 ) -> None:
-    """Of the energy and of forces along a displacement: differences of fourth order, 1e-7; cells and rules stay."""
+    """Of the energy and of forces along a displacement: differences of fourth order, 1e-7; cells
+    and rules stay.
+    """
     strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, 1.5, halved=symmetry == "half")
-    remanent = {"kind": "expression", "components": ["1 + x/9", "0", "0.2"], "flux_density": f"{BR} T"}
+    remanent = {
+        "kind": "expression",
+        "components": ["1 + x/9", "0", "0.2"],
+        "flux_density": f"{BR} T",
+    }
     case = case_of(
         tmp_path / "strips.msh",
         0.2,
@@ -424,19 +511,34 @@ def test_derivatives_by_thickness_and_place(
         symmetry=symmetry,
     )
     scene = Scene(replace(case.problem(), thickness=Thickness()))
-    term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
-    r0, thickness, u, v = scene.model.r0, scene.model.thickness, scene.model.u, fem.Function(scene.model.V)
+    term = next(
+        term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm)
+    )
+    r0, thickness, u, v = (
+        scene.model.r0,
+        scene.model.thickness,
+        scene.model.u,
+        fem.Function(scene.model.V),
+    )
     assert thickness
     X, rng = r0.x.array.reshape(-1, 3).copy(), np.random.default_rng(0)
 
     def smooth(k: float) -> np.ndarray:
         x, y = k * X[:, 0], X[:, 1] ** 2
-        return np.stack([np.sin(2 * x + y), X[:, 1] * np.cos(x), np.sin(3 * x + y)], axis=-1).ravel()
+        return np.stack(
+            [np.sin(2 * x + y), X[:, 1] * np.cos(x), np.sin(3 * x + y)], axis=-1
+        ).ravel()
 
-    u.x.array[:], v.x.array[:], r0.x.array[:] = 1e-2 * smooth(1.5), smooth(0.7), r0.x.array + 1e-2 * smooth(1.0)
+    u.x.array[:], v.x.array[:], r0.x.array[:] = (
+        1e-2 * smooth(1.5),
+        smooth(0.7),
+        r0.x.array + 1e-2 * smooth(1.0),
+    )
     thickness.x.array[:] += 0.1 * rng.standard_normal(len(thickness.x.array))
     fixed = property(lambda self: 0.07, lambda self, value: None)
-    monkeypatch.setattr(Near, "_scale", fixed, raising=False)  # else rules change with the size of cells
+    monkeypatch.setattr(
+        Near, "_scale", fixed, raising=False
+    )  # else rules change with the size of cells
 
     def values() -> np.ndarray:
         b = np.zeros(len(u.x.array))
@@ -458,16 +560,30 @@ def test_derivatives_by_thickness_and_place(
 
 @pytest.mark.parametrize("interaction", ["others", pytest.param("all", marks=pytest.mark.slow)])
 def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: str) -> None:
-    """Of the energy and of forces along a displacement: differences of both, exact as they are quadratic; 1e-9."""
+    """Of the energy and of forces along a displacement: differences of both, exact as they are
+    quadratic; 1e-9.
+    """
     size = 1.5 if interaction == "others" else 3.0
     strips(tmp_path / "strips.msh", 3.0, 1.0, 1.5, size)
-    remanent = {"kind": "expression", "components": ["1 + x/9", "y/3", "0.2"], "flux_density": f"{BR} T"}
+    remanent = {
+        "kind": "expression",
+        "components": ["1 + x/9", "y/3", "0.2"],
+        "flux_density": f"{BR} T",
+    }
     magnetic = {"interaction": interaction, "remanent": remanent}
-    scene = Scene(case_of(tmp_path / "strips.msh", 0.2, magnetic=magnetic, mesh={"degree": 2}).problem())
-    term = next(term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm))
+    scene = Scene(
+        case_of(tmp_path / "strips.msh", 0.2, magnetic=magnetic, mesh={"degree": 2}).problem()
+    )
+    term = next(
+        term for term in scene.model.system.terms if isinstance(term, interacting.InteractionTerm)
+    )
     rng, u, v = np.random.default_rng(0), scene.model.u, fem.Function(scene.model.V)
-    u.x.array[:], v.x.array[:] = (size * rng.standard_normal(len(u.x.array)) for size in (1e-3, 1.0))
-    (Br, by_energy), (_, by_force) = (term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0)))
+    u.x.array[:], v.x.array[:] = (
+        size * rng.standard_normal(len(u.x.array)) for size in (1e-3, 1.0)
+    )
+    (Br, by_energy), (_, by_force) = (
+        term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0))
+    )
     change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
     own, forces, energies = own_field(term._sight), list[float](), list[float]()
     own.edges = own.chargeable  # the change has charges on edges between cells
@@ -483,16 +599,34 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("interaction", ["others", "all"])
-def test_gradients_by_thickness_and_shape_beside_a_neighbour(model: Any, tmp_path: Path, interaction: str) -> None:
-    """The deflection of a tip: differences of whole runs with other thickness and shape of both strips, 1e-6."""
+def test_gradients_by_thickness_and_shape_beside_a_neighbour(
+    model: Any, tmp_path: Path, interaction: str
+) -> None:
+    """The deflection of a tip: differences of whole runs with other thickness and shape of both
+    strips, 1e-6.
+    """
     rooted_strips(tmp_path / "strips.msh")
 
     def ran(**keys: Any) -> Any:
-        shell = {"geometry": "mesh", "file": str(tmp_path / "strips.msh"), "unit": "mm", "radius": "5 mm"}
+        shell = {
+            "geometry": "mesh",
+            "file": str(tmp_path / "strips.msh"),
+            "unit": "mm",
+            "radius": "5 mm",
+        }
         shell |= {"thickness": "0.2 mm", "youngs_modulus": "20 MPa", "poisson_ratio": 0, **keys}
-        magnetic = {"interaction": interaction, "remanent": {"polar": 30, "flux_density": f"{BR} T"}}
+        magnetic = {
+            "interaction": interaction,
+            "remanent": {"polar": 30, "flux_density": f"{BR} T"},
+        }
         held, points = {"part0": "clamped", "root": "clamped"}, {"tip": ["4 mm", "1 mm", "1.5 mm"]}
-        sections = {"shell": shell, "boundary": held, "points": points, "magnetic": magnetic, "mesh": {"degree": 2}}
+        sections = {
+            "shell": shell,
+            "boundary": held,
+            "points": points,
+            "magnetic": magnetic,
+            "mesh": {"degree": 2},
+        }
         return run(case_of(tmp_path / "strips.msh", 0.2, **sections))
 
     def slope(d: float, keys: Any) -> float:
@@ -505,7 +639,10 @@ def test_gradients_by_thickness_and_shape_beside_a_neighbour(model: Any, tmp_pat
     thicker = slope(1e-3, lambda e: {"thickness_factor": f"1 + {e!r}*x"})
     assert by["thickness"].along(x) == pytest.approx(thicker, rel=1e-6)
     x, y = by["deviation"].places[..., :1], by["deviation"].places[..., 1:2]
-    other = slope(5e-3, lambda e: {"imperfections": [{"kind": "formula", "w0": "x**2 + 0.3*x*y", "amplitude": e}]})
+    other = slope(
+        5e-3,
+        lambda e: {"imperfections": [{"kind": "formula", "w0": "x**2 + 0.3*x*y", "amplitude": e}]},
+    )
     assert by["deviation"].along(x**2 + 0.3 * x * y) * 0.2 / 5 == pytest.approx(other, rel=1e-6)
 
 
@@ -515,7 +652,10 @@ def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) ->
     rooted_strips(tmp_path / "strips.msh")
 
     def ran(e: float) -> Any:
-        remanent = {"kind": "expression", "components": [f"0.5 + {e!r}*x", f"{e!r}*y", f"0.8 + {e!r}*z*x"]}
+        remanent = {
+            "kind": "expression",
+            "components": [f"0.5 + {e!r}*x", f"{e!r}*y", f"0.8 + {e!r}*z*x"],
+        }
         magnetic = {"interaction": "others", "remanent": {**remanent, "flux_density": f"{BR} T"}}
         held, points = {"part0": "clamped", "root": "clamped"}, {"tip": ["4 mm", "1 mm", "1.5 mm"]}
         sections = {"boundary": held, "points": points, "magnetic": magnetic, "mesh": {"degree": 2}}
@@ -525,7 +665,9 @@ def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) ->
     by = gradient_of(found.scene, found.latest, of="tip_uz_mm", by="remanence")["remanence"]
     x, y, z = np.moveaxis(by.places, -1, 0)
     tips = [ran(side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
-    assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
+    assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx(
+        (tips[0] - tips[1]) / (2 * d), rel=1e-5
+    )
 
 
 @pytest.mark.slow
@@ -546,9 +688,11 @@ def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-4, -1e-3])
 def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, gap: float) -> None:
-    """A strip leans on another one just behind its end: forces and tangent are slopes of the energy, by differences.
+    """A strip leans on another one just behind its end: forces and tangent are slopes of the
+    energy, by differences.
 
-    It ends 0.1 h before the other one begins: its face, continued, would cross that one's. The gap (h) is at its end.
+    It ends 0.1 h before the other one begins: its face, continued, would cross that one's. The gap
+    (h) is at its end.
     """
     h = 0.3
     rooted_strips(tmp_path / "strips.msh")
@@ -558,15 +702,21 @@ def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, 
     (term,) = (each for each in system.terms if each.name == "interaction")
     x, _, z = 5 * scene.model.r0.x.array.reshape(-1, 3).T
     upper, (sine, cosine) = z > 1e-6, (0.1, np.sqrt(0.99))
-    end = 0.5 * h * (1 + cosine) + gap * h  # of the mid-surface, whose lower face touches with its edge
+    end = (
+        0.5 * h * (1 + cosine) + gap * h
+    )  # of the mid-surface, whose lower face touches with its edge
     places = [4.0 - 0.1 * h - 0.5 * h * sine + cosine * (x - 4.0), end - sine * (x - 4.0) - 1.5]
     u = np.zeros((len(x), 3))
-    u[upper, 0], u[upper, 2] = ((each - (x if i == 0 else 0))[upper] / 5 for i, each in enumerate(places))
+    u[upper, 0], u[upper, 2] = (
+        (each - (x if i == 0 else 0))[upper] / 5 for i, each in enumerate(places)
+    )
     v = np.where(upper, -((x / 4) ** 2), 0.0)[:, None] * [0, 0, 1]
     u, v, step = u.ravel(), v.ravel(), 1e-4 * h / 5
     sides = [u + side * step * v for side in (1, -1)]
     energies = [system.at(State(each, mu)).of(term.energy) for each in sides]
-    assert (energies[0] - energies[1]) / (2 * step) == pytest.approx(gradient(scene, u) @ v, rel=1e-5)
+    assert (energies[0] - energies[1]) / (2 * step) == pytest.approx(
+        gradient(scene, u) @ v, rel=1e-5
+    )
     acting = system.at(State(u, mu)).of(term.acting)
     bend = v @ (acting.stored @ v + acting.times_others(v[:, None]).ravel())
     slopes = [gradient(scene, each) @ v for each in sides]

@@ -1,4 +1,6 @@
-"""The own field of a solid: magpylib's cuboid and mesh of triangles, the dipoles of F Br in it, and the thin shell."""
+"""The own field of a solid: magpylib's cuboid and mesh of triangles, the dipoles of F Br in it, and
+the thin shell.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -20,7 +22,10 @@ MM = 1e-3
 BLOCK = {"geometry": "strip", "radius": "20 mm", "width": 0.5, "thickness": "2 mm", "youngs_modulus": "1 MPa",
          "poisson_ratio": 0.3}  # fmt: skip
 HALF = np.array([10.0, 5.0, 1.0]) * MM
-PLACES = np.array([[10, 3, 40], [12, 2, 1.1], [10, 5.3, 1.5], [21, 6, 1.3], [3, 1, -7], [20.2, 1, 0.0]]) * MM
+PLACES = (
+    np.array([[10, 3, 40], [12, 2, 1.1], [10, 5.3, 1.5], [21, 6, 1.3], [3, 1, -7], [20.2, 1, 0.0]])
+    * MM
+)
 TILTED = {"polar": 40, "azimuth": 30, "flux_density": "60 mT"}
 ALONG = {"polar": 40, "azimuth": 0, "flux_density": "60 mT"}
 VARIED = {"kind": "expression", "components": ["1 + x", "y", "z*x + x**2"], "flux_density": "60 mT"}
@@ -49,7 +54,9 @@ def moved(scene: Scene, map_of: Any) -> State:
 
 def readings(scene: Scene, state: State) -> np.ndarray:
     row = scene.observe(state)
-    return np.array([[row[f"{each.name}_B{axis}"] for axis in "xyz"] for each in scene.model.loads.sensors])
+    return np.array(
+        [[row[f"{each.name}_B{axis}"] for axis in "xyz"] for each in scene.model.loads.sensors]
+    )
 
 
 def error(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
@@ -58,29 +65,45 @@ def error(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 def polarization(remanent: dict[str, Any]) -> np.ndarray:
     polar, azimuth = np.radians([remanent["polar"], remanent["azimuth"]])
-    return 0.06 * np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    return 0.06 * np.array(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    )
 
 
 @pytest.mark.parametrize(("symmetry", "remanent"), [("none", TILTED), ("half", ALONG)])
 def test_a_block_is_magpylibs_cuboid(symmetry: str, remanent: dict[str, Any]) -> None:
-    """Also a tenth of the thickness from a face and beside an edge: 1e-8; the export's flat faces are the same."""
+    """Also a tenth of the thickness from a face and beside an edge: 1e-8; the export's flat faces
+    are the same.
+    """
     scene = made({"remanent": remanent}, symmetry=symmetry)
-    block = magpylib.magnet.Cuboid(dimension=2 * HALF, polarization=polarization(remanent), position=[HALF[0], 0, 0])
+    block = magpylib.magnet.Cuboid(
+        dimension=2 * HALF, polarization=polarization(remanent), position=[HALF[0], 0, 0]
+    )
     expected = block.getB(PLACES)
     assert (error(readings(scene, scene.unloaded()), expected) < 1e-8).all()
     record: Any = SimpleNamespace(point=SimpleNamespace(state=scene.unloaded()))
     assert (error(scene.to_magpylib(record, 2).getB(PLACES), expected) < 1e-4).all()
 
 
-@pytest.mark.parametrize(("symmetry", "A", "remanent"), [("none", AFFINE, TILTED), ("half", UPRIGHT, ALONG)])
-def test_a_deformed_block_is_magpylibs_mesh(symmetry: str, A: np.ndarray, remanent: dict[str, Any]) -> None:
-    """An affine map makes a parallelepiped with the polarization A Br/det A: 1e-7; in it a map has no values."""
+@pytest.mark.parametrize(
+    ("symmetry", "A", "remanent"), [("none", AFFINE, TILTED), ("half", UPRIGHT, ALONG)]
+)
+def test_a_deformed_block_is_magpylibs_mesh(
+    symmetry: str, A: np.ndarray, remanent: dict[str, Any]
+) -> None:
+    """An affine map makes a parallelepiped with the polarization A Br/det A: 1e-7; in it a map has
+    no values.
+    """
     corners = (np.array(np.meshgrid([0, 2], [-1, 1], [-1, 1])).reshape(3, -1).T * HALF) @ A.T
     body = magpylib.magnet.TriangularMesh.from_ConvexHull(
         points=corners, polarization=A @ polarization(remanent) / np.linalg.det(A)
     )
     x = PLACES @ A.T
-    box = {"corner": [-3 * MM, 1 * MM, -3 * MM], "sides": [[28 * MM, 0, 0], [0, 0, 8 * MM]], "points": [8, 7]}
+    box = {
+        "corner": [-3 * MM, 1 * MM, -3 * MM],
+        "sides": [[28 * MM, 0, 0], [0, 0, 8 * MM]],
+        "points": [8, 7],
+    }
     scene = made({"remanent": remanent}, x, symmetry=symmetry, field_maps={"box": box})
     state = moved(scene, lambda X: X @ A.T)
     assert (error(readings(scene, state), body.getB(x)) < 1e-7).all()
@@ -100,19 +123,28 @@ def bent(X: np.ndarray) -> np.ndarray:
 
 
 def dipoles(scene: Scene, state: State, x: np.ndarray, polarised: Any) -> np.ndarray:
-    """By Gauss's rule the field of the polarisation per undeformed volume, in units of |Br|, at places x over R."""
+    """By Gauss's rule the field of the polarisation per undeformed volume, in units of |Br|, at
+    places x over R.
+    """
     V = scene.model.V
     points, weights = basix.make_quadrature(V.mesh.basix_cell(), 14)
     T = V.element.basix_element.tabulate(1, points)[..., 0]
     nodes = V.dofmap.list
-    X, u = (np.einsum("dqk,cki->dcqi", T, f.reshape(-1, 3)[nodes]) for f in (scene.model.r0.x.array, state.u))
+    X, u = (
+        np.einsum("dqk,cki->dcqi", T, f.reshape(-1, 3)[nodes])
+        for f in (scene.model.r0.x.array, state.u)
+    )
     G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
     F, volume = np.eye(3) + H @ np.linalg.inv(G), (np.linalg.det(G) * weights)[..., None]
     J, B = volume * polarised(X[0], F), []
     for each in x:
         d = each - X[0] - u[0]
         r = np.linalg.norm(d, axis=-1, keepdims=True)
-        B.append(((3 * np.sum(J * d, axis=-1, keepdims=True) * d / r**5 - J / r**3) / (4 * np.pi)).sum(axis=(0, 1)))
+        B.append(
+            ((3 * np.sum(J * d, axis=-1, keepdims=True) * d / r**5 - J / r**3) / (4 * np.pi)).sum(
+                axis=(0, 1)
+            )
+        )
     return np.array(B)
 
 
@@ -144,21 +176,32 @@ def turned(F: np.ndarray) -> np.ndarray:
         ),
     ],
 )  # fmt: skip
-def test_a_bent_block_is_its_dipoles(magnetic: dict[str, Any], polarised: Any, allowed: float) -> None:
-    """A formula, whose divergence is charge inside, layers, which jump, and the law that turns: other formulas."""
+def test_a_bent_block_is_its_dipoles(
+    magnetic: dict[str, Any], polarised: Any, allowed: float
+) -> None:
+    """A formula, whose divergence is charge inside, layers, which jump, and the law that turns:
+    other formulas.
+    """
     x = np.array([[10, 3, 40], [-6, 2, 8], [10, 14, 3], [28, 1, 9]]) * MM
     layers = {"solid": {"layers": 2}} if "layers" in magnetic["remanent"] else {}
     scene = made(magnetic, x, **layers)
     state = moved(scene, bent)
     expected = 0.06 * dipoles(scene, state, x / scene.problem.length, polarised)
-    assert (error(readings(scene, state), expected) < allowed).all(), error(readings(scene, state), expected)
+    assert (error(readings(scene, state), expected) < allowed).all(), error(
+        readings(scene, state), expected
+    )
 
 
 @pytest.mark.slow
 def test_a_thin_strip_as_a_shell_and_as_a_solid() -> None:
-    """Bent to 22 of 30 mm: 1e-3 on a fine mesh, which is by how much its tip is beside that of the shell."""
+    """Bent to 22 of 30 mm: 1e-3 on a fine mesh, which is by how much its tip is beside that of the
+    shell.
+    """
     shell = {**BLOCK, "radius": "30 mm", "width": 0.3, "thickness": "0.3 mm", "poisson_ratio": 0.0}
-    magnetic = {"remanent": {"polar": 90, "flux_density": "60 mT"}, "applied": {"polar": 0, "flux_density": "1 mT"}}
+    magnetic = {
+        "remanent": {"polar": 90, "flux_density": "60 mT"},
+        "applied": {"polar": 0, "flux_density": "1 mT"},
+    }
     x = np.array([[25, 1, 12], [15, 0, -3]]) * MM
     here = {"shell": shell, "symmetry": "half"}
     found = []

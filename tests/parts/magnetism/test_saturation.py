@@ -1,4 +1,6 @@
-"""Langevin's law in a sheet: SciPy's solution at points, and derivatives by differences of those below them."""
+"""Langevin's law in a sheet: SciPy's solution at points, and derivatives by differences of those
+below them.
+"""
 
 from math import factorial
 
@@ -9,7 +11,12 @@ from scipy.optimize import brentq
 
 from magshell_fenicsx.parts.magnetism.saturation import ORDERS, expanded, polarisation, ratio
 
-POINTS = [(chi, n, t) for chi in (0.3, 5.0, 400.0) for n in (1e-3, 0.4, 3.0, 60.0) for t in (0.0, 0.02, 0.7, 20.0)]
+POINTS = [
+    (chi, n, t)
+    for chi in (0.3, 5.0, 400.0)
+    for n in (1e-3, 0.4, 3.0, 60.0)
+    for t in (0.0, 0.02, 0.7, 20.0)
+]
 
 
 def langevin(x: float) -> float:
@@ -31,7 +38,9 @@ def test_energy_and_polarisation(chi: float, normal: float, along: float) -> Non
     """The coenergy is the integral of mu0 M over b: 1e-10."""
     b = across(chi, normal, along)
     size = np.hypot(b, along)
-    w = quad(lambda x: langevin(x), 0, 3 * chi * size, epsabs=0, epsrel=1e-12, limit=200)[0] / (3 * chi)
+    w = quad(lambda x: langevin(x), 0, 3 * chi * size, epsabs=0, epsrel=1e-12, limit=200)[0] / (
+        3 * chi
+    )
     found = expanded(*map(np.array, (chi, normal**2, along**2)), 1.0)
     assert found[2] == pytest.approx(-w - (normal - b) ** 2 / 2, rel=1e-10)
     J = langevin(3 * chi * size) / size * np.array([along, 0, b])
@@ -42,7 +51,9 @@ def test_energy_and_polarisation(chi: float, normal: float, along: float) -> Non
 
 @pytest.mark.parametrize("order", [order for order in ORDERS if sum(order)])
 def test_derivatives(order: tuple[int, int]) -> None:
-    """Central differences of the derivative of one order less, on both sides of the end of the series."""
+    """Central differences of the derivative of one order less, on both sides of the end of the
+    series.
+    """
     which = 0 if order[0] else 1
     below = (order[0] - 1, order[1]) if order[0] else (0, order[1] - 1)
     chi, normal, along = np.array([point for point in POINTS if point[2]]).T

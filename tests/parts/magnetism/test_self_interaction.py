@@ -1,4 +1,6 @@
-"""A magnetised part in its own field: closed forms of prisms and spherical shells, differences, eigenvalues."""
+"""A magnetised part in its own field: closed forms of prisms and spherical shells, differences,
+eigenvalues.
+"""
 
 import subprocess
 import sys
@@ -25,7 +27,10 @@ __all__ = ["model"]
 
 
 def demagnetising(a: float, b: float, c: float) -> float:
-    """That of a prism of 2a x 2b x 2c along the last side: A. Aharoni, J. Appl. Phys. 83 (1998) 3432, equation 1."""
+    """That of a prism of 2a x 2b x 2c along the last side: A.
+
+    Aharoni, J. Appl. Phys. 83 (1998) 3432, equation 1.
+    """
     r, ab, ac, bc = np.sqrt([a * a + b * b + c * c, a * a + b * b, a * a + c * c, b * b + c * c])
     D = (b * b - c * c) / (2 * b * c) * np.log((r - a) / (r + a))
     D += (a * a - c * c) / (2 * a * c) * np.log((r - b) / (r + b))
@@ -41,7 +46,9 @@ def alone(file: Path, h: float, polar: float, **sections: Any) -> Scene:
     gmsh.model.occ.addRectangle(0, -0.5, 0, 5.0, 1.0)
     meshed(file, 0.5)
     magnetic = {"interaction": "all", "remanent": {"polar": polar, "flux_density": f"{BR} T"}}
-    return Scene(case_of(file, h, magnetic=magnetic, **{"boundary": {"edge0": "clamped"}, **sections}))
+    return Scene(
+        case_of(file, h, magnetic=magnetic, **{"boundary": {"edge0": "clamped"}, **sections})
+    )
 
 
 @pytest.mark.parametrize(("h", "polar"), [(0.25, 0), (0.25, 90), (0.05, 0), (0.05, 90)])
@@ -58,9 +65,13 @@ def test_a_prism(model: Any, tmp_path: Path, h: float, polar: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("R_over_h", "error"), [(20, 2e-4), (90, 2e-4)])
 def test_a_closed_sphere(R_over_h: float, error: float) -> None:
-    """A uniformly magnetised spherical shell: field only inside the wall and outside, energy Br² V/(6 mu_0)."""
+    """A uniformly magnetised spherical shell: field only inside the wall and outside, energy Br²
+    V/(6 mu_0).
+    """
     shape = sphere_of_triangles(1 / R_over_h, np.array([0.0, 0.0, 1.0]))
-    corners = np.unique(shape.r0[:, :3].round(9).reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    corners = np.unique(shape.r0[:, :3].round(9).reshape(-1, 3), axis=0, return_inverse=True)[
+        1
+    ].reshape(-1, 3)
     none, count = np.zeros(0, dtype=np.intp), len(shape.r0)
     near = Near(shape, corners, none, none, range(count), MPI.COMM_WORLD)
     charged = Charged(shape, np.zeros(count, dtype=np.intp), none, none, MPI.COMM_WORLD, near)
@@ -77,18 +88,26 @@ def bent(scene: Scene) -> tuple[Vector, Array]:
         [0.01 * np.sin(2 * y), 0.02 * np.cos(2 * x), 0.03 * np.sin(2 * x + 1.5 * y)],
         [np.cos(2 * y + x), np.sin(2 * x), np.cos(2 * x - 1.5 * y)],
     ]
-    u, v = (scene.model.system.held(np.column_stack(each).ravel()[: scene.model.system.size]) for each in both)
+    u, v = (
+        scene.model.system.held(np.column_stack(each).ravel()[: scene.model.system.size])
+        for each in both
+    )
     return u, v
 
 
 @pytest.mark.slow
 def test_derivatives(model: Any, tmp_path: Path) -> None:
-    """Work is the change of the energy, the tangent is the slope of the forces: differences, 1e-6; no net force."""
+    """Work is the change of the energy, the tangent is the slope of the forces: differences, 1e-6;
+    no net force.
+    """
     scene = alone(tmp_path / "strip.msh", 0.25, 40)
     (u, v), system, mu = bent(scene), scene.model.system, {"interaction": 1.0}
     (term,) = (each for each in system.terms if each.name == "interaction")
     step = 3e-6  # beside edges charges are so near each other
-    moved = [(w / step, u + k * step * v) for k, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))]
+    moved = [
+        (w / step, u + k * step * v)
+        for k, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
+    ]
     slope = gradient(scene, u)
     energies = [(w, system.at(State(each, mu)).of(term.energy)) for w, each in moved]
     assert sum(w * value for w, value in energies) == pytest.approx(slope @ v, rel=1e-6)
@@ -101,20 +120,29 @@ def test_derivatives(model: Any, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_inertia(model: Any, tmp_path: Path) -> None:
-    """Negative pivots of the factors are the dense matrix's negative eigenvalues, with 1 and 1e5 times the energy."""
+    """Negative pivots of the factors are the dense matrix's negative eigenvalues, with 1 and 1e5
+    times the energy.
+    """
     scene = alone(tmp_path / "strip.msh", 0.25, 0)
     system, counts = scene.model.system, []
     for factor in (1.0, 1e5):
-        K, factors = system.tangent(0.01 * bent(scene)[0], {"interaction": factor}), Factorisation(system.comm)
+        K, factors = (
+            system.tangent(0.01 * bent(scene)[0], {"interaction": factor}),
+            Factorisation(system.comm),
+        )
         factors.factor(K)
-        eigenvalues = np.linalg.eigvalsh(symmetric_part(K).getValues(range(system.size), range(system.size)))
+        eigenvalues = np.linalg.eigvalsh(
+            symmetric_part(K).getValues(range(system.size), range(system.size))
+        )
         counts.append(factors.negative_pivots)
         assert counts[-1] == np.sum(eigenvalues < 0)
     assert counts[0] == 0 < counts[1]
 
 
 def halves(file: Path, symmetry: str, polar: float, azimuth: float, **sections: Any) -> Scene:
-    """Two strips of 5 x 1 mm, one above the other, each of two halves with the same mesh; all of it, or a half."""
+    """Two strips of 5 x 1 mm, one above the other, each of two halves with the same mesh; all of
+    it, or a half.
+    """
     if not file.exists():
         for z in (0.0, 0.5):
             both = [gmsh.model.occ.addRectangle(0, y, z, 5.0, 0.5) for y in (-0.5, 0.0)]
@@ -135,40 +163,64 @@ def halves(file: Path, symmetry: str, polar: float, azimuth: float, **sections: 
             gmsh.model.addPhysicalGroup(1, sorted(rim - set(root)), name=f"{name}_rim")
         gmsh.model.mesh.generate(2)
         gmsh.write(str(file))
-    magnetic = {"interaction": "all", "remanent": {"polar": polar, "azimuth": azimuth, "flux_density": f"{BR} T"}}
+    magnetic = {
+        "interaction": "all",
+        "remanent": {"polar": polar, "azimuth": azimuth, "flux_density": f"{BR} T"},
+    }
     held = {"lower_root": "clamped", "upper_root": "clamped"}
-    sections = {"boundary": held, "magnetic": magnetic, "symmetry": symmetry, "mesh": {"degree": 2}} | sections
+    sections = {
+        "boundary": held,
+        "magnetic": magnetic,
+        "symmetry": symmetry,
+        "mesh": {"degree": 2},
+    } | sections
     return Scene(case_of(file, 0.2, **sections))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("polar", "azimuth", "error"), [(40, 0, 5e-3), (90, 90, 1e-5)])  # mirrored, or opposite
+@pytest.mark.parametrize(
+    ("polar", "azimuth", "error"), [(40, 0, 5e-3), (90, 90, 1e-5)]
+)  # mirrored, or opposite
 def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error: float) -> None:
-    """A half in its images' field is the half of the whole, to the error of rules: energy 1e-5, even and odd tangents.
+    """A half in its images' field is the half of the whole, to the error of rules: energy 1e-5,
+    even and odd tangents.
 
-    Cells of the whole's other half begin at other corners than images do, which shows the error of rules for cells that
-    touch: largest in the tangent, of charged faces. Differences of the half's own energy and forces: 1e-6.
+    Cells of the whole's other half begin at other corners than images do, which shows the error of
+    rules for cells that touch: largest in the tangent, of charged faces. Differences of the half's
+    own energy and forces: 1e-6.
     """
     file, at = tmp_path / "halves.msh", {"interaction": 1.0}
     whole, half = (halves(file, each, polar, azimuth) for each in ("none", "half"))
     assert (whole.model.multiplicity, half.model.multiplicity) == (1, 2)
     x, of = (each.model.r0.x.array.reshape(-1, 3) for each in (whole, half))
     images = half.model.mirror.image(of)
-    here, there = (np.linalg.norm(x[:, None] - each, axis=-1).argmin(axis=0) for each in (of, images))
+    here, there = (
+        np.linalg.norm(x[:, None] - each, axis=-1).argmin(axis=0) for each in (of, images)
+    )
     assert np.linalg.norm(x[here] - of, axis=-1).max() < 1e-9
     S = half.model.mirror.reflection
-    bend = np.column_stack([0.01 * np.sin(2 * of[:, 1]) ** 2, 0 * of[:, 0], 0.03 * of[:, 0] ** 2 * (1 + of[:, 1] ** 2)])
+    bend = np.column_stack(
+        [0.01 * np.sin(2 * of[:, 1]) ** 2, 0 * of[:, 0], 0.03 * of[:, 0] ** 2 * (1 + of[:, 1] ** 2)]
+    )
     u = np.zeros_like(x)
     u[here], u[there] = bend, bend @ S
-    terms = [next(t for t in each.model.system.terms if t.name == "interaction") for each in (whole, half)]
+    terms = [
+        next(t for t in each.model.system.terms if t.name == "interaction")
+        for each in (whole, half)
+    ]
     states = [State(u.ravel(), at), State(bend.ravel(), at)]
     systems = whole.model.system, half.model.system
-    energies = [s.at(state).of(t.energy) for s, state, t in zip(systems, states, terms, strict=True)]
+    energies = [
+        s.at(state).of(t.energy) for s, state, t in zip(systems, states, terms, strict=True)
+    ]
     assert 2 * energies[1] == pytest.approx(energies[0], rel=1e-5)
     system, term, step = systems[1], terms[1], 3e-6
     v, k = smooth(of, 1.0), rows_of(system, states[1], term)
     assert np.abs(k - k.T).max() < 1e-11 * np.abs(k).max()
-    moved = [(w / step, bend + c * step * v) for c, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))]
+    moved = [
+        (w / step, bend + c * step * v)
+        for c, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
+    ]
     change = sum(w * system.at(State(each.ravel(), at)).of(term.energy) for w, each in moved)
     assert change == pytest.approx(gradient(half, bend.ravel()) @ v.ravel(), rel=1e-6)
     slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
@@ -178,13 +230,18 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     turned, times = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel())), term._blocks.times
     stored, rest = flat.stored, flat.stored.copy()
     rest.data[flat.beside] = 0.0
-    exact, rounding = stored @ v.ravel(), np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel()))
+    exact, rounding = (
+        stored @ v.ravel(),
+        np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel())),
+    )
     for upper in (True, False):
         assert (np.abs(times(Singles.of(stored, upper=upper), v.ravel()) - exact) <= rounding).all()
     others = flat.times_others(v.reshape(-1, 1))[:, 0]
     products = [exact + others, times(turned, v.ravel()) + rest @ v.ravel() + others]
     as_it_was, with_nodes = (np.linalg.norm(each - slope) for each in products)
-    assert with_nodes < min(0.3 * as_it_was, 0.02 * np.linalg.norm(slope)), "the bend stretches by 4 %, too"
+    assert with_nodes < min(0.3 * as_it_was, 0.02 * np.linalg.norm(slope)), (
+        "the bend stretches by 4 %, too"
+    )
     K = rows_of(systems[0], states[0], terms[0])
     for sign in (1.0, -1.0):
         v, V = smooth(of, sign), np.zeros_like(x)
@@ -230,14 +287,21 @@ if comm.rank == 0:
 
 @pytest.mark.slow
 def test_forces_are_foreseen_by_the_same_derivative_on_ranks(tmp_path: Path) -> None:
-    """D has the same blocks on 1 and 2 ranks, and so foresees the same forces, to its single precision.
+    """D has the same blocks on 1 and 2 ranks, and so foresees the same forces, to its single
+    precision.
 
     How many iterations they save hangs at thresholds and is no evidence of it.
     """
     (tmp_path / "case.yaml").write_text(CAP)
     found = []
     for ranks in (1, 2):
-        words = [sys.executable, "-c", FORESEEN, str(tmp_path / "case.yaml"), str(tmp_path / f"{ranks}.npy")]
+        words = [
+            sys.executable,
+            "-c",
+            FORESEEN,
+            str(tmp_path / "case.yaml"),
+            str(tmp_path / f"{ranks}.npy"),
+        ]
         done = subprocess.run(mpirun(ranks) + words, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         found.append(np.load(tmp_path / f"{ranks}.npy"))
@@ -252,17 +316,34 @@ def test_forces_are_foreseen_by_the_same_derivative_on_ranks(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_ranks_and_resume(tmp_path: Path) -> None:
-    """A half in its own and its image's field: the same path on 1 and 2 ranks, and of a run that goes on."""
+    """A half in its own and its image's field: the same path on 1 and 2 ranks, and of a run that
+    goes on.
+    """
     (tmp_path / "case.yaml").write_text(CAP)
     run = start("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again")
     wait_for_rows(run, tmp_path / "again", 2)
     run.terminate()
     run.communicate()
-    done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / "again", "--resume", ranks=1)
+    done = magshell(
+        "run",
+        tmp_path / "case.yaml",
+        "--no-pictures",
+        "--out",
+        tmp_path / "again",
+        "--resume",
+        ranks=1,
+    )
     assert done.returncode == 0, done.stderr
     paths = [read_path(tmp_path / "again")]
     for ranks in (1, 2):
-        done = magshell("run", tmp_path / "case.yaml", "--no-pictures", "--out", tmp_path / str(ranks), ranks=ranks)
+        done = magshell(
+            "run",
+            tmp_path / "case.yaml",
+            "--no-pictures",
+            "--out",
+            tmp_path / str(ranks),
+            ranks=ranks,
+        )
         assert done.returncode == 0, done.stderr
         paths.append(read_path(tmp_path / str(ranks)))
     for other in paths[1:]:
@@ -275,7 +356,9 @@ def test_ranks_and_resume(tmp_path: Path) -> None:
 def smooth(x: Array, sign: float) -> Array:
     """A displacement that a mirror at y = 0 leaves, or turns into its opposite."""
     even, odd = (np.cos(x[:, 1]), x[:, 1]) if sign > 0 else (x[:, 1], np.cos(x[:, 1]))
-    return np.column_stack([even * np.sin(3 * x[:, 0] + 1), odd * np.cos(2 * x[:, 0]), even * np.sin(2 * x[:, 0])])
+    return np.column_stack(
+        [even * np.sin(3 * x[:, 0] + 1), odd * np.cos(2 * x[:, 0]), even * np.sin(2 * x[:, 0])]
+    )
 
 
 def rows_of(system: Any, state: State, term: Any) -> Array:

@@ -1,4 +1,6 @@
-"""Soft magnetism: derivatives by differences in every model, the energy by hand, Euler's elastica, what is refused."""
+"""Soft magnetism: derivatives by differences in every model, the energy by hand, Euler's elastica,
+what is refused.
+"""
 
 from functools import cache
 from typing import Any
@@ -14,8 +16,20 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.public import follow, run
 
-PLATE = {"geometry": "plate", "length": "30 mm", "width": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
-STRIP = {"geometry": "strip", "radius": "30 mm", "width": 0.4, "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+PLATE = {
+    "geometry": "plate",
+    "length": "30 mm",
+    "width": "12 mm",
+    "thickness": "1 mm",
+    "youngs_modulus": "1 MPa",
+}
+STRIP = {
+    "geometry": "strip",
+    "radius": "30 mm",
+    "width": 0.4,
+    "thickness": "1 mm",
+    "youngs_modulus": "1 MPa",
+}
 RING = {**PLATE, "geometry": "annulus", "radius": "30 mm", "inner_radius": "12 mm"}
 RING = {key: value for key, value in RING.items() if key not in ("length", "width")}
 MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
@@ -33,10 +47,14 @@ REMANENT = {"polar": 70, "azimuth": 20, "flux_density": "90 mT"}
 G = {**FIELD, "gradient": [[0.3, 0.1, 0], [0.1, -0.7, 0.2], [0, 0.2, 0.4]]}
 
 
-def made(shell: dict[str, Any], boundary: dict[str, str], magnetic: dict[str, Any], **sections: Any) -> Scene:
+def made(
+    shell: dict[str, Any], boundary: dict[str, str], magnetic: dict[str, Any], **sections: Any
+) -> Scene:
     shell = {"poisson_ratio": 0.3, **shell}
     given = {"loading": {"kind": "field"}, "mesh": {"degree": 2}, **sections}
-    return Scene(Case.model_validate({"shell": shell, "boundary": boundary, "magnetic": magnetic, **given}))
+    return Scene(
+        Case.model_validate({"shell": shell, "boundary": boundary, "magnetic": magnetic, **given})
+    )
 
 
 LEFT, SIZED = {"left": "clamped"}, {"mesh": {"degree": 2, "size": 0.015}}
@@ -101,9 +119,13 @@ def rough(kind: str) -> tuple[Any, np.ndarray, dict[str, float]]:
     return system, u, {name: 0.3 + 0.1 * i for i, name in enumerate(sorted(mu))}
 
 
-@pytest.mark.parametrize("kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
+@pytest.mark.parametrize(
+    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KINDS]
+)
 def test_derivatives(kind: str) -> None:
-    """Residual, tangent, load columns, conjugates and their derivatives by all amplitudes, by central differences."""
+    """Residual, tangent, load columns, conjugates and their derivatives by all amplitudes, by
+    central differences.
+    """
     system, u, mu = rough(kind)
     v = system.held(np.random.default_rng(2).standard_normal(system.size))
 
@@ -122,7 +144,9 @@ def test_derivatives(kind: str) -> None:
         def at(e: float, name: str = name) -> dict[str, float]:
             return {**mu, name: mu[name] + e}
 
-        assert system.potential(u, mu, name) == pytest.approx(differences(lambda e: energy(u, at(e)), 1e-3), rel=1e-6)
+        assert system.potential(u, mu, name) == pytest.approx(
+            differences(lambda e: energy(u, at(e)), 1e-3), rel=1e-6
+        )
         column = system.load(u, mu, name)
         by_difference = differences(lambda e: system.residual(u, at(e)), 1e-3)
         assert np.abs(column).max() > 0
@@ -130,12 +154,17 @@ def test_derivatives(kind: str) -> None:
         for other in mu:
             bend = differences(lambda e, other=other: system.potential(u, at(e), other), 1e-3)
             scale = abs(bend) + 1e-3 * abs(system.potential(u, mu, other))
-            assert system.curvature(u, mu, name, other) == pytest.approx(bend, abs=1e-5 * scale), (name, other)
+            assert system.curvature(u, mu, name, other) == pytest.approx(bend, abs=1e-5 * scale), (
+                name,
+                other,
+            )
 
 
 @pytest.mark.parametrize("model", ["shell", "solid"])
 def test_a_plate_in_a_tilted_field(model: str) -> None:
-    """A rigid turn changes the energy by -(chi h A/2mu0)(B_t² + B_n²/(1 + chi)), and the polarisation as by hand."""
+    """A rigid turn changes the energy by -(chi h A/2mu0)(B_t² + B_n²/(1 + chi)), and the
+    polarisation as by hand.
+    """
     chi, angle, B = 2.0, np.radians(25.0), 0.2
     magnetic = {"susceptibility": chi, "applied": {"polar": 0, "flux_density": f"{B} T"}}
     mesh = {"size": 0.015} | ({"degree": 2} if model == "shell" else {})
@@ -158,7 +187,9 @@ def test_a_plate_in_a_tilted_field(model: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("saturation", [None, "10 mT"])
 def test_models_agree(saturation: str | None) -> None:
-    """A soft disc in a graded field along its axis: meridian, half and full, and the polarisation of each."""
+    """A soft disc in a graded field along its axis: meridian, half and full, and the polarisation
+    of each.
+    """
     shell: dict[str, Any] = {"geometry": "disc", "radius_to_thickness": 40, "poisson_ratio": 0.3}
     magnetic: dict[str, Any] = {
         "susceptibility": 2,
@@ -166,24 +197,38 @@ def test_models_agree(saturation: str | None) -> None:
         "applied": {"polar": 0, "gradient": [[-0.5, 0, 0], [0, -0.5, 0], [0, 0, 1]]},
     }
     if saturation:
-        shell = {"geometry": "disc", "radius": "30 mm", "thickness": "0.75 mm", "youngs_modulus": "1 MPa"}
+        shell = {
+            "geometry": "disc",
+            "radius": "30 mm",
+            "thickness": "0.75 mm",
+            "youngs_modulus": "1 MPa",
+        }
         shell["poisson_ratio"] = 0.3
         applied = magnetic["applied"] | {"flux_density": "22 mT"}
         magnetic = {"susceptibility": 2, "saturation": saturation, "applied": applied}
     rows = []
     for symmetry in ("axisymmetric", "half", "none"):
-        case = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "symmetry": symmetry}
+        case = {
+            "shell": shell,
+            "boundary": {"rim": "clamped"},
+            "magnetic": magnetic,
+            "symmetry": symmetry,
+        }
         rows.append(follow_last(case))
     keys = ("w_pole_over_h", "magnetic", "bending", "induced_z")
     for row in rows[1:]:
         for key in keys:
-            assert row[key] == pytest.approx(rows[0][key], rel=5e-4), key  # bending 3e-4, of the mesh
+            assert row[key] == pytest.approx(rows[0][key], rel=5e-4), (
+                key
+            )  # bending 3e-4, of the mesh
         assert abs(row["induced_x"]) + abs(row["induced_y"]) < 1e-6 * abs(row["induced_z"])
     assert abs(rows[0]["w_pole_over_h"]) > 1e-3
 
 
 def follow_last(case: dict[str, Any]) -> dict[str, float]:
-    scene = Scene(Case.model_validate({**case, "loading": {"kind": "field", "points": 2}}).problem())
+    scene = Scene(
+        Case.model_validate({**case, "loading": {"kind": "field", "points": 2}}).problem()
+    )
     *_, last = follow(scene)
     return scene.observe(last.point.state)
 
@@ -199,7 +244,9 @@ def tip(ratio: float) -> tuple[float, float]:
         def rates(_: float, y: np.ndarray) -> list[float]:
             return [y[1], -(k**2) * np.sin(2 * y[0]) / 2, np.cos(y[0]), np.sin(y[0])]
 
-        return np.asarray(solve_ivp(rates, (0, 1), [0, slope, 0, 0], rtol=1e-11, atol=1e-12).y[:, -1])
+        return np.asarray(
+            solve_ivp(rates, (0, 1), [0, slope, 0, 0], rtol=1e-11, atol=1e-12).y[:, -1]
+        )
 
     slope = brentq(lambda slope: end(slope)[1], 0.1 * k, k * (1 - 1e-10), xtol=1e-13)
     x, z = end(float(slope))[2:]
@@ -240,7 +287,9 @@ def langevin(chi: float, J: float, normal: float, along: float) -> tuple[float, 
     return size(total) * b / total, size(total) * along / total
 
 
-def saturated_tip(chi: float, J: float, B: float, slender: float, angle: float) -> tuple[float, float]:
+def saturated_tip(
+    chi: float, J: float, B: float, slender: float, angle: float
+) -> tuple[float, float]:
     """Displacement of the tip along x and z over L, by SciPy; J and B over sqrt(mu0 E)."""
 
     def torque(theta: float) -> float:
@@ -254,7 +303,9 @@ def saturated_tip(chi: float, J: float, B: float, slender: float, angle: float) 
         return [y[1], -smooth(y[0]), np.cos(y[0]), np.sin(y[0])]
 
     def end(slope: float) -> np.ndarray:
-        return np.asarray(solve_ivp(rates, (0, 1), [0, slope, 0, 0], rtol=1e-9, atol=1e-11).y[:, -1])
+        return np.asarray(
+            solve_ivp(rates, (0, 1), [0, slope, 0, 0], rtol=1e-9, atol=1e-11).y[:, -1]
+        )
 
     slope = brentq(lambda slope: end(slope)[1], 0.01, 2.0, xtol=1e-10)
     x, z = end(float(slope))[2:]
@@ -266,21 +317,39 @@ def test_a_saturating_strip_is_an_elastica() -> None:
     """The tip in a field beyond saturation, of SciPy's elastica with the same law: 1e-4."""
     unit = np.sqrt(4e-7 * np.pi * 1e6)
     x, z = saturated_tip(5.0, 4e-3 / unit, 6e-3 / unit, 200, np.radians(20))
-    shell = {"geometry": "strip", "radius": "30 mm", "width": 0.1, "thickness": "0.15 mm", "youngs_modulus": "1 MPa"}
+    shell = {
+        "geometry": "strip",
+        "radius": "30 mm",
+        "width": 0.1,
+        "thickness": "0.15 mm",
+        "youngs_modulus": "1 MPa",
+    }
     magnetic = {"susceptibility": 5.0, "saturation": "4 mT"}
     magnetic["applied"] = {"polar": 20, "azimuth": 0, "flux_density": "6 mT"}
-    case = {"shell": {**shell, "poisson_ratio": 0}, "boundary": {"root": "clamped"}, "magnetic": magnetic}
-    row = run(Case.model_validate({**case, "points": {"tip": ["30 mm", 0, 0]}, "loading": {"kind": "field"}})).rows[-1]
+    case = {
+        "shell": {**shell, "poisson_ratio": 0},
+        "boundary": {"root": "clamped"},
+        "magnetic": magnetic,
+    }
+    row = run(
+        Case.model_validate(
+            {**case, "points": {"tip": ["30 mm", 0, 0]}, "loading": {"kind": "field"}}
+        )
+    ).rows[-1]
     assert z > 0.2
     assert [row["tip_ux_mm"] / 30, row["tip_uz_mm"] / 30] == pytest.approx([x, z], abs=1e-4)
 
 
 @pytest.mark.slow
 def test_a_strip_that_saturates_stands_straight_again() -> None:
-    """Tips at 150 and 300 mT of SciPy's elastica, 1e-4; it buckles where (mu0 M)² B/b is (pi/2L)² mu0 D/h, 2e-5."""
+    """Tips at 150 and 300 mT of SciPy's elastica, 1e-4; it buckles where (mu0 M)² B/b is (pi/2L)²
+    mu0 D/h, 2e-5.
+    """
     chi, J, unit = 5.0, 0.1, np.sqrt(4e-7 * np.pi * 580e6)
     file = CASES / "saturated_strip.yaml"
-    rows = [row for row in run(Case.load(file, ["loading.points=8"])).rows if row["label"] == "target"]
+    rows = [
+        row for row in run(Case.load(file, ["loading.points=8"])).rows if row["label"] == "target"
+    ]
     for row, B in zip(rows[3::4], (0.15, 0.3), strict=True):
         x, z = saturated_tip(chi, J / unit, B / unit, 100, np.radians(0.5))
         assert row["applied_mT"] == pytest.approx(1e3 * B, rel=1e-9)
@@ -292,13 +361,21 @@ def test_a_strip_that_saturates_stands_straight_again() -> None:
 
     critical = [1e3 * float(brentq(left, *bounds)) for bounds in ((0.05, 0.1), (0.12, 0.3))]
     found = run(Case.load(file, ["magnetic.applied.polar=0", "loading.points=3"])).rows
-    assert [row["applied_mT"] for row in found if row["label"] == "bifurcation"] == pytest.approx(critical, rel=2e-5)
+    assert [row["applied_mT"] for row in found if row["label"] == "bifurcation"] == pytest.approx(
+        critical, rel=2e-5
+    )
 
 
 @pytest.mark.parametrize(("B", "error"), [(1e-3, 1e-4), (10.0, 1e-2)])
 def test_limits_of_saturation(B: float, error: float) -> None:
-    """A weak field has the linear law to O(B²); a strong one J, but for O(J/3 chi b), along the field b within."""
-    magnetic = {"susceptibility": 2, "saturation": "0.5 T", "applied": {"polar": 40, "flux_density": f"{B} T"}}
+    """A weak field has the linear law to O(B²); a strong one J, but for O(J/3 chi b), along the
+    field b within.
+    """
+    magnetic = {
+        "susceptibility": 2,
+        "saturation": "0.5 T",
+        "applied": {"polar": 40, "flux_density": f"{B} T"},
+    }
     found = made(PLATE, LEFT, magnetic, **SIZED)
     row = found.observe(State(found.model.zero(), {"lambda_m": found.problem.lambda_m}))
     s, c = np.sin(np.radians(40)), np.cos(np.radians(40))
@@ -310,20 +387,29 @@ def test_limits_of_saturation(B: float, error: float) -> None:
 
 @pytest.mark.parametrize(("chi", "R_over_h"), [(0.5, 50), (5.0, 200)])
 def test_a_sphere_in_a_uniform_field(chi: float, R_over_h: float) -> None:
-    """The moment of a spherical shell (Jackson, Classical Electrodynamics, equation 5.121), but for O(chi h/R)."""
+    """The moment of a spherical shell (Jackson, Classical Electrodynamics, equation 5.121), but for
+    O(chi h/R).
+    """
     shell = {"geometry": "hemisphere", "radius_to_thickness": R_over_h}
     magnetic = {"susceptibility": chi, "lambda_m": 1e-3, "applied": {"polar": 0}}
     found = made(shell, {"equator": "clamped"}, magnetic, symmetry="axisymmetric")
     row = found.observe(State(found.model.zero(), {"lambda_m": 1e-3}))
     mu, a, b = 1 + chi, 1 - 0.5 / R_over_h, 1 + 0.5 / R_over_h
-    alpha = (2 * mu + 1) * (mu - 1) / ((2 * mu + 1) * (mu + 2) - 2 * (a / b) ** 3 * (mu - 1) ** 2) * (b**3 - a**3)
+    alpha = (
+        (2 * mu + 1)
+        * (mu - 1)
+        / ((2 * mu + 1) * (mu + 2) - 2 * (a / b) ** 3 * (mu - 1) ** 2)
+        * (b**3 - a**3)
+    )
     exact = 3 * alpha / (b**3 - a**3) * 1e-3  # mu0 M, mean over the shell
     assert row["induced_z"] == pytest.approx(exact, rel=chi / R_over_h)
 
 
 @pytest.mark.slow
 def test_critical_field_as_a_solid() -> None:
-    """The body's strip of L/h = 20 buckles at the same field, but for what shear and thickness change: O((h/L)²)."""
+    """The body's strip of L/h = 20 buckles at the same field, but for what shear and thickness
+    change: O((h/L)²).
+    """
     case = {
         "model": "solid",
         "shell": {"geometry": "strip", "radius_to_thickness": 20, "width": 0.1, "poisson_ratio": 0},
@@ -332,19 +418,30 @@ def test_critical_field_as_a_solid() -> None:
         "loading": {"kind": "field", "until": "limit"},
     }
     found = run(Case.model_validate(case))
-    assert found.limit_points[0]["value"] == pytest.approx(np.pi / 2 / 20 * np.sqrt(3 / 48), rel=5e-3)
+    assert found.limit_points[0]["value"] == pytest.approx(
+        np.pi / 2 / 20 * np.sqrt(3 / 48), rel=5e-3
+    )
 
 
 @pytest.mark.slow
 def test_gradient_by_susceptibility() -> None:
-    """The critical field B_c ~ sqrt((1 + chi)/chi²): d ln B_c/d chi in closed form; tip by differences of two runs."""
+    """The critical field B_c ~ sqrt((1 + chi)/chi²): d ln B_c/d chi in closed form; tip by
+    differences of two runs.
+    """
     case = {
-        "shell": {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0},
+        "shell": {
+            "geometry": "strip",
+            "radius_to_thickness": 100,
+            "width": 0.1,
+            "poisson_ratio": 0,
+        },
         "boundary": {"root": "clamped"},
         "points": {"tip": [1, 0, 0]},
         "magnetic": {"susceptibility": 2.0, "lambda_m": 3e-3, "applied": {"polar": 20}},
         "loading": {"kind": "field", "points": 1},
-        "mesh": {"degree": 3},  # at degree 4 the tangent's rounding alone changes the gradient by 1e-6
+        "mesh": {
+            "degree": 3
+        },  # at degree 4 the tangent's rounding alone changes the gradient by 1e-6
         "gradients": {"of": ["tip_uz"], "by": ["magnetic.susceptibility", "lambda_m"]},
     }
 
@@ -376,10 +473,19 @@ def test_gradient_by_susceptibility() -> None:
         ({"susceptibility": 2, "lambda_m": 1e-3, "energy": "second"}, "susceptibility needs full"),
         ({"susceptibility": 2, "lambda_m": 1e-3, "applied": {"flux_density": "0.1 T"}}, "not both"),
         ({"susceptibility": 2, "applied": {"polar": 1}}, "give lambda_m, or applied.flux_density"),
-        ({"susceptibility": 2, "lambda_m": 1e-3, "remanence": "rotation"}, "which this shell has not"),
+        (
+            {"susceptibility": 2, "lambda_m": 1e-3, "remanence": "rotation"},
+            "which this shell has not",
+        ),
         ({"susceptibility": 2, "saturation": "0.5 T", "lambda_m": 1e-3}, "in a field in tesla"),
-        ({"saturation": "0.5 T", "remanent": {}, "lambda_m": 1e-3}, "of a shell with a susceptibility"),
-        ({"susceptibility": 2, "saturation": "-1 T", "applied": {"flux_density": "1 T"}}, "saturation"),
+        (
+            {"saturation": "0.5 T", "remanent": {}, "lambda_m": 1e-3},
+            "of a shell with a susceptibility",
+        ),
+        (
+            {"susceptibility": 2, "saturation": "-1 T", "applied": {"flux_density": "1 T"}},
+            "saturation",
+        ),
         ({"remanent": None, "lambda_m": 1e-3}, "shell with a susceptibility"),
         ({"susceptibility": {"dimple": 2}, "lambda_m": 1e-3}, "no dimple"),
         ({"susceptibility": "x - 0.5", "lambda_m": 1e-3}, "magnetic.susceptibility: 'x - 0.5': is"),

@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.touching.nearest import Cells, highest, places_near
 
 COUNT = 60
-ELEMENT = basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 3, basix.LagrangeVariant.gll_warped)
+ELEMENT = basix.create_element(
+    basix.ElementFamily.P, basix.CellType.triangle, 3, basix.LagrangeVariant.gll_warped
+)
 INSIDE = {"type": "ineq", "fun": lambda X: [1 - X[0] - X[1], X[0], X[1]]}
 
 
 @pytest.mark.parametrize("parts", [3, 4])
 def test_nearest_in_cells(parts: int) -> None:
-    """Against SciPy's sequential quadratic programming, of curved cells of a constant thickness or of one that varies.
+    """Against SciPy's sequential quadratic programming, of curved cells of a constant thickness or
+    of one that varies.
 
     Along the directions in which a place can move, the distance is stationary.
     """
@@ -24,7 +27,9 @@ def test_nearest_in_cells(parts: int) -> None:
     r = (flat + 0.01 * rng.normal(size=(COUNT, k, parts))).reshape(-1, parts)
     x = rng.uniform([-0.2, -0.2, -0.1, 0.0][:parts], [0.8, 0.8, 0.1, 0.1][:parts], (COUNT, parts))
     each = np.arange(COUNT)
-    cells = Cells(ELEMENT, np.arange(COUNT * k).reshape(COUNT, k), np.zeros((COUNT, 3), dtype=np.int64))
+    cells = Cells(
+        ELEMENT, np.arange(COUNT * k).reshape(COUNT, k), np.zeros((COUNT, 3), dtype=np.int64)
+    )
     pair, at = places_near(cells, r, x, (each, each, np.ones(COUNT, dtype=np.int64), each), np.inf)
     assert list(pair) == list(each)
     kinds = at.free.any(axis=1).sum(axis=1)
@@ -37,10 +42,14 @@ def test_nearest_in_cells(parts: int) -> None:
             return float(np.linalg.norm(x[n, :3] - y[:3]) + (x[n] - y)[3:].sum())
 
         assert at.distance[n] == pytest.approx(distance(at.X[n]), abs=1e-13)
-        best = scipy.optimize.minimize(distance, at.X[n], method="SLSQP", constraints=INSIDE, tol=1e-12)
+        best = scipy.optimize.minimize(
+            distance, at.X[n], method="SLSQP", constraints=INSIDE, tol=1e-12
+        )
         assert at.distance[n] < best.fun + 1e-9
         for way in at.free[n].T:
-            assert distance(at.X[n] + 1e-6 * way) == pytest.approx(distance(at.X[n] - 1e-6 * way), abs=1e-12)
+            assert distance(at.X[n] + 1e-6 * way) == pytest.approx(
+                distance(at.X[n] - 1e-6 * way), abs=1e-12
+            )
 
 
 def test_a_bound_of_polynomials() -> None:

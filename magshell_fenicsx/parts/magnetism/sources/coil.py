@@ -38,7 +38,9 @@ class CoilSection(SourceSection):
     def _one_shape(self) -> Self:
         if (self.diameter is None) == (self.vertices is None):
             raise ValueError("give diameter or vertices")
-        if self.vertices and any(a == b for a, b in zip(self.vertices, self.vertices[1:], strict=False)):
+        if self.vertices and any(
+            a == b for a, b in zip(self.vertices, self.vertices[1:], strict=False)
+        ):
             raise ValueError("vertices: two of them in a row are the same place")
         return self
 
@@ -47,7 +49,9 @@ class CoilSection(SourceSection):
         if self.vertices is not None:
             corners = np.array(self.vertices)
             wire = currents.Polyline(current=current, vertices=corners)
-            return FieldOfSource(Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], NOWHERE)
+            return FieldOfSource(
+                Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], NOWHERE
+            )
         assert self.diameter
         r = self.diameter / 2
         loop = currents.Circle(current=current, diameter=2 * r)

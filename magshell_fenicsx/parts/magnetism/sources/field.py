@@ -1,4 +1,6 @@
-"""The whole applied field where it is known by its values: formulas, sources, and what is uniform beside these."""
+"""The whole applied field where it is known by its values: formulas, sources, and what is uniform
+beside these.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -65,7 +67,9 @@ def placed(context: Context, turn: float = 0.0) -> list[PlacedSource]:
         key = f"magnetic.applied.sources.{i}"
         position = [x / R for x in section.position]
         own = section.field(key, R)
-        sources.append(PlacedSource(own, Q @ position, Q @ section.axes, R, section.strength / unit, key))
+        sources.append(
+            PlacedSource(own, Q @ position, Q @ section.axes, R, section.strength / unit, key)
+        )
     return sources
 
 
@@ -75,7 +79,9 @@ def _applied(context: Context) -> AppliedSection | None:
 
 
 def turns(context: Context, turn: float = 0.0) -> tuple[Motion, ...]:
-    """The rotations of all of the field about the origin, of a field that is known by values, or has a gradient."""
+    """The rotations of all of the field about the origin, of a field that is known by values, or
+    has a gradient.
+    """
     applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
         return ()
@@ -85,13 +91,16 @@ def turns(context: Context, turn: float = 0.0) -> tuple[Motion, ...]:
             after = step.load.to.vector(turn)
             axis = np.cross(before, after)
             angle = acos(float(before @ after))
-            rotations.append(Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero))
+            rotations.append(
+                Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero)
+            )
             before = after
     return tuple(rotations)
 
 
 def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
-    """The field that stays, None if it is built in, and the fields that steps drive, in a frame turned about e3 (rad).
+    """The field that stays, None if it is built in, and the fields that steps drive, in a frame
+    turned about e3 (rad).
 
     Raises
     ------
@@ -131,7 +140,9 @@ def _driven(
     rotations: Sequence[Motion],
     Q: Array,
 ) -> Driven:
-    """A source with the amplitudes of its steps; turns about its own position come before all other motions."""
+    """A source with the amplitudes of its steps; turns about its own position come before all other
+    motions.
+    """
     spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
     of_all = {motion.name: motion for motion in rotations}
     loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
@@ -150,13 +161,17 @@ def _driven(
             factors[name] = load.strength - 1
         else:
             end = np.array(load.move or load.to) / source.length
-            begin = moved(moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]).x[0]
+            begin = moved(
+                moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]
+            ).x[0]
             moves.append(Motion(name, Q @ end - (begin if load.to else zero), zero, zero))
     return Driven(source, [*spins, *moves], factors)
 
 
 def values(context: Context) -> list[Callable[[Array], Array]]:
-    """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them has changed."""
+    """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them
+    has changed.
+    """
     still, driven = in_space(context)
     if still is None:
         return []
@@ -165,6 +180,8 @@ def values(context: Context) -> list[Callable[[Array], Array]]:
     mus += [{**mus[0], name: mu} for name in names for mu in (HALFWAY, 1.0)]
 
     def at(mu: dict[str, float]) -> Callable[[Array], Array]:
-        return lambda x: np.asarray(still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3)))
+        return lambda x: np.asarray(
+            still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3))
+        )
 
     return [at(mu) for mu in mus]

@@ -25,11 +25,13 @@ _grids: dict[tuple[Path, str], tuple[list[Array], Array]] = {}  # a run plans it
 
 
 class GridSection(FileKeys, SourceSection):
-    """A measured or computed flux density on a rectilinear grid, between whose points a C² cubic spline runs.
+    """A measured or computed flux density on a rectilinear grid, between whose points a C² cubic
+    spline runs.
 
-    A table with the columns x, y, z, Bx, By, Bz in any order (.csv with a header, or arrays of these names in .npz),
-    each perhaps with a unit as in x [mm], Bx [mT], by default m and T; or a VTK file (.vtk, .vti, .vtr, .vts) with a
-    vector named B, in m and T. At least four places along each axis. Places are those of its own axes.
+    A table with the columns x, y, z, Bx, By, Bz in any order (.csv with a header, or arrays of
+    these names in .npz), each perhaps with a unit as in x [mm], Bx [mT], by default m and T; or a
+    VTK file (.vtk, .vti, .vtr, .vts) with a vector named B, in m and T. At least four places along
+    each axis. Places are those of its own axes.
     """
 
     kind: Literal["grid"]
@@ -80,7 +82,8 @@ def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
 
 
 def read(file: Path, digest: str | None, files: Files) -> tuple[list[Array], Array]:
-    """The places along each axis in m, and B (nx, ny, nz, 3) in T. A file is read again if its `digest` has changed.
+    """The places along each axis in m, and B (nx, ny, nz, 3) in T. A file is read again if its
+    `digest` has changed.
 
     Raises
     ------
@@ -100,7 +103,9 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
     axes = [_places(x[:, i]) for i in range(3)]
     shape = tuple(len(axis) for axis in axes)
     if min(shape) <= DEGREE:
-        raise TableError(f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis")
+        raise TableError(
+            f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis"
+        )
     values = np.full((len(x), 3), np.nan)
     if len(x) == prod(shape):  # scattered places have far more places along the axes than rows
         where = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
@@ -116,7 +121,9 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
 def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
     columns, units = read_table(file, files)
     if missing := [name for name in (*PLACES, *FIELD) if name not in columns]:
-        raise TableError(f"has no column {', '.join(missing)}; needed are {', '.join((*PLACES, *FIELD))}")
+        raise TableError(
+            f"has no column {', '.join(missing)}; needed are {', '.join((*PLACES, *FIELD))}"
+        )
     axes = [columns[name] for name in PLACES]
     on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
     if on_axes and columns["Bx"].size == prod(a.size for a in axes):  # the places along each axis

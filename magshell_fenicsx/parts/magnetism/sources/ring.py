@@ -38,13 +38,17 @@ class RingSection(MagnetSection):
         return self.inner_diameter / 2, self.diameter / 2
 
     def values(self, magnets: ModuleType) -> Values:
-        magnet = magnets.CylinderSegment(dimension=(*self.radii, self.height, 0, 360), polarization=self.vector)
+        magnet = magnets.CylinderSegment(
+            dimension=(*self.radii, self.height, 0, 360), polarization=self.vector
+        )
         return magnet.getB  # type: ignore[no-any-return]
 
     def distance(self, x: Array) -> Array:
         inner, outer = self.radii
         off_middle = np.abs(np.hypot(x[:, 0], x[:, 1]) - (inner + outer) / 2)
-        return to_box(np.column_stack([off_middle - (outer - inner) / 2, np.abs(x[:, 2]) - self.height / 2]))
+        return to_box(
+            np.column_stack([off_middle - (outer - inner) / 2, np.abs(x[:, 2]) - self.height / 2])
+        )
 
     def lines(self) -> list[Array]:
         return [line for radius in self.radii for line in upright(radius, self.height)]

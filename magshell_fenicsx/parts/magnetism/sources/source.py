@@ -1,4 +1,6 @@
-"""What all sources of the applied field have in common: their sections, and their fields at their places."""
+"""What all sources of the applied field have in common: their sections, and their fields at their
+places.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -24,7 +26,9 @@ Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e6)]
 Position = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 Polarization = (
     Annotated[FluxDensity, Field(ge=-1e3, le=1e3)]
-    | Annotated[list[Annotated[FluxDensity, Field(ge=-1e3, le=1e3)]], Field(min_length=3, max_length=3)]
+    | Annotated[
+        list[Annotated[FluxDensity, Field(ge=-1e3, le=1e3)]], Field(min_length=3, max_length=3)
+    ]
 )
 Current = Annotated[float, or_number("ampere"), Field(ge=-1e9, le=1e9)]
 SourceName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
@@ -38,7 +42,8 @@ class FieldOfSource:
     Attributes
     ----------
     values
-        Places (n, 3) in m -> B in T with its first and second derivatives; not finite where there is none.
+        Places (n, 3) in m -> B in T with its first and second derivatives; not finite where there
+        is none.
     lines
         Its outline: places (n, 3) along lines, in m.
     nowhere
@@ -72,11 +77,14 @@ class SourceSection(Section):
     def axes(self) -> Array:
         """Its own axes as columns (3, 3)."""
         (sp, cp), (sa, ca), (ss, cs) = (
-            (np.sin(t), np.cos(t)) for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
+            (np.sin(t), np.cos(t))
+            for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
         )
         about_z = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
         about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-        return np.asarray(about_z @ about_y @ np.array([[cs, -ss, 0.0], [ss, cs, 0.0], [0.0, 0.0, 1.0]]))
+        return np.asarray(
+            about_z @ about_y @ np.array([[cs, -ss, 0.0], [ss, cs, 0.0], [0.0, 0.0, 1.0]])
+        )
 
     def words(self) -> str:
         """Its words in the account of what is built."""
@@ -125,13 +133,19 @@ class MagnetSection(SourceSection):
 
     def field(self, key: str, R: float) -> FieldOfSource:
         values = Harmonic(self.values(magpylib(key).magnet), self.distance)
-        solid = self.solid().magnetised(self.strength * self.vector, self.name or f"{self.kind} magnet")
+        solid = self.solid().magnetised(
+            self.strength * self.vector, self.name or f"{self.kind} magnet"
+        )
         return FieldOfSource(values, self.lines(), "inside", solid)
 
 
 def to_box(beyond: Array) -> Array:
-    """The distance (n,) from how far places are beyond the faces in each direction (n, m); negative inside."""
-    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
+    """The distance (n,) from how far places are beyond the faces in each direction (n, m); negative
+    inside.
+    """
+    return np.asarray(
+        np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+    )
 
 
 @dataclass(frozen=True)
@@ -172,7 +186,9 @@ class PlacedSource:
         """From places (n, 3) to its body, over R, negative inside; infinite if it has none."""
         of = getattr(self.own.values, "distance", None)
         return (
-            np.full(len(x), np.inf) if of is None else of(self.length * (x - self.position) @ self.axes) / self.length
+            np.full(len(x), np.inf)
+            if of is None
+            else of(self.length * (x - self.position) @ self.axes) / self.length
         )
 
     @property
@@ -213,18 +229,20 @@ def magpylib(key: str) -> ModuleType:
 class Harmonic:
     """A field outside its sources with its derivatives, of its values alone.
 
-    There B has neither a divergence nor a curl, so around any place it is the gradient of a series of harmonic
-    polynomials. The values at the place itself, at six points on the axes and at eight on the diagonals of a cube, all
-    at the distance a, determine the first and second derivatives exactly if the series ends at degree 5. What is left
-    out is of order (a/d)^4, with the distance d from the nearest source; rounding is of order (d/a)^2. With
-    a = 0.005 d both are 1e-9 of the derivatives of a cylinder magnet, measured against 27 points at 0.03 d.
+    There B has neither a divergence nor a curl, so around any place it is the gradient of a series
+    of harmonic polynomials. The values at the place itself, at six points on the axes and at eight
+    on the diagonals of a cube, all at the distance a, determine the first and second derivatives
+    exactly if the series ends at degree 5. What is left out is of order (a/d)^4, with the distance
+    d from the nearest source; rounding is of order (d/a)^2. With a = 0.005 d both are 1e-9 of the
+    derivatives of a cylinder magnet, measured against 27 points at 0.03 d.
 
     Attributes
     ----------
     values
         Places (n, 3) -> B (n, 3).
     distance
-        Places (n, 3) -> distance (n,) from the nearest source, negative inside a magnet, where the field is nan.
+        Places (n, 3) -> distance (n,) from the nearest source, negative inside a magnet, where the
+        field is nan.
     """
 
     values: Values
@@ -248,11 +266,16 @@ class Harmonic:
 
 @cache
 def stencil() -> tuple[Array, Array, Array]:
-    """Points (m, 3) at the distance 0 or 1, and what makes derivatives of the values there: (3 m, 9) and (3 m, 27).
+    """Points (m, 3) at the distance 0 or 1, and what makes derivatives of the values there: (3 m,
+    9) and (3 m, 27).
 
-    The gradients of the powers (a . x)^l of null vectors a are those of all harmonic polynomials of degree l.
+    The gradients of the powers (a . x)^l of null vectors a are those of all harmonic polynomials of
+    degree l.
     """
-    axes, diagonals = np.vstack([np.eye(3), -np.eye(3)]), np.array([*product((-1.0, 1.0), repeat=3)]) / np.sqrt(3)
+    axes, diagonals = (
+        np.vstack([np.eye(3), -np.eye(3)]),
+        np.array([*product((-1.0, 1.0), repeat=3)]) / np.sqrt(3),
+    )
     points = np.vstack([np.zeros((1, 3)), axes, diagonals])
     values, first, second = list[Array](), list[Array](), list[Array]()
     for degree in range(1, DEGREE + 1):
@@ -266,5 +289,7 @@ def stencil() -> tuple[Array, Array, Array]:
                 first.append(part(by_x))
                 second.append(part(by_x_twice))
     inverse = np.linalg.pinv(np.array(values), rcond=1e-10)
-    first_weights, second_weights = (np.asarray(inverse @ np.array(rows), dtype=float) for rows in (first, second))
+    first_weights, second_weights = (
+        np.asarray(inverse @ np.array(rows), dtype=float) for rows in (first, second)
+    )
     return points, first_weights, second_weights
