@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx import Scene
-from magshell_fenicsx.assembly.coupled import times
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.system import Skewed, State
+from magshell_fenicsx.continuation.system import SkewedTangent, State
 from magshell_fenicsx.models.shell.energy import HessianTerm
 
 Direction = tuple[fem.Function, fem.Form]
 
 
-def csr(K: PETSc.Mat | Skewed) -> scipy.sparse.csr_array:
-    if isinstance(K, Skewed):
+def csr(K: PETSc.Mat | SkewedTangent) -> scipy.sparse.csr_array:
+    if isinstance(K, SkewedTangent):
         return csr(K.K) + csr(K.N)
     rows, columns, values = K.getValuesCSR()
     return scipy.sparse.csr_array((values, columns, rows), shape=K.size)
@@ -66,7 +66,7 @@ def along(
                 total += (mu[term.amplitude] if term.amplitude else 1.0) * part
         return total
 
-    return np.asarray(system._summed(system.at(State(u, dict(mu))).of(total), held=False))
+    return np.asarray(system._summed(system.at_state(State(u, dict(mu))).evaluate(total), constrained=False))
 
 
 def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:
@@ -76,8 +76,8 @@ def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, floa
     K, worst = csr(system.tangent(u, dict(mu))), 0.0
     for seed in range(3):
         v = np.random.default_rng(seed).standard_normal(system.size)
-        free = system.held(v)
-        expected = system.held(along(system, u, mu, free))
+        free = system.zero_at_supports(v)
+        expected = system.zero_at_supports(along(system, u, mu, free))
         error = K @ v - (expected + (v - free))
         worst = max(worst, float(np.abs(error).max() / np.abs(expected).max()))
     return worst
@@ -128,13 +128,13 @@ def check_derivatives(
     """
     system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
     rough, moved, other = (
-        system.held(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size])
+        system.zero_at_supports(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size])
         for k in range(3)
     )
-    u, v = system.held(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
-    at = system.at(State(u, mu))
-    entries = at.of(term.entries)
-    assert deep[0] < at.of(term.penetration) < deep[1]
+    u, v = system.zero_at_supports(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
+    at = system.at_state(State(u, mu))
+    entries = at.evaluate(term.entries)
+    assert deep[0] < at.evaluate(term.penetration) < deep[1]
     Kv = times([(1.0, entries)], v)
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()

@@ -1,6 +1,6 @@
 """Every case under noise: make noise ARGS="[--seeds 20] [--seconds 60] [CASE ...]"
 
-The noise (`assembly/evaluated.py`) stands for the rounding of another processor, at 1e-15, 1e-14
+The noise (`assembly/evaluation.py`) stands for the rounding of another processor, at 1e-15, 1e-14
 and 1e-13 in turn. A case should reach the same end through the same instabilities, with numbers
 within their estimated errors.
 """
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.assembly.evaluated import VARIABLE
+from magshell_fenicsx.assembly.evaluation import VARIABLE
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.continuation.snes import MOTION
+from magshell_fenicsx.continuation.snes import LENGTH_PER_DISPLACEMENT
 from magshell_fenicsx.continuation.system import max_abs
 
 LEVELS = 1e-15, 1e-14, 1e-13
@@ -81,7 +81,7 @@ def u_ratio(a: ms.Record, b: ms.Record, scene: ms.Scene) -> float:
     length = scene.model.system.length
     moved = max_abs(scene.comm, a.point.state.u - b.point.state.u) / length
     scale = max(
-        1.0, MOTION * max_abs(scene.comm, a.point.state.u) / length
+        1.0, LENGTH_PER_DISPLACEMENT * max_abs(scene.comm, a.point.state.u) / length
     )  # as points are accepted
     tolerance = scene.newton.options.tolerance * scale
     return moved / (a.point.error + b.point.error + tolerance)

@@ -1,4 +1,8 @@
-"""Steps in time up to a given time, of a fixed length or for a tolerance."""
+"""Time steps up to a given time, of a fixed length or adapted to a tolerance.
+
+`advance` repeats the steps of an `Integrator`, and shortens them where Newton's method fails, where
+the estimated error is too large, or where contact makes the balance of energy leak.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,15 +12,17 @@ import numpy as np
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.transient import Integrator
 
-ATONCE = 0.1  # part of what the balance may lack that one step may make
-SPENT = 0.3  # of its share: a step after one that leaks more is not longer
-SMALLEST = 1e-6  # of the first step
-FINEST = 1e-9  # tolerance of a step
+MAX_LEAK_OF_STEP = 0.1  # fraction of the allowed imbalance that one step may contribute
+# fraction of that: a step after one that leaks more does not grow
+MAX_LEAK_FOR_GROWTH = 0.3
+MIN_STEP_RATIO = 1e-6  # the smallest step over the first
+MIN_TOLERANCE = 1e-9  # of a step; below it estimated errors are those of the iterations
+END_TOLERANCE = 1e-9  # of an interval: what is left of it then is rounding
 
 
 @dataclass(frozen=True)
 class TimeSteps:
-    """How long steps are.
+    """Options of the step lengths.
 
     Attributes
     ----------
@@ -29,9 +35,9 @@ class TimeSteps:
     first
         First step without `fixed`.
     balance
-        Beside a body: what the balance of energy may lack, over its turnover.
+        In contact with a body: the allowed imbalance of energy, over its turnover.
     longest, fastest
-        The longest step for the tolerance up to a time, as a rule that at which a motion is
+        The longest step for the tolerance up to the time `fastest`, at which as a rule a motion is
         fastest.
     """
 
@@ -42,17 +48,17 @@ class TimeSteps:
     longest: float = np.inf
     fastest: float = -np.inf
 
-    def refined(self, part: float) -> "TimeSteps":
-        """Steps that are shorter by this factor; below `FINEST` estimated errors are of the
-        iterations.
-        """
+    def refined(self, factor: float) -> "TimeSteps":
+        """Return steps that are shorter by a factor; `MIN_TOLERANCE` bounds the tolerance."""
         return replace(
-            self, tolerance=max(part**3 * self.tolerance, FINEST), longest=part * self.longest
+            self,
+            tolerance=max(factor**3 * self.tolerance, MIN_TOLERANCE),
+            longest=factor * self.longest,
         )
 
-    def share(self, now: Motion) -> float:
-        """What the last step may have added to the imbalance."""
-        return ATONCE * self.balance * now.turnover
+    def allowed_leak(self, motion: Motion) -> float:
+        """Return what the last step may have added to the imbalance."""
+        return MAX_LEAK_OF_STEP * self.balance * motion.turnover
 
 
 class TimeStopped(RuntimeError):
@@ -65,19 +71,19 @@ class TimeStopped(RuntimeError):
 
 def advance(
     integrator: Integrator,
-    now: Motion,
+    motion: Motion,
     end: float,
     steps: TimeSteps,
     dt: float,
-    between: Callable[[], None] = lambda: None,
+    before_step: Callable[[], None] = lambda: None,
 ) -> tuple[Motion, float]:
-    """The motion at a later time, and the step to go on with.
+    """Return the motion at a later time, and the step to continue with. Collective.
 
     Parameters
     ----------
     dt
-        The step to begin with.
-    between
+        The first step.
+    before_step
         Called before every step; may raise an exception to stop.
 
     Raises
@@ -85,48 +91,49 @@ def advance(
     TimeStopped
         If even a tiny step fails.
     """
-    begin, failed, now = now.t, False, integrator.balanced(now) if np.isnan(now.imbalance) else now
-    while end - now.t > 1e-9 * (end - begin):
-        between()
-        way = end - now.t
-        dt = min(dt, steps.fixed or dt, steps.longest if now.t < steps.fastest else dt)
-        length = way / np.ceil(way / dt * (1 - 1e-9))
-        trial = integrator.step(now, length)
+    begin, failed = motion.t, False
+    if np.isnan(motion.imbalance):
+        motion = integrator.with_imbalance(motion)
+    smallest = MIN_STEP_RATIO * steps.first
+    while end - motion.t > END_TOLERANCE * (end - begin):
+        before_step()
+        remaining = end - motion.t
+        longest = steps.longest if motion.t < steps.fastest else dt
+        dt = min(dt, steps.fixed or dt, longest)
+        length = remaining / np.ceil(remaining / dt * (1 - 1e-9))
+        trial = integrator.step(motion, length)
         if isinstance(trial, str):
             dt, failed = length / 2, True
-            if dt < SMALLEST * steps.first:
-                raise TimeStopped(f"the time step has become too small: {trial}", now)
+            if dt < smallest:
+                raise TimeStopped(f"the time step has become too small: {trial}", motion)
             continue
         if steps.fixed is None:
             change = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
-            if trial.error > steps.tolerance and length > SMALLEST * steps.first:
+            if trial.error > steps.tolerance and length > smallest:
                 dt = max(0.3, change) * length
                 continue
-            leak = abs(trial.imbalance - now.imbalance) / steps.share(
-                trial
-            )  # nan where it is not checked
-            if leak > 1 and abs(trial.imbalance) > abs(now.imbalance):
-                if length <= SMALLEST * steps.first:
-                    raise TimeStopped(unbalanced(now, trial), now)
+            # nan where the balance is not checked
+            leak = abs(trial.imbalance - motion.imbalance) / steps.allowed_leak(trial)
+            if leak > 1 and abs(trial.imbalance) > abs(motion.imbalance):
+                if length <= smallest:
+                    raise TimeStopped(leak_message(motion, trial), motion)
                 dt = max(0.3, 0.8 / leak**0.5) * length
                 continue
-            change = min(change, 1.0) if leak > SPENT else change
-            dt = (
-                length * min(change, 2.0)
-                if change > 1.3
-                else max(length, dt if change > 1 else 0.0)
-            )
+            change = min(change, 1.0) if leak > MAX_LEAK_FOR_GROWTH else change
+            unchanged = max(length, dt if change > 1 else 0.0)
+            dt = length * min(change, 2.0) if change > 1.3 else unchanged
         elif not failed:
             dt = max(dt, 2 * length)
         failed = False
-        now = trial
-    return replace(now, t=end), dt
+        motion = trial
+    return replace(motion, t=end), dt
 
 
-def unbalanced(now: Motion, after: Motion) -> str:
-    """What the balance of energy lacks between two motions, in words."""
-    leak = after.imbalance - now.imbalance
+def leak_message(begin: Motion, end: Motion) -> str:
+    """Return a message on how much energy a step gains or loses."""
+    leak = end.imbalance - begin.imbalance
     return (
-        f"the balance of energy {'gains' if leak > 0 else 'loses'} {abs(leak) / after.turnover:.2g} of the energies in "
-        f"a step of {after.t - now.t:.2g}, whatever its length: give a body less stiffness, or a larger balance"
+        f"the balance of energy {'gains' if leak > 0 else 'loses'} "
+        f"{abs(leak) / end.turnover:.2g} of the energies in a step of {end.t - begin.t:.2g}, "
+        "whatever its length: give a body less stiffness, or a larger balance"
     )

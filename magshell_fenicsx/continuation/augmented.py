@@ -1,5 +1,4 @@
-"""The equations of a fold or a bifurcation with a second number p as unknown, and Newton's step for
-them.
+"""Equations of folds and bifurcations with a second parameter p, and Newton's step for them.
 
 A fold is R(u, mu, p) = 0 and g(u, mu, p) = 0, a bifurcation R + beta b = 0, g = 0 and v . R_mu = 0,
 with g and v of `fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. One more row says where on the
@@ -13,12 +12,12 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from magshell_fenicsx.continuation.bifurcation import DIFFERENCE as RELATIVE
-from magshell_fenicsx.continuation.bifurcation import mixed as mixed_third
+from magshell_fenicsx.continuation.bifurcation import DIFFERENCE_STEP as RELATIVE_DIFFERENCE_STEP
+from magshell_fenicsx.continuation.bifurcation import mixed_third_derivative
 from magshell_fenicsx.continuation.fold import (
     AugmentedTangent,
+    difference_step,
     first_difference,
-    offset,
     times_tangent,
 )
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -26,40 +25,47 @@ from magshell_fenicsx.continuation.system import State, System, Vector, dot, max
 
 Kind = Literal["fold", "bifurcation"]
 # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
-SYMMETRIC = 1e-4
-SOLVES = 25  # of the power iteration for a second eigenvalue near zero
+SYMMETRY_TOLERANCE = 1e-4
+POWER_ITERATIONS = 25  # for a second eigenvalue near zero
 
 
-class Family(Protocol):
-    """Systems that differ by a number p, with the same unknowns."""
+class SystemFamily(Protocol):
+    """Systems that differ by a parameter p, with the same unknowns."""
 
     @property
     def costly(self) -> bool:
-        """Whether a system of another p is made anew: points are then taken at given p where that
-        is possible.
+        """Whether a system at another p is made anew.
+
+        Points are then taken at given p where that is possible.
         """
 
-    def at(self, p: float) -> BorderedNewton:
-        """The solver of the system at p; it may raise `NoSystem`."""
+    def solver_at(self, p: float) -> BorderedNewton:
+        """Return the solver of the system at p; it may raise `NoSystem`."""
 
     def amplitudes(self, p: float) -> dict[str, float]:
-        """The amplitudes beside the one that is unknown."""
+        """Return the amplitudes that are given, all but the unknown one."""
 
-    def beside(self, p: float, *, rough: bool = False) -> Sequence[tuple[float, float]]:
-        """Weights and values of p of a difference: the derivative by p is the weighted sum of what
-        is there.
+    def difference_weights(
+        self, p: float, *, low_order: bool = False
+    ) -> Sequence[tuple[float, float]]:
+        """Return weights and values of p of a difference.
 
-        A rough one is of first order, from p itself and one more value.
+        The derivative by p is the weighted sum of what the systems at these values have.
+
+        Parameters
+        ----------
+        low_order
+            Whether the difference is of first order, from p itself and one more value.
         """
 
 
 class NoSystem(RuntimeError):
-    """There is no system at this value of p; the message gives the reason."""
+    """No system exists at this value of p; the message gives the reason."""
 
 
 @dataclass(frozen=True)
-class Way:
-    """A direction (du, dmu, dp)."""
+class CurveVector:
+    """A vector (du, dmu, dp): a direction, or a point (u, mu, p)."""
 
     du: Vector = field(repr=False)
     dmu: float
@@ -67,15 +73,15 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Locus:
+class BoundaryPoint:
     """A point of a boundary.
 
     Attributes
     ----------
     phi
-        Null vector of K, of length one, the same way along the whole boundary.
+        Null vector of K, of length one, with the same orientation along the whole boundary.
     unstable
-        Number of unstable directions besides `phi`.
+        Number of unstable directions other than `phi`.
     counts
         The same for each family: the model's own modes, then each family that it excludes, where
         these are counted.
@@ -88,7 +94,7 @@ class Locus:
     cubic, pull
         phi . Pi'''(phi, phi) and phi . R_mu.
     second
-        The eigenvalue nearest to zero besides that of `phi`, where it was asked for; else NaN.
+        The eigenvalue nearest to zero other than that of `phi`, if requested; else NaN.
     load_error
         Estimated error of the amplitude.
     """
@@ -97,7 +103,7 @@ class Locus:
     state: State
     phi: Vector = field(repr=False)
     unstable: int
-    way: Way
+    way: CurveVector
     cubic: float
     pull: float
     second: float
@@ -108,13 +114,21 @@ class Locus:
     habit: int = -1
 
     def unstable_of(self, family: int) -> int:
-        """The number of a family; those that are too short for the shell are not counted."""
+        """Return the count of a family; 0 if its modes are too short to be counted."""
         return self.counts[family] if family < len(self.counts) else 0
 
 
 @dataclass(frozen=True)
-class Row:
-    """g + c . (du, dmu, dp) = 0, the row that says where on the curve a point is."""
+class CurveRow:
+    """The scalar equation that says where on the curve a point is.
+
+    Attributes
+    ----------
+    du, dmu, dp
+        Its gradient; du is None where it is zero.
+    value
+        Its value at (u, mu, p).
+    """
 
     du: Vector | None
     dmu: float
@@ -122,9 +136,28 @@ class Row:
     value: Callable[[Vector, float, float], float]
 
 
-class Lines:
-    """The rows of Newton's step at a state, with what its columns take: du = alpha v - w_R - dmu
-    w_mu - dp w_p.
+class AugmentedRows:
+    """The rows of Newton's step at a state of a boundary.
+
+    The step is du = alpha v - w_R - dmu w_mu - dp w_p.
+
+    Parameters
+    ----------
+    tangent
+        The augmented tangent at the state.
+    difference
+        Weights and values of p of a difference by p.
+    scales
+        Changes of the amplitude and of p that count as of order one.
+
+    Attributes
+    ----------
+    v
+        The null vector.
+    unstable
+        Number of unstable directions other than v.
+    bend, pull
+        v . Pi'''(v, v) and v . R_mu.
     """
 
     def __init__(
@@ -134,70 +167,83 @@ class Lines:
         state: State,
         name: str,
         tangent: AugmentedTangent,
-        family: Family,
+        family: SystemFamily,
         p: float,
-        beside: Sequence[tuple[float, float]],
+        difference: Sequence[tuple[float, float]],
         scales: tuple[float, float],
     ) -> None:
-        self._kind, self._scales, self._largest = kind, scales, 0.0
+        self._kind, self._scales, self._mixed_size = kind, scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
-        own = {name: state.mu[name]}
-        self._others = [
-            (weight, family.at(q).system, {**family.amplitudes(q), **own}) for weight, q in beside
+        value = {name: state.mu[name]}
+        self._difference = [
+            (weight, family.solver_at(q).system, {**family.amplitudes(q), **value})
+            for weight, q in difference
         ]
         v, u, mu = tangent.v, state.u, state.mu
         self._R = system.residual(u, mu)
         self.w_R, self.t_R = tangent.solve(self._R)
         self.w_mu, self.t_mu = tangent.solve(system.load(u, mu, name))
-        d = offset(system, v)
-        ahead, back = (system.residual(u + way * d * v, mu) for way in (1, -1))
-        self.cubic = np.asarray((back - 2 * self._R + ahead) / d**2)
+        d = difference_step(system, v)
+        forward, backward = (system.residual(u + sign * d * v, mu) for sign in (1, -1))
+        self.cubic = np.asarray((backward - 2 * self._R + forward) / d**2)
         self.v, self.unstable = v, tangent.unstable
         self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
-        R_p, self.K_p_v = self._derivatives_by_p([p == q for _, q in beside], d, ahead, back)
+        R_p, self.K_p_v = self._derivatives_by_p(
+            [p == q for _, q in difference], d, forward, backward
+        )
         self.w_p, self.t_p = tangent.solve(R_p)
 
     def _derivatives_by_p(
-        self, itself: Sequence[bool], d: float, ahead: Vector, back: Vector
+        self, is_here: Sequence[bool], d: float, forward: Vector, backward: Vector
     ) -> tuple[Vector, Vector]:
-        """R_p and K_p v; at this p itself R is known, and ahead and back at u + d v and u - d v."""
+        """Return R_p and K_p v.
+
+        Parameters
+        ----------
+        is_here
+            Whether a value of p is that of the state: R is known there, ahead at u + d v and back
+            at u - d v.
+        """
         u, v, R_p, K_p_v = self._state.u, self._tangent.v, 0.0 * self._R, 0.0 * self._R
-        for same, (weight, other, mu) in zip(itself, self._others, strict=True):
-            R_p += weight * (self._R if same else other.residual(u, mu))
-            K_p_v += weight * (
-                (ahead - back) / (2 * d) if same else times_tangent(other, State(u, mu), v)
+        for is_same_p, (weight, system, mu) in zip(is_here, self._difference, strict=True):
+            R_p += weight * (self._R if is_same_p else system.residual(u, mu))
+            K_v = (
+                (forward - backward) / (2 * d)
+                if is_same_p
+                else times_tangent(system, State(u, mu), v)
             )
+            K_p_v += weight * K_v
         return R_p, K_p_v
 
-    def _by_p(self, of: Callable[[System, dict[str, float]], Vector]) -> Vector:
-        """The derivative by p at fixed u and amplitude."""
-        return np.asarray(
-            np.sum([weight * of(other, mu) for weight, other, mu in self._others], axis=0)
-        )
-
-    def balance(self, residual: Vector) -> None:
-        """Take the residual at a state close by, with the same factors."""
+    def set_residual(self, residual: Vector) -> None:
+        """Use the residual at a nearby state, with the same factors."""
         self.w_R, self.t_R = self._tangent.solve(residual)
 
     def eigenvalue(self, family: int, p: float, state: State) -> float:
-        """The eigenvalue nearest to zero across b, of the model's own modes, with the factors of
-        the last step.
+        """Return the model's eigenvalue nearest to zero in the space orthogonal to b.
+
+        It is computed with the factors of the last step, whatever the arguments.
         """
         return second_eigenvalue(self._tangent, self._system)
 
-    def step(self, row: Row, value: float | None, *, settled: bool = False) -> Way:
-        """Newton's step to the point on which a row has the value zero; without a value the tangent
-        of the curve.
+    def step(self, row: CurveRow, value: float | None, *, settled: bool = False) -> CurveVector:
+        """Return Newton's step to the point on which a row has the value zero.
 
-        `settled` takes only the residual and the row as not yet zero.
+        Parameters
+        ----------
+        value
+            The value of the row at the state; None for the tangent of the curve instead of a step.
+        settled
+            Whether only the residual and the row are not yet zero.
         """
-        kind, comm, v, t = self._kind, self._system.comm, self._tangent.v, self._tangent
-        w_R, t_R = (self.w_R, self.t_R) if value is not None else (0.0 * v, 0.0)
-        g, pull = (t.g, self.t_mu) if value is not None and not settled else (0.0, 0.0)
+        kind, comm, v, tangent = self._kind, self._system.comm, self._tangent.v, self._tangent
+        is_tangent = value is None
+        w_R, t_R = (0.0 * v, 0.0) if is_tangent else (self.w_R, self.t_R)
+        g, pull = (0.0, 0.0) if is_tangent or settled else (tangent.g, self.t_mu)
 
-        def along(c: Vector) -> list[float]:
-            """What c . du has of dmu, dp, alpha and of R."""
+        def coefficients(c: Vector) -> list[float]:
+            """Return the coefficients of dmu, dp and alpha in c . du, and its constant term."""
             return [
                 -dot(comm, c, self.w_mu),
                 -dot(comm, c, self.w_p),
@@ -205,48 +251,64 @@ class Lines:
                 -dot(comm, c, w_R),
             ]
 
-        on_v, on_mu = along(self.cubic), dot(comm, v, self.K_mu_v)
-        singular = [on_v[0] + on_mu, on_v[1] + dot(comm, v, self.K_p_v), on_v[2], on_v[3] - g]
-        own = (
-            [self.t_mu, self.t_p, -t.g, t_R] if kind == "fold" else self._without_work(along, pull)
-        )
-        c = along(row.du) if row.du is not None else [0.0] * 4
-        place = [c[0] + row.dmu, c[1] + row.dp, c[2], c[3] + value if value is not None else -1.0]
-        rows = np.array([singular, own, place])
+        cubic, K_mu_vv = coefficients(self.cubic), dot(comm, v, self.K_mu_v)
+        K_p_vv = dot(comm, v, self.K_p_v)
+        singular_row = [cubic[0] + K_mu_vv, cubic[1] + K_p_vv, cubic[2], cubic[3] - g]
+        if kind == "fold":
+            kind_row = [self.t_mu, self.t_p, -tangent.g, t_R]
+        else:
+            kind_row = self._row_without_work(coefficients, pull)
+        c = coefficients(row.du) if row.du is not None else [0.0] * 4
+        place_row = [
+            c[0] + row.dmu,
+            c[1] + row.dp,
+            c[2],
+            c[3] + value if value is not None else -1.0,
+        ]
+        rows = np.array([singular_row, kind_row, place_row])
         columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
         rows[:, :3] *= columns
         size = np.abs(rows[:, :3]).max(axis=1)
         if kind == "bifurcation":
-            size[1] = max(size[1], self._largest * columns[2])
+            size[1] = max(size[1], self._mixed_size * columns[2])
         rows /= np.where(size, size, 1.0)[:, None]
-        dmu, dp, alpha = (
-            columns
-            * np.linalg.lstsq(rows[:, :3], -rows[:, 3], SYMMETRIC if kind != "fold" else None)[0]
-        )
-        return Way(alpha * v - w_R - dmu * self.w_mu - dp * self.w_p, float(dmu), float(dp))
+        rank_tolerance = SYMMETRY_TOLERANCE if kind != "fold" else None
+        solution = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rank_tolerance)[0]
+        dmu, dp, alpha = columns * solution
+        du = alpha * v - w_R - dmu * self.w_mu - dp * self.w_p
+        return CurveVector(du, float(dmu), float(dp))
 
-    def _without_work(self, along: Callable[[Vector], list[float]], pull: float) -> list[float]:
-        """The row v . R_mu = 0, with v' = -K^-1 K' v."""
+    def _row_without_work(
+        self, coefficients: Callable[[Vector], list[float]], pull: float
+    ) -> list[float]:
+        """Return the row v . R_mu = 0, with v' = -K^-1 K' v."""
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
         v, w = self._tangent.v, self.w_mu
-        mixed = mixed_third(system, state, v, w, self._R) - self.K_mu_v
-        self._largest = dot(comm, np.abs(mixed), np.abs(v))
-        mu, d = state.mu[name], RELATIVE * (abs(state.mu[name]) or 1.0)
-        ahead, back = (
+        mixed = mixed_third_derivative(system, state, v, w, self._R) - self.K_mu_v
+        self._mixed_size = dot(comm, np.abs(mixed), np.abs(v))
+        mu, d = state.mu[name], RELATIVE_DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
+        forward, backward = (
             system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d)
         )
-        by_mu = dot(comm, v, np.asarray((ahead - back) / (2 * d))) - dot(comm, w, self.K_mu_v)
-        load_p = self._by_p(lambda other, amplitudes: other.load(state.u, amplitudes, name))
+        by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * d))) - dot(comm, w, self.K_mu_v)
+        loads = [
+            weight * other.load(state.u, amplitudes, name)
+            for weight, other, amplitudes in self._difference
+        ]
+        load_p = np.asarray(np.sum(loads, axis=0))
         by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)
-        c = along(mixed)
+        c = coefficients(mixed)
         return [by_mu - c[0], by_p - c[1], -c[2], pull - c[3]]
 
 
 def second_eigenvalue(tangent: AugmentedTangent, system: System) -> float:
-    """The eigenvalue of K nearest to zero across b, by a power iteration of the bordered inverse."""
+    """Return the eigenvalue of K nearest to zero in the space orthogonal to b. Collective.
+
+    A power iteration of the bordered inverse finds it.
+    """
     x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)
     value = np.nan
-    for _ in range(SOLVES):
+    for _ in range(POWER_ITERATIONS):
         y, _ = tangent.solve(x)
         value = dot(system.comm, x, x) / dot(system.comm, x, y)
         x = y / np.sqrt(dot(system.comm, y, y))

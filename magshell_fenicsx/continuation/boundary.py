@@ -1,10 +1,10 @@
-"""The boundary of stability: a fold or a bifurcation followed in a second number p, through turning
-points.
+"""Boundaries of stability: a fold or a bifurcation continued in a second parameter p.
 
-Both are curves in (u, mu, p), see `augmented` and, of modes that the model excludes, `excluded`.
-They are followed by arc length; cubics predict. Along folds v . (R_mu dmu + R_p dp) = 0. So where p
-turns, mu turns too and the curve goes along v alone, a cusp, at which v . Pi'''(v, v) is zero; or v
-. R_mu is zero: two folds meet at a bifurcation.
+Both are curves in (u, mu, p), see `augmented` and, for symmetry-breaking modes,
+`symmetry_breaking`. They are followed by arc length, through turning points of p; cubics predict.
+Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v
+alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a
+bifurcation.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,41 +14,54 @@ from typing import Literal, cast
 
 import numpy as np
 
-from magshell_fenicsx.continuation.augmented import Family, Kind, Lines, Locus, NoSystem, Row, Way
-from magshell_fenicsx.continuation.excluded import ExcludedLines, Excluding, nearest_eigenvalue
+from magshell_fenicsx.continuation.augmented import (
+    AugmentedRows,
+    BoundaryPoint,
+    CurveRow,
+    CurveVector,
+    Kind,
+    NoSystem,
+    SystemFamily,
+)
 from magshell_fenicsx.continuation.fold import AugmentedTangent
-from magshell_fenicsx.continuation.interpolated import hermite, interpolated, slope, stationary
+from magshell_fenicsx.continuation.interpolation import (
+    hermite,
+    interpolated,
+    slope_weights,
+    stationary,
+)
 from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.symmetry_breaking import (
+    SymmetryBreakingRows,
+    SymmetryBreakingSystems,
+    nearest_eigenvalue,
+)
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 
 Label = Literal["start", "point", "cusp", "turn", "meeting", "crossing", "end"]
-TOLERANCE = (
-    1e-6  # estimated remaining error of u, in lengths; along v it changes the load by its square
-)
+# estimated remaining error of u, in lengths; along v it changes the load by its square
+TOLERANCE = 1e-6
 LOAD_TOLERANCE = 1e-9  # the same of the load, over its scale
-MOST_ITERATIONS = 8
-LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
-EASY = 2  # iterations after which a step grows
-MOST_TURN, STRAIGHT = (
-    0.6,
-    0.95,
-)  # cosines of successive tangents: less is refused; with more, steps grow
-GAP = 0.5  # of a step: a larger correction of its prediction counts as a jump
-ALIKE = 0.5  # cosine of successive null vectors
-SMALLEST = 1e-4  # of the first step
-STEEP = 0.2  # part of p in the tangent from which costly systems are taken at a given p
-SPECIAL = 1e-10  # of the range of p: how closely p is stationary where it turns
-MOST_TRIALS, MOST_POINTS = 12, 400
-MOST_LOOKS, LOOKED, CLOSE = (
-    8,
-    4,
-    1e-3,
-)  # points near a meeting, those that are interpolated, and their distance
+MAX_ITERATIONS = 8
+MAX_STEP = 10.0  # in lengths; a longer one counts as divergence
+EASY_ITERATIONS = 2  # iterations after which a step grows
+# cosine of successive tangents: a smaller one is refused; with a larger one steps grow
+MIN_COSINE, GROWTH_COSINE = 0.6, 0.95
+MAX_CORRECTION = 0.5  # of a step: a larger correction of its prediction counts as a jump
+MIN_NULL_VECTOR_COSINE = 0.5  # of successive null vectors
+MIN_STEP_RATIO = 1e-4  # the smallest step over the first
+# part of p in the tangent from which points of costly systems are taken at a given p
+MIN_SLOPE_FOR_GIVEN_P = 0.2
+TURN_TOLERANCE = 1e-10  # of the range of p: how closely p is stationary where it turns
+MIN_BRACKET = 1e-9  # of a step: distance of a turn from the ends of its bracket
+MAX_TRIALS, MAX_POINTS = 12, 400
+END_BISECTIONS = 50  # for the place where a prediction leaves the range
+MAX_MEETING_POINTS = 8  # points that are solved near a meeting
+INTERPOLATED_POINTS = 4  # of these, that are interpolated
+MEETING_TOLERANCE = 1e-3  # of the step: distance of an interpolated meeting from a point
 ROUNDING = 1e-12  # relative, of an amplitude
-LAST, APART = (
-    3,
-    1e-3,
-)  # points whose systems give a slope by p, and their distance at least, over the range
+# points whose systems give a slope by p, and their least distance, over the range
+SLOPE_POINTS, MIN_SLOPE_DISTANCE = 3, 1e-3
 
 
 class BoundaryLost(RuntimeError):
@@ -56,75 +69,85 @@ class BoundaryLost(RuntimeError):
 
 
 class Boundary:
-    """A boundary in the plane of an amplitude and of p.
+    """A boundary of stability in the plane of an amplitude and of p.
 
     Parameters
     ----------
     name
         The amplitude that is unknown.
     scales
-        Of the amplitude and of p: changes that count as of order one in the arc length.
+        Changes of the amplitude and of p that count as of order one in the arc length.
     recorded
         Gets each solve, and gives its result or that of an interrupted boundary at this place.
     m
-        The family of modes that the model excludes in which the bifurcation is; 0: it is one of the
-        model itself.
+        The family of symmetry-breaking modes in which the bifurcation is; 0: it is one of the model
+        itself.
     watched
-        Whether the modes that the model excludes are counted along its own.
+        Whether symmetry-breaking modes are counted along a boundary of the model itself.
     """
 
     def __init__(
         self,
-        family: Family | Excluding,
+        family: SystemFamily | SymmetryBreakingSystems,
         name: str,
         kind: Kind,
         scales: tuple[float, float],
-        recorded: "Callable[[Callable[[], Locus | str]], Locus | str]" = lambda solve: solve(),
+        recorded: "Callable[[Callable[[], BoundaryPoint | str]], BoundaryPoint | str]" = (
+            lambda solve: solve()
+        ),
         m: int = 0,
         watched: bool = False,
     ) -> None:
         self.family, self.name, self.kind, self.scales, self.m = family, name, kind, scales, m
-        self._watched = watched or m > 0
+        self._counts_families = watched or m > 0
         self._recorded = recorded
-        self._weight = 0.0
-        self._solved_at = list[float]()
+        self._weight = 0.0  # of du . du in the metric
+        self._solved_at = list[float]()  # values of p
 
-    def inner(self, a: Way, b: Way) -> float:
-        """<a, b>: root mean square of u over the length, and the numbers over their scales."""
+    def inner(self, a: CurveVector, b: CurveVector) -> float:
+        """Return <a, b>: root mean square of u over the length, mu and p over their scales."""
         mu, p = self.scales
-        return (
-            self._weight * dot(self._comm, a.du, b.du) + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
-        )
+        displacement = self._weight * dot(self._comm, a.du, b.du)
+        return displacement + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
 
-    def start(self, p: float, state: State, phi: Vector) -> Locus:
-        """The point at p near an instability that a path has located.
+    def start(self, p: float, state: State, phi: Vector) -> BoundaryPoint:
+        """Return the point at p near an instability that a path has located. Collective.
+
+        Parameters
+        ----------
+        phi
+            A vector near the null vector.
 
         Raises
         ------
         BoundaryLost
             If none is found.
         """
-        system = self.family.at(p).system
+        solver = self.family.solver_at(p)
+        system = solver.system
         self._comm, self._length = system.comm, system.length
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
-        if self.family.at(p).factor_at(state).skewed:
+        if solver.factor_at(state).skewed:
             raise BoundaryLost(
-                "a load without potential: its tangent is not symmetric, and no boundary is followed"
+                "a load without potential: its tangent is not symmetric, "
+                "and no boundary is followed"
             )
-        again = self._solved(p, state, phi, _at(p), None)
-        if isinstance(again, str):
-            raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {again}")
-        return replace(again, p=p)
+        point = self._solve(p, state, phi, _row_at(p), None)
+        if isinstance(point, str):
+            raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {point}")
+        return replace(point, p=p)
 
-    def followed(
-        self, start: Locus, sense: float, ends: tuple[float, float], steps: int
-    ) -> Iterator[tuple[Label, Locus]]:
-        """Points from a start until p leaves its range.
+    def follow(
+        self, start: BoundaryPoint, sense: float, ends: tuple[float, float], steps: int
+    ) -> Iterator[tuple[Label, BoundaryPoint]]:
+        """Yield labels and points from a start until p leaves its range.
 
         Parameters
         ----------
         sense
             Sign of dp at the start.
+        ends
+            The range of p.
         steps
             No step changes p by more than its scale over this number.
 
@@ -133,434 +156,535 @@ class Boundary:
         BoundaryLost
             If the smallest step fails.
         """
-        here = start if start.way.dp * sense >= 0 else _turned(start)
-        before: tuple[Locus, float] | None = None  # the point before, and the step from it
-        most = self.scales[1] / steps
-        length = first = min(most / max(abs(here.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5)
-        for _ in range(MOST_POINTS):
-            guess = self._ahead(before, here, length)
+        current = start if start.way.dp * sense >= 0 else _reversed(start)
+        previous: tuple[BoundaryPoint, float] | None = None  # the previous point, and its step
+        max_dp = self.scales[1] / steps
+        first = min(max_dp / max(abs(current.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5)
+        length = first
+        for _ in range(MAX_POINTS):
+            guess = self._predict(previous, current, length)
             if not ends[0] < guess.dp < ends[1]:
-                last = self._last(before, here, length, ends)
-                if last:
-                    yield from self._between(here, *last)
-                    yield "end", last[0]
+                end = self._point_at_end(previous, current, length, ends)
+                if end:
+                    yield from self._events_between(current, *end)
+                    yield "end", end[0]
                     return
-            tried: Locus | str = "the end of the range is not reached at once"
+            point: BoundaryPoint | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
-                tried = self._onward(here, guess, length)
-            if isinstance(tried, str):
+                point = self._correct(current, guess, length)
+            if isinstance(point, str):
                 length /= 2
-                if length < SMALLEST * first:
+                if length < MIN_STEP_RATIO * first:
                     raise BoundaryLost(
-                        f"at {here.p:.6g}, load {here.state.mu[self.name]:.6g}: {tried}"
+                        f"at {current.p:.6g}, load {current.state.mu[self.name]:.6g}: {point}"
                     )
                 continue
-            step = self._distance(here, tried, length)
-            yield from self._between(here, tried, step)
-            if not ends[0] < tried.p < ends[1]:  # the prediction had not shown it
+            step = self._distance(current, point, length)
+            yield from self._events_between(current, point, step)
+            if not ends[0] < point.p < ends[1]:  # the prediction had not shown it
                 length /= 2
                 continue
-            yield "point", tried
-            straight = self.inner(here.way, tried.way) > STRAIGHT
-            before, here = (here, step), tried
-            if tried.factorisations <= EASY and straight:
+            yield "point", point
+            straight = self.inner(current.way, point.way) > GROWTH_COSINE
+            previous, current = (current, step), point
+            if point.factorisations <= EASY_ITERATIONS and straight:
                 length = 1.5 * length
-            elif tried.factorisations > 2 * EASY:
+            elif point.factorisations > 2 * EASY_ITERATIONS:
                 length = 0.7 * length
-            length = min(length, 1.2 * most / max(abs(here.way.dp), 1e-300), 3 * first, 2 * step)
-        raise BoundaryLost(f"{MOST_POINTS} points have not reached the end of the range")
+            length = min(
+                length, 1.2 * max_dp / max(abs(current.way.dp), 1e-300), 3 * first, 2 * step
+            )
+        raise BoundaryLost(f"{MAX_POINTS} points have not reached the end of the range")
 
-    def _between(self, low: Locus, high: Locus, length: float) -> Iterator[tuple[Label, Locus]]:
-        """What is special between two successive points."""
+    def _events_between(
+        self, low: BoundaryPoint, high: BoundaryPoint, length: float
+    ) -> Iterator[tuple[Label, BoundaryPoint]]:
+        """Yield cusps, turns, meetings and crossings between two successive points."""
         if low.way.dp * high.way.dp < 0:
-            turn = self._stationary(low, high, length)
+            turn = self._locate_turn(low, high, length)
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
             yield "cusp" if is_cusp else "turn", turn
-        if not self._watched:
-            if low.unstable != high.unstable and (
-                met := self._meeting(low, high, length, lambda one: one.unstable)
-            ):
-                yield "meeting", met
+        if not self._counts_families:
+            if low.unstable != high.unstable:
+                point = self._locate_meeting(low, high, length, lambda point: point.unstable)
+                if point:
+                    yield "meeting", point
             return
         families = range(max(len(low.counts), len(high.counts)))
         changed = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
-        met_by = {
-            i: self._meeting(low, high, length, partial(Locus.unstable_of, family=i), i)
+        meetings = {
+            i: self._locate_meeting(
+                low, high, length, partial(BoundaryPoint.unstable_of, family=i), i
+            )
             for i in changed
         }
+
+        def distance(item: tuple[int, BoundaryPoint | None]) -> float:
+            return abs(item[1].p - low.p) if item[1] else 0.0
+
         counts = [low.unstable_of(i) for i in families]
-        for i, met in sorted(
-            met_by.items(), key=lambda each: abs(each[1].p - low.p) if each[1] else 0.0
-        ):
-            if met is None:
+        for i, point in sorted(meetings.items(), key=distance):
+            if point is None:
                 continue
             if i == self.m == 0:
-                yield "meeting", replace(met, met=i)
-            else:  # its own counts are those of a point close by, which may be beyond other crossings
-                yield "crossing", replace(met, met=i, counts=tuple(counts), unstable=sum(counts))
+                yield "meeting", replace(point, met=i)
+            else:
+                # its own counts are those of a nearby point, which may be beyond other crossings
+                unstable = sum(counts)
+                yield "crossing", replace(point, met=i, counts=tuple(counts), unstable=unstable)
             counts[i] = high.unstable_of(i)
 
-    def _ahead(self, before: tuple[Locus, float] | None, here: Locus, length: float) -> Way:
-        """The point after a step: by the cubic through the last two points and their tangents."""
-        if before is None:
-            return self._plus(here, length, here.way)
-        low, step = before
-        return self._hermite(low, here, step, 1 + length * self.inner(low.way, here.way) / step)
+    def _predict(
+        self, previous: tuple[BoundaryPoint, float] | None, current: BoundaryPoint, length: float
+    ) -> CurveVector:
+        """Predict the point after a step by the cubic through the last two points and tangents."""
+        if previous is None:
+            mu, tangent = current.state.mu[self.name], current.way
+            return CurveVector(
+                current.state.u + length * tangent.du,
+                mu + length * tangent.dmu,
+                current.p + length * tangent.dp,
+            )
+        low, step = previous
+        t = 1 + length * self.inner(low.way, current.way) / step
+        return self._hermite(low, current, step, t)
 
-    def _plus(self, here: Locus, t: float, way: Way) -> Way:
-        mu = here.state.mu[self.name]
-        return Way(here.state.u + t * way.du, mu + t * way.dmu, here.p + t * way.dp)
-
-    def _hermite(self, low: Locus, high: Locus, step: float, t: float) -> Way:
-        """The cubic at t in units of the step, which is measured along the tangent at the low end."""
+    def _hermite(
+        self, low: BoundaryPoint, high: BoundaryPoint, step: float, t: float
+    ) -> CurveVector:
+        """Return the cubic at t in units of the step, which is measured along the low tangent."""
         faster = 1 / self.inner(low.way, high.way)
         (h00, h10), (h01, h11) = hermite(t, (0.0, 1.0))
         a, b, name = step * h10, step * faster * h11, self.name
 
-        def at(x0: float, d0: float, x1: float, d1: float) -> float:
+        def cubic(x0: float, d0: float, x1: float, d1: float) -> float:
             return h00 * x0 + a * d0 + h01 * x1 + b * d1
 
-        return Way(
+        return CurveVector(
             h00 * low.state.u + a * low.way.du + h01 * high.state.u + b * high.way.du,
-            at(low.state.mu[name], low.way.dmu, high.state.mu[name], high.way.dmu),
-            at(low.p, low.way.dp, high.p, high.way.dp),
+            cubic(low.state.mu[name], low.way.dmu, high.state.mu[name], high.way.dmu),
+            cubic(low.p, low.way.dp, high.p, high.way.dp),
         )
 
-    def _onward(self, here: Locus, guess: Way, length: float) -> Locus | str:
-        """The next point: where it is predicted in p if systems are costly, else at a distance."""
-        if not self._at_given_p(here):
-            return self._at_distance(here, guess, length)
-        row = _at(guess.dp)
-        return self._tried(here, guess, length, row, rough=True)
+    def _correct(
+        self, current: BoundaryPoint, guess: CurveVector, length: float
+    ) -> BoundaryPoint | str:
+        """Return the next point: at the predicted p if systems are costly, else at a distance."""
+        if not self._is_taken_at_given_p(current):
+            return self._correct_at_distance(current, guess, length)
+        return self._correct_on_row(current, guess, length, _row_at(guess.dp), low_order=True)
 
-    def _at_given_p(self, here: Locus) -> bool:
-        return self.family.costly and abs(here.way.dp) / self.scales[1] > STEEP
+    def _is_taken_at_given_p(self, current: BoundaryPoint) -> bool:
+        """Return whether the next point is solved at a given p."""
+        slope = abs(current.way.dp) / self.scales[1]
+        return self.family.costly and slope > MIN_SLOPE_FOR_GIVEN_P
 
-    def _distance(self, here: Locus, there: Locus, length: float) -> float:
-        """Along the tangent of the first point; the length of the step where it was taken at that."""
-        if not self._at_given_p(here):
+    def _distance(self, current: BoundaryPoint, next_point: BoundaryPoint, length: float) -> float:
+        """Return the distance along the tangent of the first point.
+
+        Where the second was solved at a distance, it is that `length`.
+        """
+        if not self._is_taken_at_given_p(current):
             return length
         name = self.name
-        off = Way(
-            there.state.u - here.state.u,
-            there.state.mu[name] - here.state.mu[name],
-            there.p - here.p,
+        chord = CurveVector(
+            next_point.state.u - current.state.u,
+            next_point.state.mu[name] - current.state.mu[name],
+            next_point.p - current.p,
         )
-        return self.inner(here.way, off)
+        return self.inner(current.way, chord)
 
-    def _at_distance(
-        self, base: Locus, guess: Way, length: float, *, look: int | None = None
-    ) -> Locus | str:
-        """The point at a distance along the tangent of another one."""
-        way, (mu, p), name = base.way, self.scales, self.name
+    def _correct_at_distance(
+        self,
+        base: BoundaryPoint,
+        guess: CurveVector,
+        length: float,
+        *,
+        eigenvalue_family: int | None = None,
+    ) -> BoundaryPoint | str:
+        """Return the point at a distance along the tangent of another one, or why there is none."""
+        tangent, (mu, p), name = base.way, self.scales, self.name
 
         def value(u: Vector, m: float, q: float) -> float:
-            return (
-                self.inner(way, Way(u - base.state.u, m - base.state.mu[name], q - base.p)) - length
-            )
+            chord = CurveVector(u - base.state.u, m - base.state.mu[name], q - base.p)
+            return self.inner(tangent, chord) - length
 
-        row = Row(self._weight * way.du, way.dmu / mu**2, way.dp / p**2, value)
-        return self._tried(base, guess, length, row, look=look)
+        row = CurveRow(self._weight * tangent.du, tangent.dmu / mu**2, tangent.dp / p**2, value)
+        return self._correct_on_row(base, guess, length, row, eigenvalue_family=eigenvalue_family)
 
-    def _looked_at(self, base: Locus, guess: Way, s: float, family: int) -> Locus | str:
-        """A point with the eigenvalue of a family; where families do not couple, at a given p if
-        that is cheaper.
+    def _correct_with_eigenvalue(
+        self, base: BoundaryPoint, guess: CurveVector, s: float, family: int
+    ) -> BoundaryPoint | str:
+        """Return a point with the second eigenvalue of a family, or why there is none.
+
+        Where families do not couple it is at a given p if that is cheaper.
         """
-        if not (self.m and self._at_given_p(base)):
-            return self._at_distance(base, guess, s, look=family)
-        return self._tried(base, guess, s, _at(guess.dp), look=family, rough=True)
+        if not (self.m and self._is_taken_at_given_p(base)):
+            return self._correct_at_distance(base, guess, s, eigenvalue_family=family)
+        return self._correct_on_row(
+            base, guess, s, _row_at(guess.dp), eigenvalue_family=family, low_order=True
+        )
 
-    def _tried(
+    def _correct_on_row(
         self,
-        base: Locus,
-        guess: Way,
+        base: BoundaryPoint,
+        guess: CurveVector,
         length: float,
-        row: Row,
+        row: CurveRow,
         *,
-        look: int | None = None,
-        rough: bool = False,
-    ) -> Locus | str:
+        eigenvalue_family: int | None = None,
+        low_order: bool = False,
+    ) -> BoundaryPoint | str:
+        """Return the point near a guess on which a row holds, or why it is not accepted."""
         name = self.name
-        point = self._solved(
+        point = self._solve(
             guess.dp,
             State(guess.du, {name: guess.dmu}),
             base.phi,
             row,
             base,
-            look=look,
-            rough=rough,
+            eigenvalue_family=eigenvalue_family,
+            low_order=low_order,
         )
         if isinstance(point, str):
             return point
-        off = Way(point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp)
-        if np.sqrt(self.inner(off, off)) > GAP * abs(length):
+        correction = CurveVector(
+            point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp
+        )
+        if np.sqrt(self.inner(correction, correction)) > MAX_CORRECTION * abs(length):
             return "a step ends far from its prediction"
-        if self.inner(base.way, point.way) < MOST_TURN:
+        if self.inner(base.way, point.way) < MIN_COSINE:
             return "the boundary turns too sharply"
         return point
 
-    def _last(
+    def _point_at_end(
         self,
-        before: tuple[Locus, float] | None,
-        here: Locus,
+        previous: tuple[BoundaryPoint, float] | None,
+        current: BoundaryPoint,
         length: float,
         ends: tuple[float, float],
-    ) -> tuple[Locus, float] | None:
-        """The point at the end of the range, and its distance; None if the boundary does not go
-        there at once.
+    ) -> tuple[BoundaryPoint, float] | None:
+        """Return the point at the end of the range, and its distance.
+
+        None if the boundary does not go there at once.
         """
         low, high = 0.0, length
-        for _ in range(50):  # where the prediction leaves the range
+        for _ in range(END_BISECTIONS):  # where the prediction leaves the range
             middle = (low + high) / 2
-            inside = ends[0] < self._ahead(before, here, middle).dp < ends[1]
-            low, high = (middle, high) if inside else (low, middle)
-        guess = self._ahead(before, here, high)
+            is_inside = ends[0] < self._predict(previous, current, middle).dp < ends[1]
+            low, high = (middle, high) if is_inside else (low, middle)
+        guess = self._predict(previous, current, high)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
-        row = _at(end)
-        guessed, rough = State(guess.du, {self.name: guess.dmu}), self._at_given_p(here)
-        last = self._solved(end, guessed, here.phi, row, here, rough=rough)
-        if (
-            isinstance(last, str)
-            or last.way.dp * here.way.dp < 0
-            or self.inner(last.way, here.way) < MOST_TURN
-        ):
+        point = self._solve(
+            end,
+            State(guess.du, {self.name: guess.dmu}),
+            current.phi,
+            _row_at(end),
+            current,
+            low_order=self._is_taken_at_given_p(current),
+        )
+        if isinstance(point, str) or point.way.dp * current.way.dp < 0:
             return None
-        off = Way(last.state.u - guess.du, last.state.mu[self.name] - guess.dmu, 0.0)
-        return None if np.sqrt(self.inner(off, off)) > GAP * high else (replace(last, p=end), high)
+        if self.inner(point.way, current.way) < MIN_COSINE:
+            return None
+        correction = CurveVector(
+            point.state.u - guess.du, point.state.mu[self.name] - guess.dmu, 0.0
+        )
+        if np.sqrt(self.inner(correction, correction)) > MAX_CORRECTION * high:
+            return None
+        return replace(point, p=end), high
 
-    def _stationary(self, low: Locus, high: Locus, length: float) -> Locus:
-        """Where p turns between two points: the stationary point of the cubic through both,
-        repeated.
+    def _locate_turn(self, low: BoundaryPoint, high: BoundaryPoint, length: float) -> BoundaryPoint:
+        """Return the point between two others where p turns.
+
+        It is the stationary point of the cubic through both, repeated.
         """
         base, a, b = low, 0.0, length  # distances along the tangent of the base
-        best = min(low, high, key=lambda one: abs(one.way.dp))
-        for _ in range(MOST_TRIALS):
-            s = _zero_of_slope(a, low, b, high, base, self)
+        best = min(low, high, key=lambda point: abs(point.way.dp))
+        for _ in range(MAX_TRIALS):
+            d0, d1 = (point.way.dp / self.inner(base.way, point.way) for point in (low, high))
+            s = a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)
             guess = self._hermite(
                 low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a)
             )
-            middle = self._at_distance(base, guess, s)
+            middle = self._correct_at_distance(base, guess, s)
             if isinstance(middle, str):  # rounding: the cubic is as good
                 state = best.state.with_(guess.du, self.name, float(guess.dmu))
                 return replace(best, p=float(guess.dp), state=state)
             best = middle if abs(middle.way.dp) < abs(best.way.dp) else best
-            other, gap = (high, b - s) if middle.way.dp * low.way.dp > 0 else (low, s - a)
+            is_before = middle.way.dp * low.way.dp > 0
+            other, gap = (high, b - s) if is_before else (low, s - a)
             curvature = abs(other.way.dp - middle.way.dp) / gap
-            rest = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
-            if rest <= SPECIAL * self.scales[1] or min(s - a, b - s) < 1e-9 * length:
+            error = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
+            if error <= TURN_TOLERANCE * self.scales[1] or min(s - a, b - s) < MIN_BRACKET * length:
                 break
-            low, high, a, b = (
-                (middle, high, s, b) if middle.way.dp * low.way.dp > 0 else (low, middle, a, s)
-            )
+            low, high, a, b = (middle, high, s, b) if is_before else (low, middle, a, s)
         return best
 
-    def _meeting(
-        self, low: Locus, high: Locus, length: float, count: Callable[[Locus], int], family: int = 0
-    ) -> Locus | None:
-        """Where a second eigenvalue, of a family, is zero between two points, by inverse
-        interpolation.
+    def _locate_meeting(
+        self,
+        low: BoundaryPoint,
+        high: BoundaryPoint,
+        length: float,
+        count: Callable[[BoundaryPoint], int],
+        family: int = 0,
+    ) -> BoundaryPoint | None:
+        """Locate the point between two others where a second eigenvalue of a family is zero.
 
-        The bordered tangent may be singular there, so the point itself is interpolated between
-        others close by; where families do not couple it is not, and these may be closer.
+        Inverse interpolation finds it. The bordered tangent may be singular there, so the point
+        itself is interpolated between others close by; where families do not couple it is not, and
+        these may be closer.
+
+        Parameters
+        ----------
+        count
+            Number of unstable directions of the family at a point.
+
+        Returns
+        -------
+        None if no point is found between the two.
         """
-        close = CLOSE if family in (0, self.m) else CLOSE**2
-        looked_at, a, b = list[tuple[float, float, Locus]](), 0.0, length
+        coupled = family in (0, self.m)
+        tolerance = MEETING_TOLERANCE if coupled else MEETING_TOLERANCE**2
+        # places, second eigenvalues and points, those with the smallest eigenvalues first
+        solved, a, b = list[tuple[float, float, BoundaryPoint]](), 0.0, length
         s = length / 2
-        for _ in range(MOST_LOOKS):
+        for _ in range(MAX_MEETING_POINTS):
             guess = self._hermite(low, high, length, s / length)
-            tried = self._looked_at(low, guess, s, family)
-            if isinstance(tried, str) or any(
-                s == place or tried.second == second for place, second, _ in looked_at
-            ):
+            point = self._correct_with_eigenvalue(low, guess, s, family)
+            if isinstance(point, str):
                 break
-            looked_at = sorted(
-                [*looked_at, (s, tried.second, tried)], key=lambda each: abs(each[1])
-            )[:LOOKED]
-            a, b = (s, b) if count(tried) == count(low) else (a, s)
+            if any(s == place or point.second == second for place, second, _ in solved):
+                break
+            solved = sorted([*solved, (s, point.second, point)], key=lambda entry: abs(entry[1]))
+            solved = solved[:INTERPOLATED_POINTS]
+            a, b = (s, b) if count(point) == count(low) else (a, s)
             s = (a + b) / 2
-            if len(looked_at) > 1:
-                ahead = interpolated(
-                    [each[1] for each in looked_at], [each[0] for each in looked_at], 0.0
-                )
-                nearest_place = looked_at[0][0]
-                by_rounding = not a < ahead < b and abs(ahead - nearest_place) < CLOSE * length
-                if by_rounding or abs(ahead - nearest_place) < close * length:
-                    s = ahead
+            if len(solved) > 1:
+                places, seconds = [entry[0] for entry in solved], [entry[1] for entry in solved]
+                zero = interpolated(seconds, places, 0.0)
+                distance = abs(zero - solved[0][0])
+                outside_by_rounding = not a < zero < b and distance < MEETING_TOLERANCE * length
+                if outside_by_rounding or distance < tolerance * length:
+                    s = zero
                     break
-                s = ahead if a < ahead < b else s
-        if len(looked_at) < 2:
-            return looked_at[0][2] if looked_at else None
-        places, mu = [each[0] for each in looked_at], self.name
-        nearest, loads = looked_at[0][2], [each[2].state.mu[mu] for each in looked_at]
-        p, load = (
-            interpolated(places, [each[2].p for each in looked_at], s),
-            interpolated(places, loads, s),
-        )
-        error = abs(load - interpolated(places[:-1], loads[:-1], s)) + nearest.load_error
+                s = zero if a < zero < b else s
+        if len(solved) < 2:
+            return solved[0][2] if solved else None
+        return self._interpolated_point(solved, s)
+
+    def _interpolated_point(
+        self, solved: Sequence[tuple[float, float, BoundaryPoint]], s: float
+    ) -> BoundaryPoint:
+        """Return the nearest of solved points with interpolated p and amplitude."""
+        places, nearest = [entry[0] for entry in solved], solved[0][2]
+        loads = [point.state.mu[self.name] for _, _, point in solved]
+        p = interpolated(places, [point.p for _, _, point in solved], s)
+        load = interpolated(places, loads, s)
+        change = abs(load - interpolated(places[:-1], loads[:-1], s))
         return replace(
-            nearest, p=p, state=nearest.state.with_(nearest.state.u, mu, load), load_error=error
+            nearest,
+            p=p,
+            state=nearest.state.with_(nearest.state.u, self.name, load),
+            load_error=change + nearest.load_error,
         )
 
-    def _lines(
+    def _rows(
         self,
         newton: BorderedNewton,
         state: State,
         b: Vector,
         p: float,
-        beside: Sequence[tuple[float, float]],
-    ) -> Lines | ExcludedLines:
-        """The rows of Newton's step at a state."""
+        difference: Sequence[tuple[float, float]],
+    ) -> AugmentedRows | SymmetryBreakingRows:
+        """Return the rows of Newton's step at a state, with a tangent bordered by b."""
         if self.m:
-            return ExcludedLines(
-                newton, state, self.name, b, self.m, cast(Excluding, self.family), p, beside
-            )
-        tangent = AugmentedTangent(newton, state, b)
-        return Lines(
-            self.kind, newton.system, state, self.name, tangent, self.family, p, beside, self.scales
+            family = cast(SymmetryBreakingSystems, self.family)
+            return SymmetryBreakingRows(newton, state, self.name, b, self.m, family, p, difference)
+        return AugmentedRows(
+            self.kind,
+            newton.system,
+            state,
+            self.name,
+            AugmentedTangent(newton, state, b),
+            self.family,
+            p,
+            difference,
+            self.scales,
         )
 
-    def _counts(self, lines: Lines | ExcludedLines, p: float, state: State) -> Sequence[int]:
-        """See `Locus`."""
-        if isinstance(lines, ExcludedLines):
-            return lines.counts()
-        excluded = cast(Excluding, self.family).counts(p, state) if self._watched else ()
-        return [lines.unstable, *excluded]
+    def _counts(
+        self, rows: AugmentedRows | SymmetryBreakingRows, p: float, state: State
+    ) -> Sequence[int]:
+        """Return `BoundaryPoint.counts`."""
+        if isinstance(rows, SymmetryBreakingRows):
+            return rows.counts()
+        if not self._counts_families:
+            return [rows.unstable]
+        return [rows.unstable, *cast(SymmetryBreakingSystems, self.family).counts(p, state)]
 
-    def _eigenvalue(
-        self, lines: Lines | ExcludedLines, family: int, p: float, state: State
+    def _second_eigenvalue(
+        self, rows: AugmentedRows | SymmetryBreakingRows, family: int, p: float, state: State
     ) -> float:
-        """The second one of a family."""
+        """Return the eigenvalue of a family nearest to zero, other than that of the boundary."""
         if family and not self.m:
-            return nearest_eigenvalue(
-                cast(Excluding, self.family).factored(p, state, family), self._comm
-            )
-        return lines.eigenvalue(family, p, state)
+            systems = cast(SymmetryBreakingSystems, self.family)
+            return nearest_eigenvalue(systems.factored_tangent(p, state, family), self._comm)
+        return rows.eigenvalue(family, p, state)
 
-    def _solved(
+    def _solve(
         self,
         p: float,
         state: State,
         b: Vector,
-        row: Row,
-        near: Locus | None,
+        row: CurveRow,
+        neighbour: BoundaryPoint | None,
         *,
-        look: int | None = None,
-        rough: bool = False,
-    ) -> Locus | str:
-        """The point near a guess on which a row holds, or the reason why there is none."""
+        eigenvalue_family: int | None = None,
+        low_order: bool = False,
+    ) -> BoundaryPoint | str:
+        """Return the point near a guess on which a row holds, or the reason why there is none."""
 
-        def by_newton() -> Locus | str:
+        def solve() -> BoundaryPoint | str:
             try:
-                solved = self._iterated(float(p), state, b, row, near, look=look, rough=rough)
+                point = self._iterate(
+                    float(p),
+                    state,
+                    b,
+                    row,
+                    neighbour,
+                    eigenvalue_family=eigenvalue_family,
+                    low_order=low_order,
+                )
             except NoSystem as e:
                 return str(e)
-            if isinstance(solved, str) or self.family.costly:
-                return solved
-            return replace(solved, habit=self.family.at(solved.p).factorisation.habit)
+            if isinstance(point, str) or self.family.costly:
+                return point
+            return replace(point, habit=self.family.solver_at(point.p).factorisation.habit)
 
-        found = self._recorded(by_newton)
-        if isinstance(found, Locus):
-            self._solved_at.append(found.p)
+        point = self._recorded(solve)
+        if isinstance(point, BoundaryPoint):
+            self._solved_at.append(point.p)
             if not self.family.costly:
-                self.family.at(found.p).factorisation.habit = found.habit
-        return found
+                self.family.solver_at(point.p).factorisation.habit = point.habit
+        return point
 
-    def _beside(self, p: float, *, rough: bool) -> Sequence[tuple[float, float]]:
-        """Weights and values of p of a difference by p; a rough one from the last points, which
-        have their systems.
+    def _difference(self, p: float, *, low_order: bool) -> Sequence[tuple[float, float]]:
+        """Return weights and values of p of a difference by p.
+
+        One of low order may be from the last points, which have their systems.
         """
         places = [p]
+        min_distance = MIN_SLOPE_DISTANCE * self.scales[1]
         for q in reversed(self._solved_at):
-            if (
-                min(abs(q - place) for place in places) > APART * self.scales[1]
-                and len(places) <= LAST
-            ):
+            is_apart = min(abs(q - place) for place in places) > min_distance
+            if is_apart and len(places) <= SLOPE_POINTS:
                 places.append(q)
-        return slope(places) if rough and len(places) > LAST else self.family.beside(p, rough=rough)
+        if low_order and len(places) > SLOPE_POINTS:
+            return slope_weights(places)
+        return self.family.difference_weights(p, low_order=low_order)
 
-    def _iterated(
+    def _iterate(
         self,
         p: float,
         state: State,
         b: Vector,
-        row: Row,
-        near: Locus | None,
+        row: CurveRow,
+        neighbour: BoundaryPoint | None,
         *,
-        look: int | None,
-        rough: bool,
-    ) -> Locus | str:
+        eigenvalue_family: int | None,
+        low_order: bool,
+    ) -> BoundaryPoint | str:
+        """Run Newton's method for the point on which a row holds.
+
+        Parameters
+        ----------
+        b
+            A vector near the null vector.
+        neighbour
+            A nearby point, whose null vector and tangent orient those of the result.
+        eigenvalue_family
+            The family whose second eigenvalue is computed; None: none.
+        low_order
+            Whether a difference by p of low order is enough.
+        """
         u, mu, name = state.u, float(state.mu[self.name]), self.name
-        beside = self._beside(p, rough=rough)
-        sizes, changes = list[float](), list[float]()
+        difference = self._difference(p, low_order=low_order)
+        sizes, load_changes = list[float](), list[float]()
         while True:
-            newton = self.family.at(p)
+            newton = self.family.solver_at(p)
             system, latest = newton.system, State(u, {**self.family.amplitudes(p), name: mu})
             try:
-                lines = self._lines(newton, latest, b, p, beside)
-                way = lines.step(row, row.value(u, mu, p))
+                rows = self._rows(newton, latest, b, p, difference)
+                step = rows.step(row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"
-            b = lines.v
-            sizes.append(max_abs(system.comm, way.du) / system.length)
-            changes.append(abs(way.dmu))
-            if not (sizes[-1] <= LARGEST_STEP and np.isfinite(way.dmu + way.dp)):
+            b = rows.v
+            sizes.append(max_abs(system.comm, step.du) / system.length)
+            load_changes.append(abs(step.dmu))
+            if not (sizes[-1] <= MAX_STEP and np.isfinite(step.dmu + step.dp)):
                 return "Newton's method diverges"
             if len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], TOLERANCE):
                 return "Newton's method diverges"
-            u, mu, p = u + way.du, float(mu + way.dmu), float(p + way.dp)
-            rate = min(sizes[-1] / sizes[-2], 0.5) if len(sizes) > 1 and sizes[-2] else 0.5
-            rest = rate / (1 - rate)
-            slow = sizes[-1] > sizes[-2] / 2 if len(sizes) > 1 else False
-            settled = sizes[-1] * rest <= TOLERANCE or (slow and sizes[-1] <= TOLERANCE)
-            if settled and (changes[-1] * rest <= LOAD_TOLERANCE * self.scales[0] or slow):
+            u, mu, p = u + step.du, float(mu + step.dmu), float(p + step.dp)
+            if self._has_converged(sizes, load_changes):
                 break
-            if len(sizes) == MOST_ITERATIONS:
-                return f"Newton's method has not converged in {MOST_ITERATIONS} iterations"
-        last = self.family.at(p).system
-        lines.balance(last.residual(u, {**self.family.amplitudes(p), name: mu}))
-        rest_of = lines.step(row, row.value(u, mu, p), settled=True)
-        u, mu, p = u + rest_of.du, float(mu + rest_of.dmu), float(p + rest_of.dp)
+            if len(sizes) == MAX_ITERATIONS:
+                return f"Newton's method has not converged in {MAX_ITERATIONS} iterations"
+        last_system = self.family.solver_at(p).system
+        rows.set_residual(last_system.residual(u, {**self.family.amplitudes(p), name: mu}))
+        last_step = rows.step(row, row.value(u, mu, p), settled=True)
+        u, mu, p = u + last_step.du, float(mu + last_step.dmu), float(p + last_step.dp)
         v = b / np.sqrt(dot(system.comm, b, b))
-        if near is not None:
-            cosine = dot(system.comm, v, near.phi)
-            if abs(cosine) < ALIKE:
+        if neighbour is not None:
+            cosine = dot(system.comm, v, neighbour.phi)
+            if abs(cosine) < MIN_NULL_VECTOR_COSINE:
                 return "the null vector is another one"
             v = v * np.sign(cosine)
-        direction = lines.step(row, None)
+        direction = rows.step(row, None)
         norm = np.sqrt(self.inner(direction, direction))
-        if near is not None and self.inner(direction, near.way) < 0:
+        if neighbour is not None and self.inner(direction, neighbour.way) < 0:
             norm = -norm
-        scale = dot(system.comm, lines.v, v)
+        scale = dot(system.comm, rows.v, v)
         state = State(u, {**self.family.amplitudes(p), name: mu})
-        counts = self._counts(lines, p, state)
-        return Locus(
+        counts = self._counts(rows, p, state)
+        second = np.nan
+        if eigenvalue_family is not None:
+            second = self._second_eigenvalue(rows, eigenvalue_family, p, state)
+        return BoundaryPoint(
             p=p,
             state=state,
             phi=np.asarray(v),
             unstable=sum(counts),
             counts=counts,
-            way=Way(direction.du / norm, direction.dmu / norm, direction.dp / norm),
-            cubic=lines.bend / scale**3,
-            pull=lines.pull / scale,
-            second=np.nan if look is None else self._eigenvalue(lines, look, p, state),
-            load_error=abs(rest_of.dmu) + ROUNDING * abs(mu),
+            way=CurveVector(direction.du / norm, direction.dmu / norm, direction.dp / norm),
+            cubic=rows.bend / scale**3,
+            pull=rows.pull / scale,
+            second=second,
+            load_error=abs(last_step.dmu) + ROUNDING * abs(mu),
             factorisations=len(sizes),
         )
 
+    def _has_converged(self, sizes: Sequence[float], load_changes: Sequence[float]) -> bool:
+        """Return whether the remaining errors of u and of the load are small.
 
-def _at(p: float) -> Row:
-    """The row of a point at a given p."""
-    return Row(None, 0.0, 1.0, lambda u, mu, q: q - p)
+        Sizes that shrink slowly below the tolerance are rounding.
+        """
+        ratio, slow = 0.5, False
+        if len(sizes) > 1:
+            ratio = min(sizes[-1] / sizes[-2], 0.5) if sizes[-2] else 0.5
+            slow = sizes[-1] > sizes[-2] / 2
+        remaining = ratio / (1 - ratio)
+        settled = sizes[-1] * remaining <= TOLERANCE or (slow and sizes[-1] <= TOLERANCE)
+        return settled and (slow or load_changes[-1] * remaining <= LOAD_TOLERANCE * self.scales[0])
 
 
-def _turned(locus: Locus) -> Locus:
-    """The same point with the opposite tangent."""
-    return replace(locus, way=Way(-locus.way.du, -locus.way.dmu, -locus.way.dp))
+def _row_at(p: float) -> CurveRow:
+    """Return the row of a point at a given p."""
+    return CurveRow(None, 0.0, 1.0, lambda u, mu, q: q - p)
 
 
-def _zero_of_slope(
-    a: float, low: Locus, b: float, high: Locus, base: Locus, boundary: Boundary
-) -> float:
-    """Where the Hermite cubic of p over the distance along the base's tangent is stationary."""
-    d0, d1 = (one.way.dp / boundary.inner(base.way, one.way) for one in (low, high))
-    return a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)
+def _reversed(point: BoundaryPoint) -> BoundaryPoint:
+    """Return the same point with the opposite tangent."""
+    tangent = point.way
+    return replace(point, way=CurveVector(-tangent.du, -tangent.dmu, -tangent.dp))

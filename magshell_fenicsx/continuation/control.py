@@ -1,8 +1,10 @@
-"""The quantity that is prescribed along a path, as the last row of the system for (u, mu), and the
-matrix with it.
+"""The quantity that is prescribed along a path, as the last row of a bordered system for (u, mu).
 
-The bordered matrix is inverted by block elimination; Broyden's update goes on with it at later
-iterates.
+Continuation solves R(u, mu) = 0 together with one scalar equation g(u, mu) = 0: a given load, a
+given conjugate displacement or a given arc length. This module has these rows, the bordered matrix
+[K R_mu; c d] with (c, d) the gradient of g, inverted by block elimination, the chord method with
+Broyden's update that keeps a matrix over several iterates, and the refinement of a path's tangent
+by generalised conjugate residuals.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +21,7 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
     Direction,
-    Roughly,
+    InexactSystem,
     State,
     System,
     Vector,
@@ -27,34 +29,37 @@ from magshell_fenicsx.continuation.system import (
     max_abs,
 )
 
-MOST_REFINEMENTS = 4
-REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
-DIFFERENCE = 1e-5  # in lengths: the step of the differences that replace K times a vector
-COARSE = 1e-4  # beside a tangent: a correction that such differences give well
-LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
+MAX_REFINEMENTS = 4
+DU_TOLERANCE, DMU_TOLERANCE = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
+DIFFERENCE_STEP = 1e-5  # in lengths: step of the differences that replace K times a vector
+# of the tangent: a larger correction is added, a smaller one is the error of such differences
+DIFFERENCE_ACCURACY = 1e-4
+# Broyden's update divides the step by a number; a smaller one is not trusted
+MIN_BROYDEN_DIVISOR = 0.3
 
 V = TypeVar("V")
 Residual = Callable[[Vector, Amplitudes], Vector]
+Gradient = tuple[Vector | None, float]  # dg/du, None where it is zero, and dg/dmu
 
 
-class Row(Protocol):
-    """g(u, mu) = 0 beside equilibrium."""
+class ConstraintRow(Protocol):
+    """The scalar equation g(u, mu) = 0 that is solved together with equilibrium."""
 
     def residual(self, state: State) -> float:
-        """g."""
+        """Return g."""
 
-    def gradient(self, state: State) -> tuple[Vector | None, float]:
-        """dg/du (None where it is zero) and dg/dmu."""
+    def gradient(self, state: State) -> Gradient:
+        """Return dg/du (None where it is zero) and dg/dmu."""
 
 
-def slope(comm: MPI.Comm, gradient: tuple[Vector | None, float], along: Direction) -> float:
-    """The derivative of g along a direction, from the gradient of its row."""
-    (c, d), (du, dmu) = gradient, along
+def derivative_along(comm: MPI.Comm, gradient: Gradient, direction: Direction) -> float:
+    """Return the derivative of g along a direction, from the gradient of its row."""
+    (c, d), (du, dmu) = gradient, direction
     return d * dmu + (dot(comm, c, du) if c is not None else 0.0)
 
 
 @dataclass(frozen=True)
-class GivenLoad:
+class PrescribedLoad:
     """Load control: mu = target."""
 
     name: str
@@ -63,12 +68,12 @@ class GivenLoad:
     def residual(self, state: State) -> float:
         return state.mu[self.name] - self.target
 
-    def gradient(self, state: State) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> Gradient:
         return None, 1.0
 
 
 @dataclass(frozen=True)
-class GivenConjugate:
+class PrescribedConjugate:
     """Displacement or volume control: -dPi/dmu = target."""
 
     system: System
@@ -78,17 +83,17 @@ class GivenConjugate:
     def residual(self, state: State) -> float:
         return -self.system.potential(state.u, state.mu, self.name) - self.target
 
-    def gradient(self, state: State) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> Gradient:
         u, mu, name = state.u, state.mu, self.name
         return -self.system.load(u, mu, name), -self.system.curvature(u, mu, name, name)
 
 
 @dataclass(frozen=True)
 class Metric:
-    """Lengths along a path of (u, mu): from the root mean square of u over the system's length, and
-    mu over `scale`.
+    """The metric of arc length along a path of (u, mu).
 
-    So a step length means the same for a thick and a thin shell, and on any mesh.
+    It sums the squares of the root mean square of u over the system's length, and of mu over
+    `scale`. So a step length means the same for a thick and a thin shell, and on any mesh.
     """
 
     system: System
@@ -100,25 +105,25 @@ class Metric:
         return 1 / (float(self.system.comm.allreduce(self.system.size)) * self.system.length**2)
 
     def inner(self, a: Direction, b: Direction) -> float:
-        """<a, b> of two directions (du, dmu)."""
+        """Return <a, b> of two directions (du, dmu). Collective."""
         return self.weight * dot(self.system.comm, a[0], b[0]) + a[1] * b[1] / self.scale**2
 
     def norm(self, du: Vector, dmu: float) -> float:
-        """Length of a direction."""
+        """Return the length of a direction. Collective."""
         return sqrt(self.inner((du, dmu), (du, dmu)))
 
 
-def projected(metric: Metric, a: Direction, span: Sequence[Direction]) -> Direction:
-    """The direction nearest to `a` among the combinations of others."""
+def nearest_combination(metric: Metric, a: Direction, span: Sequence[Direction]) -> Direction:
+    """Return the linear combination of the directions `span` that is nearest to `a`. Collective."""
     gram = [[metric.inner(p, q) for q in span] for p in span]
-    parts = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
-    du = np.sum([part * p[0] for part, p in zip(parts, span, strict=True)], axis=0)
-    return du, float(sum(part * p[1] for part, p in zip(parts, span, strict=True)))
+    coefficients = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
+    du = np.sum([c * p[0] for c, p in zip(coefficients, span, strict=True)], axis=0)
+    return du, float(sum(c * p[1] for c, p in zip(coefficients, span, strict=True)))
 
 
 @dataclass(frozen=True)
 class Hyperplane:
-    """Arc length: <normal, (u, mu) - base> = distance."""
+    """Arc-length control: <normal, (u, mu) - base> = distance."""
 
     metric: Metric
     name: str
@@ -130,17 +135,17 @@ class Hyperplane:
         chord = (state.u - self.base.u, state.mu[self.name] - self.base.mu[self.name])
         return self.metric.inner(self.normal, chord) - self.distance
 
-    def gradient(self, state: State) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> Gradient:
         return self.metric.weight * self.normal[0], self.normal[1] / self.metric.scale**2
 
 
-def plus(a: Direction, factor: float, b: Direction) -> Direction:
-    """a + factor b."""
+def add_scaled(a: Direction, factor: float, b: Direction) -> Direction:
+    """Return a + factor b."""
     return a[0] + factor * b[0], a[1] + factor * b[1]
 
 
-class Bordered:
-    """The matrix [K R_mu; c d] at a state.
+class BorderedMatrix:
+    """The matrix [K R_mu; c d] at a state, inverted by block elimination.
 
     Parameters
     ----------
@@ -150,14 +155,13 @@ class Bordered:
         The amplitude mu.
     row
         The last row, whose gradient is (c, d).
+    lagged
+        Whether a small part of K belongs to an earlier state: its solutions need not be accurate.
 
     Attributes
     ----------
     column
         R_mu.
-    rough
-        Whether a small part of K is that of an earlier state, so that its solutions need not be
-        better.
     """
 
     def __init__(
@@ -166,35 +170,35 @@ class Bordered:
         factors: Factorisation,
         state: State,
         name: str,
-        row: Row,
+        row: ConstraintRow,
         *,
-        rough: bool = False,
+        lagged: bool = False,
     ) -> None:
-        self.state, self.row, self.rough, self._mu = state, row, rough, state.mu[name]
+        self.state, self.row, self.lagged, self._mu = state, row, lagged, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        self._x2 = factors.solve(self.column, rough=rough)
-        self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
-        self._weight = dot(
-            self._comm, self._x2, self._x2
-        )  # dmu counts as the displacement that it causes
+        self._x2 = factors.solve(self.column, low_accuracy=lagged)
+        self._schur = derivative_along(self._comm, self._gradient, (-self._x2, 1.0))
+        # dmu counts as the displacement that it causes
+        self._weight = dot(self._comm, self._x2, self._x2)
 
     def size(self, step: Direction) -> float:
-        """The size of a step: the larger of du, in lengths of the system, and dmu.
+        """Return the size of a step: the larger of du, in lengths of the system, and dmu.
 
         dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
         """
-        moved = max_abs(self._comm, self._x2) / self._length
-        per_mu = min(moved, 1 / abs(self._mu)) if self._mu else moved
-        return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
+        displacement_per_mu = max_abs(self._comm, self._x2) / self._length
+        scale = min(displacement_per_mu, 1 / abs(self._mu)) if self._mu else displacement_per_mu
+        return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * scale)
 
-    def solve(self, f: Vector, g: float, *, rough: bool = False) -> Direction:
-        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g; `rough` as in
-        `Factorisation.solve`.
+    def solve(self, f: Vector, g: float, *, low_accuracy: bool = False) -> Direction:
+        """Return (du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g.
+
+        `low_accuracy` is that of `Factorisation.solve`.
         """
-        x1 = self._factors.solve(f, rough=rough)
-        dmu = (g - slope(self._comm, self._gradient, (x1, 0.0))) / self._schur
+        x1 = self._factors.solve(f, low_accuracy=low_accuracy)
+        dmu = (g - derivative_along(self._comm, self._gradient, (x1, 0.0))) / self._schur
         return x1 - dmu * self._x2, dmu
 
     @property
@@ -203,27 +207,26 @@ class Bordered:
         return np.asarray(-self._x2 / self._schur), 1 / self._schur
 
     def inner(self, a: Direction, b: Direction) -> float:
-        """Inner product in which Broyden's update is the smallest."""
+        """Return the inner product in which Broyden's update is the smallest. Collective."""
         return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
 
     def times(self, du: Vector, dmu: float) -> Direction:
-        """The matrix times a direction."""
-        return self._factors.times(du) + dmu * self.column, slope(
-            self._comm, self._gradient, (du, dmu)
-        )
+        """Return the matrix times a direction. Collective."""
+        force = self._factors.times(du) + dmu * self.column
+        return force, derivative_along(self._comm, self._gradient, (du, dmu))
 
 
 class Chord(Generic[V]):
-    """A matrix that is kept over several iterates, with Broyden's update after each step.
+    """The chord method: one matrix for several iterates, with Broyden's update after each step.
 
     C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.
-    Steps are subtracted.
+    Steps are subtracted from the iterate.
 
     Parameters
     ----------
     solve
-        The inverse of the matrix, times a right side.
-    inner, plus
+        Returns the inverse of the matrix times a right side.
+    inner, add_scaled
         Inner product in which the update is the smallest, and a + factor b.
     """
 
@@ -231,116 +234,127 @@ class Chord(Generic[V]):
         self,
         solve: Callable[[V], V],
         inner: Callable[[V, V], float],
-        plus: Callable[[V, float, V], V],
+        add_scaled: Callable[[V, float, V], V],
     ) -> None:
-        self._solve, self._inner, self._plus = solve, inner, plus
-        self._steps = list[V]()  # those taken since the matrix was made
+        self._solve, self._inner, self._add_scaled = solve, inner, add_scaled
+        self._steps = list[V]()  # full steps since the matrix was computed
 
-    def took(self, step: V) -> None:
+    def accept_step(self, step: V) -> None:
         """Go on to the next iterate by a full step."""
         self._steps.append(step)
 
     def step(self, f: V) -> V:
-        """The next step at the present iterate, whose residual is `f`."""
-        step, inner = self._updated(f, self._steps), self._inner
+        """Return the next step at the present iterate, whose residual is `f`."""
+        step, inner = self._updated_solution(f, self._steps), self._inner
         if self._steps:
             last = self._steps[-1]
-            rest = 1 - inner(last, step) / inner(last, last)
-            if rest > LEAST_REST:
-                return self._plus(step, 1 / rest - 1, step)
+            divisor = 1 - inner(last, step) / inner(last, last)
+            if divisor > MIN_BROYDEN_DIVISOR:
+                return self._add_scaled(step, 1 / divisor - 1, step)
             self._steps.clear()
         return step
 
     def solve(self, f: V, step: V) -> V:
-        """The solution for any right side at the present iterate, from which `step` is the next
-        one.
-        """
-        return self._updated(f, [*self._steps, step])
+        """Return the solution for a right side at the iterate whose next step is `step`."""
+        return self._updated_solution(f, [*self._steps, step])
 
-    def _updated(self, f: V, steps: Sequence[V]) -> V:
+    def _updated_solution(self, f: V, steps: Sequence[V]) -> V:
         solution, inner = self._solve(f), self._inner
-        for before, after in pairwise(steps):
-            solution = self._plus(solution, inner(before, solution) / inner(before, before), after)
+        for earlier, later in pairwise(steps):
+            factor = inner(earlier, solution) / inner(earlier, earlier)
+            solution = self._add_scaled(solution, factor, later)
         return solution
 
 
 def refined_tangent(
     system: System,
-    matrix: Bordered,
+    matrix: BorderedMatrix,
     t: Direction,
     state: State,
     load: Vector,
-    row: Row,
+    row: ConstraintRow,
     *,
-    foreseeing: bool = False,
+    extrapolating: bool = False,
 ) -> Direction | None:
-    """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate
-    residuals.
+    """Return the path's tangent at a state from the matrix of a nearby state. Collective.
 
-    If `foreseeing`, with forces that are foreseen, and computed along the tangent itself. None if
-    the matrix is too far away.
+    The tangent is refined by generalised conjugate residuals, with K times a vector from
+    differences of the residual.
+
+    Parameters
+    ----------
+    t
+        The tangent of the matrix.
+    load
+        R_mu at the state.
+    extrapolating
+        Whether forces of dense terms may be extrapolated. They are then computed along the tangent.
+
+    Returns
+    -------
+    The tangent; None if the matrix belongs to a state too far away.
     """
-    near = _Near(system, matrix, state, load, row)
-    if not foreseeing:
-        refined = near.refined(system.residual, t)
-        return refined[0] if refined else None
-    assert isinstance(system, Roughly)
-    for _ in range(MOST_REFINEMENTS):
-        refined = near.refined(partial(system.residual, rough=True), t)
-        if refined is None or system.knows_along(state.u, state.mu, refined[0][0]):
-            return refined[0] if refined else None
-        t = refined[0]
-        near.stiffness(system.residual, t[0], t[0])  # what is foreseen from now on is right along t
+    refinement = _TangentRefinement(system, matrix, state, load, row)
+    if not extrapolating:
+        return refinement.refined(system.residual, t)
+    assert isinstance(system, InexactSystem)
+    for _ in range(MAX_REFINEMENTS):
+        refined = refinement.refined(partial(system.residual, inexact=True), t)
+        if refined is None:
+            return None
+        if system.extrapolation_holds_along(state.u, state.mu, refined[0]):
+            return refined
+        t = refined
+        # forces computed here make the extrapolation hold along t from now on
+        refinement.stiffness(system.residual, t[0], t[0])
     return None
 
 
 @dataclass(frozen=True)
-class _Near:
-    """A state, and the matrix of one near by."""
+class _TangentRefinement:
+    """Generalised conjugate residuals for the tangent at a state.
+
+    The matrix of a nearby state is the preconditioner.
+    """
 
     system: System
-    matrix: Bordered
+    matrix: BorderedMatrix
     state: State
     load: Vector
-    row: Row
+    row: ConstraintRow
 
-    def refined(self, residual: Residual, t: Direction) -> tuple[Direction, int] | None:
-        """The tangent with some residual, from one that is nearly as good, and how often this was
-        improved.
-        """
+    def refined(self, residual: Residual, t: Direction) -> Direction | None:
+        """Return the tangent for a residual function; None if the approximation t is too poor."""
         comm, gradient = self.system.comm, self.row.gradient(self.state)
         R = residual(self.state.u, self.state.mu)
 
-        def times(t: Direction, right: float = 0.0) -> Direction:
-            rest = (
-                self.stiffness(residual, t[0], R) + t[1] * self.load,
-                slope(comm, gradient, t) - right,
-            )
-            return self.matrix.solve(*rest, rough=self.matrix.rough)
+        def preconditioned_product(t: Direction, g: float = 0.0) -> Direction:
+            force = self.stiffness(residual, t[0], R) + t[1] * self.load
+            row_value = derivative_along(comm, gradient, t) - g
+            return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
 
-        z, directions = (
-            plus((0.0 * t[0], 0.0), -1.0, times(t, 1.0)),
-            list[tuple[Direction, Direction, float]](),
-        )
-        for _ in range(MOST_REFINEMENTS):
-            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(
-                t[1]
-            ):
-                t = plus(t, 1.0, z) if max_abs(comm, z[0]) > COARSE * max_abs(comm, t[0]) else t
-                return t, len(directions)
-            p, q = z, times(z)
-            for before, image, square in directions:
-                part = self.matrix.inner(image, q) / square
-                p, q = plus(p, -part, before), plus(q, -part, image)
+        z = add_scaled((0.0 * t[0], 0.0), -1.0, preconditioned_product(t, 1.0))
+        directions = list[tuple[Direction, Direction, float]]()
+        for _ in range(MAX_REFINEMENTS):
+            size = max_abs(comm, t[0])
+            du_converged = max_abs(comm, z[0]) <= DU_TOLERANCE * size
+            if du_converged and abs(z[1]) <= DMU_TOLERANCE * abs(t[1]):
+                is_accurate = max_abs(comm, z[0]) > DIFFERENCE_ACCURACY * size
+                return add_scaled(t, 1.0, z) if is_accurate else t
+            p, q = z, preconditioned_product(z)
+            for direction, image, square in directions:
+                component = self.matrix.inner(image, q) / square
+                p = add_scaled(p, -component, direction)
+                q = add_scaled(q, -component, image)
             directions.append((p, q, self.matrix.inner(q, q)))
-            part = self.matrix.inner(z, q) / directions[-1][2]
-            t, z = plus(t, part, p), plus(z, -part, q)
+            component = self.matrix.inner(z, q) / directions[-1][2]
+            t, z = add_scaled(t, component, p), add_scaled(z, -component, q)
         return None
 
     def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
-        """K du by a difference of the residual, R at the state."""
+        """Return K du by a difference of the residual, which is R at the state."""
         size = max_abs(self.system.comm, du)
         if size == 0.0:
             return du
-        small = DIFFERENCE * self.system.length / size
-        return np.asarray((residual(self.state.u + small * du, self.state.mu) - R) / small)
+        step = DIFFERENCE_STEP * self.system.length / size
+        return np.asarray((residual(self.state.u + step * du, self.state.mu) - R) / step)

@@ -1,79 +1,83 @@
-"""The first instability: a boundary that goes on with another mode where that becomes critical
-before its own.
+"""The boundary of the first instability, which may change from one mode to another.
+
+Each mode has a boundary of its own. Along one, a crossing shows where another mode becomes critical
+before it; from there the boundary of that mode is followed.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import copysign
 
-from magshell_fenicsx.continuation.augmented import Locus, NoSystem
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.system import Vector
 
-ASIDE = 0.01  # of the range: how far beyond a crossing the other mode is taken up
-HALVINGS = 7  # of that distance, until the mode is found there, and comes first
-ALIKE = 1e-3  # of a load: modes at a start that are so near are taken for one another by a path
+# of the range of p: distance beyond a crossing at which the other mode is searched first
+DISTANCE_BEYOND_CROSSING = 0.01
+MAX_HALVINGS = 7  # of that distance, until the mode is found there, and is the first
+# relative difference of two loads at a start, below which a path may confuse the modes
+LOAD_TOLERANCE = 1e-3
 
-Curve = Callable[[int, Locus], Boundary]
-NullVector = Callable[[Locus, int, int], Vector]
-Followed = Iterator[tuple[Label, Locus, Boundary]]
+BoundaryOfFamily = Callable[[int, BoundaryPoint], Boundary]
+NullVector = Callable[[BoundaryPoint, int, int], Vector]
+LabelledPoints = Iterator[tuple[Label, BoundaryPoint, Boundary]]
 
 
-def critical(
-    curve: Curve,
+def critical_boundary(
+    curve: BoundaryOfFamily,
     null_vector: NullVector,
     mode: Boundary,
-    start: Locus,
+    start: BoundaryPoint,
     sense: float,
     ends: tuple[float, float],
     steps: int,
-) -> Followed:
-    """Points from a start until p leaves its range, each with the boundary that it is on.
+) -> LabelledPoints:
+    """Yield labels, points and their boundaries from a start until p leaves its range.
 
-    Where another mode becomes critical before that of the boundary, the boundary goes on with it.
+    Where another mode becomes critical before that of the boundary, its boundary is followed.
 
     Parameters
     ----------
     curve
-        The boundary of a family (0: of the model's own modes) that goes on from a crossing.
+        Returns the boundary of a family (0: of the model's own modes) that begins at a crossing.
     null_vector
-        Of a crossing, the family there, and that of the boundary before: the mode that becomes
-        critical.
+        Returns the mode that becomes critical at a crossing, from the crossing, the family, and
+        the family of the previous boundary.
     mode, start, sense, ends, steps
-        The first boundary, and as of `Boundary.followed`.
+        The first boundary, and the arguments of `Boundary.follow`.
 
     Raises
     ------
     BoundaryLost, NoSystem
-        See `Boundary.followed`; there is no system where another mode is taken up; or other modes
-        are unstable first, and none of them is found.
+        If `Boundary.follow` raises it; there is no system where another mode is taken up; or other
+        modes are unstable first, and none of them is found.
     """
-    search = _Search(curve, null_vector, ends)
-    begun_by: int | None = (
-        None  # the family of the boundary before, where this one begins at their crossing
-    )
+    search = _FirstModeSearch(curve, null_vector, ends)
+    # the family of the previous boundary, where this one begins at their crossing
+    begun_by: int | None = None
     while True:
         last, successor = start, None
-        for label, locus in mode.followed(start, sense, ends, steps):
-            if last is start and label == "crossing" and locus.met == begun_by:
+        for label, point in mode.follow(start, sense, ends, steps):
+            if last is start and label == "crossing" and point.met == begun_by:
                 continue
-            if not last.unstable and label in ("point", "end") and _unstable_families(mode, locus):
-                successor, sense = search.overtaking_mode(mode, locus), locus.p - last.p
+            is_point = label in ("point", "end")
+            if not last.unstable and is_point and _unstable_families(mode, point):
+                successor, sense = search.overtaking_mode(mode, point), point.p - last.p
                 yield label, successor.start, successor.mode
                 if label == "end":
                     return
                 break
             if label != "crossing" or last.unstable:
-                yield label, locus, mode
-                last = locus
+                yield label, point, mode
+                last = point
                 continue
-            sense = locus.p - last.p
+            sense = point.p - last.p
             try:
-                successor = search.mode_beyond(mode, locus, sense)
+                successor = search.mode_beyond(mode, point, sense)
             except BoundaryLost:
-                yield label, locus, mode
+                yield label, point, mode
                 raise
-            yield label, replace(locus, met=successor.mode.m), mode
+            yield label, replace(point, met=successor.mode.m), mode
             if successor.begun_by is None:
                 yield "point", successor.start, successor.mode
             break
@@ -83,58 +87,59 @@ def critical(
 
 
 def first_mode(
-    curve: Curve, null_vector: NullVector, mode: Boundary, start: Locus
-) -> tuple[Boundary, Locus]:
-    """Return the boundary that a start belongs to, and its point: another mode's where that comes
-    just before.
+    curve: BoundaryOfFamily, null_vector: NullVector, mode: Boundary, start: BoundaryPoint
+) -> tuple[Boundary, BoundaryPoint]:
+    """Return the boundary that a start belongs to, and its point on it.
 
-    A path that has two modes at nearly one load may have named the second. Where others come long
-    before, the start is an instability beyond the first, and stays.
+    It is that of another mode if that becomes critical just before: a path with two modes at nearly
+    one load may have named the second. Where others become critical long before, the start is an
+    instability beyond the first, and stays. The parameters are those of `critical_boundary`.
     """
     if not _unstable_families(mode, start):
         return mode, start
     try:
-        before = _Search(curve, null_vector, (start.p, start.p)).overtaking_mode(mode, start)
+        search = _FirstModeSearch(curve, null_vector, (start.p, start.p))
+        overtaking = search.overtaking_mode(mode, start)
     except BoundaryLost:
         return mode, start
-    one, other = (locus.state.mu[mode.name] for locus in (start, before.start))
-    return (before.mode, before.start) if abs(one - other) <= ALIKE * abs(one) else (mode, start)
+    load, other_load = (point.state.mu[mode.name] for point in (start, overtaking.start))
+    if abs(load - other_load) <= LOAD_TOLERANCE * abs(load):
+        return overtaking.mode, overtaking.start
+    return mode, start
 
 
 @dataclass(frozen=True)
 class _Successor:
-    """The boundary that goes on after another one.
+    """The boundary that continues after another one.
 
     Attributes
     ----------
     mode, start
         The boundary, and its first point.
     begun_by
-        The family of the boundary before, where both cross at the first point; None elsewhere.
+        The family of the previous boundary, where both cross at the first point; None elsewhere.
     """
 
     mode: Boundary
-    start: Locus
+    start: BoundaryPoint
     begun_by: int | None = None
 
 
 @dataclass(frozen=True)
-class _Search:
+class _FirstModeSearch:
     """The search for the first mode, among those that are unstable where another one is neutral.
 
-    Attributes
-    ----------
-    curve, null_vector, ends
-        As of `critical`.
+    The attributes are the arguments of `critical_boundary`.
     """
 
-    curve: Curve
+    curve: BoundaryOfFamily
     null_vector: NullVector
     ends: tuple[float, float]
 
-    def mode_beyond(self, mode: Boundary, crossing: Locus, sense: float) -> _Successor:
-        """Return what goes on from a crossing: the mode that becomes critical, or a third one that
-        does so there too.
+    def mode_beyond(self, mode: Boundary, crossing: BoundaryPoint, sense: float) -> _Successor:
+        """Return the boundary beyond a crossing, of the mode that becomes critical there.
+
+        It may be that of a third mode that becomes critical there too.
 
         Raises
         ------
@@ -144,20 +149,18 @@ class _Search:
 
         def starts_of(family: int) -> Iterator[_Successor]:
             other, phi = self._boundary_of(family, crossing, mode.m)
-            if mode.m and family not in (0, mode.m):  # neither equation knows of the other
+            if mode.m and family not in (0, mode.m):  # the two equations do not couple
                 start = other.start(crossing.p, crossing.state, phi)
-                yield _Successor(
-                    other,
-                    replace(start, unstable=start.unstable - start.unstable_of(mode.m)),
-                    mode.m,
-                )
-            yield _Successor(other, _beyond(other, crossing, phi, sense, self.ends))
+                unstable = start.unstable - start.unstable_of(mode.m)
+                yield _Successor(other, replace(start, unstable=unstable), mode.m)
+            yield _Successor(other, _point_beyond(other, crossing, phi, sense, self.ends))
 
         return self._first_of([crossing.met], starts_of, mode, crossing)
 
-    def overtaking_mode(self, mode: Boundary, locus: Locus) -> _Successor:
-        """Return the mode that is the first where that of a boundary is not any more, at the same
-        p.
+    def overtaking_mode(self, mode: Boundary, point: BoundaryPoint) -> _Successor:
+        """Return the mode that is the first where that of a boundary is not any more.
+
+        It starts at the same p.
 
         Raises
         ------
@@ -166,31 +169,31 @@ class _Search:
         """
 
         def starts_of(family: int) -> Iterator[_Successor]:
-            other, phi = self._boundary_of(family, locus, mode.m)
-            yield _Successor(other, other.start(locus.p, locus.state, phi))
+            other, phi = self._boundary_of(family, point, mode.m)
+            yield _Successor(other, other.start(point.p, point.state, phi))
 
-        return self._first_of(_unstable_families(mode, locus), starts_of, mode, locus)
+        return self._first_of(_unstable_families(mode, point), starts_of, mode, point)
 
-    def _boundary_of(self, family: int, locus: Locus, before: int) -> tuple[Boundary, Vector]:
-        """Return the boundary of a family that is taken up after another one, and its null vector
-        at a point."""
-        return self.curve(family, locus), self.null_vector(locus, family, before)
+    def _boundary_of(
+        self, family: int, point: BoundaryPoint, previous_family: int
+    ) -> tuple[Boundary, Vector]:
+        """Return the boundary of a family that follows another one, and its null vector there."""
+        return self.curve(family, point), self.null_vector(point, family, previous_family)
 
     def _first_of(
         self,
         families: Sequence[int],
         starts_of: Callable[[int], Iterator[_Successor]],
         mode: Boundary,
-        locus: Locus,
+        point: BoundaryPoint,
     ) -> _Successor:
-        """Return the first mode of some families, and of those that prove to be unstable before
-        these.
+        """Return the first mode of some families, and of those that prove to be unstable before.
 
         Parameters
         ----------
         starts_of
             Family -> where it may be taken up, one after the other.
-        mode, locus
+        mode, point
             The boundary that ends, and its last point, for the message.
 
         Raises
@@ -198,45 +201,51 @@ class _Search:
         BoundaryLost
             If none is found.
         """
-        families_asked, why = [*families], "none that comes before it is the first there"
-        for family in families_asked:  # which grows
+        candidates, reason = [*families], "none that comes before it is the first there"
+        for family in candidates:  # which grows
             try:
                 for successor in starts_of(family):
                     if not successor.start.unstable:
                         return successor
-                    unstable_there = _unstable_families(successor.mode, successor.start)
-                    families_asked += [
-                        other
-                        for other in unstable_there
-                        if other not in families_asked and other != mode.m
-                    ]
+                    for other in _unstable_families(successor.mode, successor.start):
+                        if other not in candidates and other != mode.m:
+                            candidates.append(other)
             except (BoundaryLost, NoSystem) as e:
-                why = str(e)
-        load = locus.state.mu[mode.name]
+                reason = str(e)
+        load = point.state.mu[mode.name]
         raise BoundaryLost(
-            f"at {locus.p:.6g}, load {load:.6g}: another mode is unstable first, and is not found: {why}"
+            f"at {point.p:.6g}, load {load:.6g}: another mode is unstable first, "
+            f"and is not found: {reason}"
         )
 
 
-def _unstable_families(mode: Boundary, locus: Locus) -> list[int]:
+def _unstable_families(mode: Boundary, point: BoundaryPoint) -> list[int]:
     """Return the families with modes that are unstable at a point of a boundary.
 
-    Not the model's own family along its own boundary: such a place is a `meeting`.
+    The model's own family does not count along its own boundary: such a place is a `meeting`.
     """
-    return [i for i, count in enumerate(locus.counts) if count and not i == mode.m == 0]
+    return [i for i, count in enumerate(point.counts) if count and not i == mode.m == 0]
 
 
-def _beyond(
-    mode: Boundary, crossing: Locus, phi: Vector, sense: float, ends: tuple[float, float]
-) -> Locus:
-    """Return a point of a boundary near its crossing, where its equations are singular: if possible
-    the first instability."""
-    room = (ends[1] if sense > 0 else ends[0]) - crossing.p
-    off = copysign(min(ASIDE * mode.scales[1], abs(room) / 2), sense)
-    farthest: Locus | None = None
-    for halvings_left in range(HALVINGS, -1, -1):
+def _point_beyond(
+    mode: Boundary, crossing: BoundaryPoint, phi: Vector, sense: float, ends: tuple[float, float]
+) -> BoundaryPoint:
+    """Return a point of a boundary near a crossing, where its equations are singular.
+
+    If possible it is the first instability there.
+
+    Raises
+    ------
+    BoundaryLost, NoSystem
+        If no point is found.
+    """
+    available = (ends[1] if sense > 0 else ends[0]) - crossing.p
+    distance = min(DISTANCE_BEYOND_CROSSING * mode.scales[1], abs(available) / 2)
+    dp = copysign(distance, sense)
+    farthest: BoundaryPoint | None = None
+    for halvings_left in range(MAX_HALVINGS, -1, -1):
         try:
-            start = mode.start(crossing.p + off, crossing.state, phi)
+            start = mode.start(crossing.p + dp, crossing.state, phi)
         except (BoundaryLost, NoSystem):
             if not halvings_left and farthest is None:
                 raise
@@ -244,6 +253,6 @@ def _beyond(
             if not start.unstable:
                 return start
             farthest = farthest or start
-        off /= 2
+        dp /= 2
     assert farthest
     return farthest

@@ -1,5 +1,4 @@
-"""Systems made of a system: a loading device that holds conjugates, amplitudes as functions of one,
-a holding force.
+"""Systems built on a system: a loading device, a curve of amplitudes, a holding force.
 
 A device holds the conjugates of some amplitudes, so these amplitudes are unknowns. For example, a
 sealed volume has an unknown pressure, and a body pressed on with a given force an unknown position.
@@ -23,18 +22,18 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
-    Edged,
+    BorderedTangent,
     State,
     System,
     Tangent,
     Vector,
-    Weighted,
+    WeightedDisplacement,
     dot,
     max_abs,
 )
 
 Conjugate = Callable[[float], tuple[float, float]]  # mu -> q and dq/dmu
-Held = float | Conjugate | str
+HeldConjugate = float | Conjugate | str
 Array = NDArray[np.float64]
 Curve = Callable[[float], tuple[float, float, float]]  # t -> mu and its first two derivatives
 FORCE = "holding force"
@@ -45,7 +44,7 @@ class Device:
 
     Parameters
     ----------
-    held
+    held_conjugates
         Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that
         does not rise, or the name of a further amplitude of the device, whose value it is.
     scale
@@ -58,114 +57,132 @@ class Device:
     """
 
     def __init__(
-        self, system: System, held: Mapping[str, Held], scale: Mapping[str, float]
+        self,
+        system: System,
+        held_conjugates: Mapping[str, HeldConjugate],
+        scale: Mapping[str, float],
     ) -> None:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
-        self._system, self.names = system, list(held)
-        self._held = [
-            q if callable(q) or isinstance(q, str) else constant(q) for q in held.values()
+        self._system, self.names = system, list(held_conjugates)
+        self._conjugates = [
+            q if callable(q) or isinstance(q, str) else constant(q)
+            for q in held_conjugates.values()
         ]
-        self._unit = np.array([scale[name] / system.length for name in held])
-        self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
+        self._units = np.array([scale[name] / system.length for name in held_conjugates])
+        self.size = system.size + len(held_conjugates) * (self.comm.rank == self.comm.size - 1)
 
-    def on(self, system: System) -> "Device":
-        """The same device on another system."""
+    def for_system(self, system: System) -> "Device":
+        """Return the same device on another system."""
         other = copy(self)
         other._system = system
         other.size = system.size + self.size - self._system.size
         return other
 
     def padded(self, u: Vector) -> Vector:
-        """A vector of the inner system with zeros for the amplitudes."""
+        """Return a vector of the inner system with zeros appended for the amplitudes."""
         return join(u, np.zeros(len(self.names)), self.comm)
 
     def enter(self, state: State) -> State:
-        """A state of the inner system as a state of the device."""
+        """Return a state of the inner system as a state of the device."""
         fixed = {name: value for name, value in state.mu.items() if name not in self.names}
         return State(join(state.u, self.unknowns(state.mu), self.comm), fixed)
 
     def leave(self, state: State) -> State:
-        """A state of the device as a state of the inner system."""
+        """Return a state of the device as a state of the inner system."""
         u, mu = self._split(state.u, state.mu)
-        return State(u, {name: value for name, value in mu.items() if name not in self._held})
+        return State(u, {name: value for name, value in mu.items() if name not in self._conjugates})
 
     def displacement(self, x: Vector) -> Vector:
-        """u of a vector (u, y)."""
+        """Return u of a vector (u, y)."""
         return split(x, len(self.names), self.comm)[0]
 
     def rates(self, x: Vector) -> dict[str, float]:
-        """The changes of the amplitudes along a vector (u, y)."""
+        """Return the changes of the amplitudes along a vector (u, y)."""
         y = split(x, len(self.names), self.comm)[1]
-        return dict(zip(self.names, (float(v) for v in y * self._unit), strict=True))
+        return dict(zip(self.names, (float(v) for v in y * self._units), strict=True))
 
-    def joined(self, u: Vector, rows: Amplitudes) -> Vector:
-        """A gradient by (u, y), from those by u and by the amplitudes."""
-        return join(u, np.array([rows[name] for name in self.names]) * self._unit, self.comm)
+    def gradient(self, by_u: Vector, by_amplitude: Amplitudes) -> Vector:
+        """Return a gradient by (u, y), from those by u and by the amplitudes."""
+        by_y = np.array([by_amplitude[name] for name in self.names]) * self._units
+        return join(by_u, by_y, self.comm)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        v, whole = self._split(u, mu)
-        return join(self._system.residual(v, whole), self.rows(v, whole), self.comm)
+        v, amplitudes = self._split(u, mu)
+        rows = self.rows(v, amplitudes)
+        return join(self._system.residual(v, amplitudes), rows, self.comm)
 
     def rows(self, u: Vector, mu: Amplitudes) -> Array:
-        """The further rows at a state of the inner system, zero where each conjugate is what it
-        should be.
+        """Return dPi/dmu + q at a state of the inner system, zero where the conjugates are held.
+
+        Returns
+        -------
+        (k,) numbers in units of y.
         """
-        each = zip(self.names, self._held, strict=True)
-        held = [mu[q] if isinstance(q, str) else q(mu[name])[0] for name, q in each]
-        rows = np.array([self._system.potential(u, mu, name) for name in self.names]) + held
-        return np.asarray(rows * self._unit)
+        held_conjugates = [
+            mu[q] if isinstance(q, str) else q(mu[name])[0]
+            for name, q in zip(self.names, self._conjugates, strict=True)
+        ]
+        rows = (
+            np.array([self._system.potential(u, mu, name) for name in self.names]) + held_conjugates
+        )
+        return np.asarray(rows * self._units)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        v, whole = self._split(u, mu)
-        if name in self._held:
-            return join(
-                0.0 * v, self._unit * (np.array(self._held, dtype=object) == name), self.comm
-            )
-        mixed = [self._system.curvature(v, whole, other, name) for other in self.names]
-        return join(self._system.load(v, whole, name), np.array(mixed) * self._unit, self.comm)
+        v, amplitudes = self._split(u, mu)
+        if name in self._conjugates:
+            is_held_by_name = np.array(self._conjugates, dtype=object) == name
+            return join(0.0 * v, self._units * is_held_by_name, self.comm)
+        mixed = [self._system.curvature(v, amplitudes, other, name) for other in self.names]
+        load = self._system.load(v, amplitudes, name)
+        return join(load, np.array(mixed) * self._units, self.comm)
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        v, whole = self._split(u, mu)
-        if name in self._held:
-            return whole[self.names[self._held.index(name)]]
-        return self._system.potential(v, whole, name)
+        v, amplitudes = self._split(u, mu)
+        if name in self._conjugates:
+            return amplitudes[self.names[self._conjugates.index(name)]]
+        return self._system.potential(v, amplitudes, name)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        if {name, other} & set(self._held):
+        if {name, other} & set(self._conjugates):
             return 0.0
         return self._system.curvature(*self._split(u, mu), name, other)
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Edged:
-        v, whole = self._split(u, mu)
-        columns, D = self.edge(v, whole)
-        below = [(weight, self.displacement(w)) for weight, w in stress]
-        K = self._system.tangent(v, whole, below)
-        assert not isinstance(K, Edged)  # a device of a device is one device
-        return Edged(K, columns, D, self.multipliers)
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> BorderedTangent:
+        v, amplitudes = self._split(u, mu)
+        columns, D = self.border(v, amplitudes)
+        inner_stress = [(weight, self.displacement(w)) for weight, w in stress]
+        K = self._system.tangent(v, amplitudes, inner_stress)
+        assert not isinstance(K, BorderedTangent)  # a device of a device is one device
+        return BorderedTangent(K, columns, D, self.multipliers)
 
-    def edge(self, u: Vector, mu: Amplitudes) -> tuple[list[Vector], Array]:
-        """The columns C, and D (k, k), at a state of the inner system."""
+    def border(self, u: Vector, mu: Amplitudes) -> tuple[list[Vector], Array]:
+        """Return the columns C, and D (k, k), at a state of the inner system."""
         system, names = self._system, self.names
         columns = [
-            unit * system.load(u, mu, name) for name, unit in zip(names, self._unit, strict=True)
+            unit * system.load(u, mu, name) for name, unit in zip(names, self._units, strict=True)
         ]
         D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
-        each = zip(names, self._held, strict=True)
-        D += np.diag([0.0 if isinstance(q, str) else q(mu[name])[1] for name, q in each])
-        return columns, np.asarray(D * np.outer(self._unit, self._unit))
+        slopes = [
+            0.0 if isinstance(q, str) else q(mu[name])[1]
+            for name, q in zip(names, self._conjugates, strict=True)
+        ]
+        D += np.diag(slopes)
+        return columns, np.asarray(D * np.outer(self._units, self._units))
 
     @property
     def multipliers(self) -> int:
-        """See `Edged`."""
+        """The number of amplitudes that are Lagrange multipliers, see `BorderedTangent`."""
         return sum(name not in self.coordinates for name in self.names)
 
     def values(self, y: Array) -> dict[str, float]:
-        """The amplitudes of the unknowns y."""
-        return dict(zip(self.names, (float(v) for v in y * self._unit), strict=True))
+        """Return the amplitudes of the unknowns y."""
+        return dict(zip(self.names, (float(v) for v in y * self._units), strict=True))
 
     def unknowns(self, mu: Amplitudes) -> Array:
-        """The unknowns y of amplitudes."""
-        return np.asarray(np.array([mu[name] for name in self.names]) / self._unit)
+        """Return the unknowns y of amplitudes."""
+        return np.asarray(np.array([mu[name] for name in self.names]) / self._units)
 
     def _split(self, x: Vector, mu: Amplitudes) -> tuple[Vector, dict[str, float]]:
         u, y = split(x, len(self.names), self.comm)
@@ -173,22 +190,22 @@ class Device:
 
 
 def constant(q: float) -> Conjugate:
-    """A conjugate that is held."""
+    """Return a conjugate that does not depend on its amplitude."""
     return lambda mu: (q, 0.0)
 
 
 def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:
-    """The amplitude that moves the system by about its length, as a power of two: the same on any
-    number of ranks.
+    """Return the amplitude that moves the system by about its length. Collective.
+
+    It is a power of two: the same on any number of ranks.
     """
-    moved = (
-        max_abs(system.comm, factors.solve(system.load(state.u, state.mu, name))) / system.length
-    )
-    return 2.0 ** -round(log2(moved)) if moved else 1.0
+    response = factors.solve(system.load(state.u, state.mu, name))
+    lengths = max_abs(system.comm, response) / system.length
+    return 2.0 ** -round(log2(lengths)) if lengths else 1.0
 
 
-class Along:
-    """A system in the amplitude t; the inner system has the amplitudes mu_i = f_i(t).
+class ParametrisedSystem:
+    """A system in one amplitude t; the inner system has the amplitudes mu_i = f_i(t).
 
     Parameters
     ----------
@@ -197,7 +214,7 @@ class Along:
     curves
         Amplitude of the inner system -> f_i with its first two derivatives.
     begin
-        t of the states that `contract` gets.
+        The value of t at the states that `contract` gets.
     """
 
     def __init__(
@@ -207,47 +224,50 @@ class Along:
         self.coordinates = system.coordinates
         self._system, self._name, self._curves, self._begin = system, name, curves, begin
 
-    def on(self, system: System) -> "Along":
-        """The same curves on another system."""
-        return Along(system, self._name, self._curves, self._begin)
+    def for_system(self, system: System) -> "ParametrisedSystem":
+        """Return the same curves on another system."""
+        return ParametrisedSystem(system, self._name, self._curves, self._begin)
 
     def contract(self, state: State) -> State:
-        """A state of the inner system with t in place of its amplitudes."""
+        """Return a state of the inner system with t in place of its amplitudes."""
         others = {name: value for name, value in state.mu.items() if name not in self._curves}
         return State(state.u, {self._name: self._begin, **others})
 
     def expand(self, state: State) -> State:
-        """The state with the amplitudes of the inner system."""
+        """Return a state with the amplitudes of the inner system in place of t."""
         return State(state.u, self._expanded(state.mu))
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         return self._system.residual(u, self._expanded(mu))
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        whole, rates = self._expanded(mu), self._rates(mu, name)
-        columns = [rate * self._system.load(u, whole, i) for i, rate in rates.items()]
+        amplitudes, rates = self._expanded(mu), self._rates(mu, name)
+        columns = [rate * self._system.load(u, amplitudes, i) for i, rate in rates.items()]
         return sum(columns[1:], columns[0])
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        whole = self._expanded(mu)
-        return sum(
-            rate * self._system.potential(u, whole, i) for i, rate in self._rates(mu, name).items()
-        )
+        amplitudes, rates = self._expanded(mu), self._rates(mu, name)
+        return sum(rate * self._system.potential(u, amplitudes, i) for i, rate in rates.items())
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        whole, t = self._expanded(mu), mu[self._name]
-        own, others = self._rates(mu, name), self._rates(mu, other)
-        bends = {i: f(t)[2] for i, f in self._curves.items()} if name == other == self._name else {}
+        amplitudes, t = self._expanded(mu), mu[self._name]
+        first_rates, second_rates = self._rates(mu, name), self._rates(mu, other)
         mixed = (
-            a * b * self._system.curvature(u, whole, i, j)
-            for i, a in own.items()
-            for j, b in others.items()
+            a * b * self._system.curvature(u, amplitudes, i, j)
+            for i, a in first_rates.items()
+            for j, b in second_rates.items()
         )
+        second_derivatives = dict[str, float]()
+        if name == other == self._name:
+            second_derivatives = {i: f(t)[2] for i, f in self._curves.items()}
         return sum(mixed) + sum(
-            bend * self._system.potential(u, whole, i) for i, bend in bends.items()
+            derivative * self._system.potential(u, amplitudes, i)
+            for i, derivative in second_derivatives.items()
         )
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> Tangent:
         return self._system.tangent(u, self._expanded(mu), stress)
 
     def _expanded(self, mu: Amplitudes) -> dict[str, float]:
@@ -255,18 +275,17 @@ class Along:
         return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
 
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
-        """Amplitude of the inner system -> dmu_i/dt for t; for one of its own amplitudes, itself ->
-        1.
+        """Return the rates of the inner system's amplitudes with an amplitude: dmu_i/dt with t.
+
+        An amplitude of the inner system changes only itself, with the rate 1.
         """
-        return (
-            {i: f(mu[self._name])[1] for i, f in self._curves.items()}
-            if name == self._name
-            else {name: 1.0}
-        )
+        if name != self._name:
+            return {name: 1.0}
+        return {i: f(mu[self._name])[1] for i, f in self._curves.items()}
 
 
-class HeldAlong:
-    """A system with one more amplitude, a force along b."""
+class HoldingForceSystem:
+    """A system with one more amplitude, `FORCE`, of a force along a vector b."""
 
     def __init__(self, system: System, b: Vector) -> None:
         self.comm, self.size, self.length = system.comm, system.size, system.length
@@ -284,5 +303,7 @@ class HeldAlong:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         return 0.0 if FORCE in (name, other) else self._system.curvature(u, mu, name, other)
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> Tangent:
         return self._system.tangent(u, mu, stress)

@@ -1,4 +1,4 @@
-"""Singular tangents: bordered, so that they are regular, and folds, located and foreseen.
+"""Folds (limit points): bordered regular tangents at them, location, extrapolation, sensitivity.
 
 The tangent is bordered by a vector near its null vector. With b . b = 1,
 
@@ -19,8 +19,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.control import GivenConjugate
-from magshell_fenicsx.continuation.device import FORCE, HeldAlong
+from magshell_fenicsx.continuation.control import PrescribedConjugate
+from magshell_fenicsx.continuation.device import FORCE, HoldingForceSystem
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import Point
@@ -30,31 +30,32 @@ from magshell_fenicsx.continuation.system import (
     System,
     Tangent,
     Vector,
-    Weighted,
+    WeightedDisplacement,
     dot,
-    followed,
+    extrapolated_stress,
     max_abs,
     symmetric_part,
 )
 
-TOLERANCE = 1e-9  # of u with its component along a direction held, in lengths of the system
-MOST_TANGENTS, CONTRACTION = 8, 0.3
-ROUNDING = 1e-5  # in lengths: smaller steps that do not shrink are rounding
+# error of u in lengths, with its component along a direction held
+TOLERANCE = 1e-9
+MAX_TANGENTS = 8
+CONTRACTION = 0.3  # a tangent is kept while it shortens steps to this fraction
+ROUNDING_STEP = 1e-5  # in lengths: smaller steps that do not shrink are rounding
 # in lengths: step of differences along v; only the speed of convergence depends on their error
-DIFFERENCE = 1e-2
+DIFFERENCE_STEP = 1e-2
 FOLD_TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
-FOLD_ROUNDING = (
-    1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
-)
-MOST_ITERATIONS = 8
-LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
-FAR = 0.6  # of the amplitude: a fold further ahead is not estimated well
+# smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
+FOLD_ROUNDING_STEP = 1e-6
+MAX_ITERATIONS = 8
+MAX_STEP = 10.0  # in lengths; a longer one counts as divergence
+# of the amplitude: a fold further ahead is not estimated well
+MAX_DISTANCE_TO_FOLD = 0.6
 
 
 @dataclass(frozen=True)
 class _Spring:
-    """A spring at the degree of freedom where a shape is largest, as stiff as the diagonal entry
-    there.
+    """A spring at one degree of freedom, where a mode is largest, of its own stiffness.
 
     Attributes
     ----------
@@ -66,23 +67,23 @@ class _Spring:
     stiffness: float
 
 
-def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
-    """Add the spring to a tangent, which is then regular at a simple fold."""
+def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
+    """Add a spring to a tangent, which is then regular at a simple fold. Collective.
+
+    The spring is about as stiff as the diagonal entry of the tangent.
+    """
     K = symmetric_part(tangent)
-    size, first = (
-        np.abs(shape[: K.getLocalSize()[0]]),
-        K.getOwnershipRange()[0],
-    )  # without the entries of an edge
-    _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
-    e = np.zeros_like(shape)
+    sizes = np.abs(mode[: K.getLocalSize()[0]])  # without the entries of a border
+    first_row = K.getOwnershipRange()[0]
+    _, owner = comm.allreduce((float(sizes.max(initial=0.0)), comm.rank), MPI.MAXLOC)
+    e = np.zeros_like(mode)
     if comm.rank == owner:
-        e[int(np.argmax(size))] = 1.0
-    sprung = [first + int(i) for i in np.flatnonzero(e)]
-    itself = comm.allreduce(sum(K.getValue(i, i) for i in sprung))
-    stiffness = (
-        2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0
-    )  # the sum is positive
-    for i in sprung:
+        e[int(np.argmax(sizes))] = 1.0
+    rows = [first_row + int(i) for i in np.flatnonzero(e)]
+    diagonal = comm.allreduce(sum(K.getValue(i, i) for i in rows))
+    # the sum of both is positive
+    stiffness = 2 * abs(diagonal) - diagonal or K.norm(PETSc.NormType.INFINITY) or 1.0
+    for i in rows:
         K.setValue(i, i, stiffness, addv=True)
     K.assemble()
     return _Spring(e, stiffness)
@@ -93,118 +94,149 @@ class AugmentedTangent:
 
     A factorisation of K itself would break down at the fold. One more border removes the spring
     exactly.
+
+    Attributes
+    ----------
+    v, g
+        Solution of K v + g b = 0, b . v = 1: v is the null vector where g = 0.
+    unstable
+        Number of unstable directions other than v.
     """
 
     def __init__(
-        self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()
+        self,
+        newton: BorderedNewton,
+        state: State,
+        b: Vector,
+        stress: Sequence[WeightedDisplacement] = (),
     ) -> None:
         self._system = system = newton.system
         K = system.tangent(state.u, state.mu, stress)
-        spring = _sprung(K, b, system.comm)
+        spring = _add_spring(K, b, system.comm)
         self._factors = newton.factorisation
         self._factors.factor(K)
-        self.unstable = self._factors.negative_pivots  # not phi, which the spring has made stable
-        dot_ = partial(dot, system.comm)
-        self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), spring.e, dot_
+        self.unstable = self._factors.negative_pivots  # not v, which the spring has made stable
+        inner = partial(dot, system.comm)
+        self._b, self._e, self._inner = b / np.sqrt(inner(b, b)), spring.e, inner
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
-        q = dot_(self._e, self._q)
+        q = inner(self._e, self._q)
         self._border = np.array(
-            [[1 / spring.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]]
+            [[1 / spring.stiffness - inner(self._e, self._p), q], [q, -inner(self._b, self._q)]]
         )
-        self.v, self.g = self._bordered(np.zeros_like(b), 1.0)
+        self.v, self.g = self._solve_bordered(np.zeros_like(b), 1.0)
 
     def solve(self, f: Vector) -> tuple[Vector, float]:
-        """K w + t b = f with b . w = 0."""
-        return self._bordered(self._factors.solve(f), 0.0)
+        """Return w and t with K w + t b = f and b . w = 0. Collective."""
+        return self._solve_bordered(self._factors.solve(f), 0.0)
 
-    def _bordered(self, y: Vector, c: float) -> tuple[Vector, float]:
-        """K x + t b = f with b . x = c, from y = (K + s e e)^-1 f; s e . x is the spring's force."""
-        force, t = np.linalg.solve(self._border, [self._dot(self._e, y), c - self._dot(self._b, y)])
+    def _solve_bordered(self, y: Vector, c: float) -> tuple[Vector, float]:
+        """Return x and t with K x + t b = f and b . x = c, from y = (K + s e e)^-1 f.
+
+        s e . x is the spring's force.
+        """
+        right_side = [self._inner(self._e, y), c - self._inner(self._b, y)]
+        force, t = np.linalg.solve(self._border, right_side)
         return y + force * self._p - t * self._q, float(t)
 
-    def improved(self, old: State, new: State) -> Vector:
-        """The null vector at a state close by, by one chord iteration of K v + g b = 0."""
-        before, after = (times_tangent(self._system, state, self.v) for state in (old, new))
-        return self.v - self.solve(after - before)[0]
+    def null_vector_at(self, old: State, new: State) -> Vector:
+        """Return the null vector at a nearby state, by one chord iteration of K v + g b = 0.
+
+        Parameters
+        ----------
+        old
+            The state of this tangent.
+        """
+        old_product, new_product = (
+            times_tangent(self._system, state, self.v) for state in (old, new)
+        )
+        return self.v - self.solve(new_product - old_product)[0]
 
 
 def held_along(
-    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
+    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[WeightedDisplacement] = ()
 ) -> tuple[State, float] | None:
-    """The equilibrium with the guess's component along b, which a force along b holds, and its
-    estimated error.
+    """Return the equilibrium in which a force along b holds the guess's component along b.
 
     This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where
-    forces set in within a step, as between shells that touch, it is solved between soft faces
-    first, as `BorderedNewton.solve` does. None if Newton's method fails. `stress` is the stress of
-    the guess, see `System.tangent`.
+    contact forces begin within a step, it is solved between soft faces first, as
+    `BorderedNewton.solve` does. Collective.
+
+    Parameters
+    ----------
+    stress
+        The stress of the guess, see `System.tangent`.
+
+    Returns
+    -------
+    The state and its estimated error in lengths; None if Newton's method fails.
 
     Raises
     ------
     LinAlgError
         If the tangent is singular in another direction too.
     """
-    held = _held_along(newton, guess, b, stress)
-    if held or not newton.options.kinks:
-        return held
-    row = GivenConjugate(
-        system := HeldAlong(newton.system, b), FORCE, -dot(system.comm, b, guess.u)
-    )
-    outcome = newton.on(system).solve(State(guess.u, {**guess.mu, FORCE: 0.0}), FORCE, row)
-    return _held_along(newton, State(outcome.state.u, guess.mu), b) if outcome.converged else None
+    equilibrium = _held_by_full_steps(newton, guess, b, stress)
+    if equilibrium or not newton.options.has_onsets:
+        return equilibrium
+    system = HoldingForceSystem(newton.system, b)
+    row = PrescribedConjugate(system, FORCE, -dot(system.comm, b, guess.u))
+    start = State(guess.u, {**guess.mu, FORCE: 0.0})
+    result = newton.for_system(system).solve(start, FORCE, row)
+    if not result.converged:
+        return None
+    return _held_by_full_steps(newton, State(result.state.u, guess.mu), b)
 
 
-def _held_along(
-    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
+def _held_by_full_steps(
+    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[WeightedDisplacement] = ()
 ) -> tuple[State, float] | None:
-    """The same by full steps alone."""
-    system, u, tangent, last = (
-        newton.system,
-        guess.u,
-        AugmentedTangent(newton, guess, b, stress),
-        np.inf,
-    )
-    tangents, own = 1, True
+    """Return the same as `held_along` by full steps of Newton's method alone."""
+    system, u, last_size = newton.system, guess.u, np.inf
+    tangent, tangents, is_own = AugmentedTangent(newton, guess, b, stress), 1, True
     while True:
         du, _ = tangent.solve(system.residual(u, guess.mu))
         size = max_abs(system.comm, du) / system.length
-        if size <= TOLERANCE or (own and CONTRACTION * last < size <= ROUNDING):
+        is_rounding = is_own and CONTRACTION * last_size < size <= ROUNDING_STEP
+        if size <= TOLERANCE or is_rounding:
             return State(u - du, guess.mu), size
-        if not own and size > CONTRACTION * last:
-            tangent, tangents, own = (
-                AugmentedTangent(newton, State(u, guess.mu), b, stress),
-                tangents + 1,
-                True,
-            )
+        if not is_own and size > CONTRACTION * last_size:
+            tangent = AugmentedTangent(newton, State(u, guess.mu), b, stress)
+            tangents, is_own = tangents + 1, True
             continue
-        if tangents > MOST_TANGENTS or not np.isfinite(size):
+        if tangents > MAX_TANGENTS or not np.isfinite(size):
             return None
-        u, last, own, stress = u - du, size, False, followed(u, -du)
+        u, last_size, is_own, stress = u - du, size, False, extrapolated_stress(u, -du)
 
 
-def third(system: System, state: State, v: Vector, residual: Vector | None = None) -> Vector:
-    """Pi'''(v, v, .), by a second difference of the residual, which may be known at the state
-    itself.
+def third_derivative(
+    system: System, state: State, v: Vector, residual: Vector | None = None
+) -> Vector:
+    """Return Pi'''(v, v, .), by a second difference of the residual. Collective.
+
+    Parameters
+    ----------
+    residual
+        The residual at the state, if it is known.
     """
-    d = offset(system, v)
-    back, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 1))
+    d = difference_step(system, v)
+    backward, forward = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 1))
     residual = system.residual(state.u, state.mu) if residual is None else residual
-    return np.asarray((back - 2 * residual + ahead) / d**2)
+    return np.asarray((backward - 2 * residual + forward) / d**2)
 
 
 def times_tangent(system: System, state: State, v: Vector) -> Vector:
-    """K v."""
+    """Return K v by a difference of the residual. Collective."""
     return first_difference(lambda u: system.residual(u, state.mu), system, state.u, v)
 
 
 def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v: Vector) -> Vector:
-    """Derivative of f at u along v."""
-    d = offset(system, v)
+    """Return the derivative of f at u along v. Collective."""
+    d = difference_step(system, v)
     return np.asarray((f(u + d * v) - f(u - d * v)) / (2 * d))
 
 
-def offset(system: System, v: Vector) -> float:
-    """Of a difference along v.
+def difference_step(system: System, v: Vector) -> float:
+    """Return the factor of v in a difference along it. Collective.
 
     Raises
     ------
@@ -214,7 +246,7 @@ def offset(system: System, v: Vector) -> float:
     size = max_abs(system.comm, v)
     if size == 0.0:
         raise np.linalg.LinAlgError
-    return DIFFERENCE * system.length / size
+    return DIFFERENCE_STEP * system.length / size
 
 
 class FoldLost(RuntimeError):
@@ -222,8 +254,8 @@ class FoldLost(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Guess:
-    """A state near a fold, and the null vector; without that it is computed from the tangent."""
+class FoldGuess:
+    """A state near a fold, and the null vector; None if it is to be computed from the tangent."""
 
     state: State
     phi: Vector | None = None
@@ -238,13 +270,13 @@ class Fold:
     phi
         Null vector of K; its largest entry is one in magnitude, and the displacement conjugate to
         the amplitude grows along it.
-    left
-        Null vector of the transposed K: `phi`, but for loads without potential.
+    left_null_vector
+        Null vector of the transposed K: `phi`, except for loads without potential.
     curvature
         Second derivative of the amplitude along the path in units of `phi` times the system's
         length; negative where the amplitude is largest.
     unstable
-        Number of unstable directions besides `phi`.
+        Number of unstable directions other than `phi`.
     iterations, factorisations
         Work.
     """
@@ -252,7 +284,7 @@ class Fold:
     state: State
     name: str
     phi: Vector
-    left: Vector
+    left_null_vector: Vector
     curvature: float
     unstable: int
     iterations: int
@@ -264,66 +296,74 @@ class Fold:
         return self.state.mu[self.name]
 
 
-def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
-    """The fold in the amplitude `name` near a guess, to 1e-9 lengths if rounding allows that.
+def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
+    """Locate the fold in the amplitude `name` near a guess. Collective.
 
-    With tiny elements, rounding of K leaves an error of 1e-8 lengths along phi. The amplitude is
-    stationary along phi, so it is accurate nevertheless.
+    Its error is 1e-9 lengths if rounding allows that. With tiny elements, rounding of K leaves an
+    error of 1e-8 lengths along phi. The amplitude is stationary along phi, so it is accurate
+    nevertheless.
 
     Raises
     ------
     FoldLost
         If Newton's method diverges or takes too long.
     """
-    system, state, before = newton.system, guess.state, newton.factorisation.count
-    b, steps = guess.phi, list[float]()
-    while not steps or _remaining(steps) > FOLD_TOLERANCE:
-        if len(steps) == MOST_ITERATIONS:
-            raise FoldLost(f"Newton's method found no fold in {MOST_ITERATIONS} iterations")
+    system, state, count = newton.system, guess.state, newton.factorisation.count
+    b, sizes = guess.phi, list[float]()
+    while not sizes or _remaining_error(sizes) > FOLD_TOLERANCE:
+        if len(sizes) == MAX_ITERATIONS:
+            raise FoldLost(f"Newton's method found no fold in {MAX_ITERATIONS} iterations")
         try:
             tangent = AugmentedTangent(
-                newton, state, b if b is not None else _first_shape(newton, state, name)
+                newton, state, b if b is not None else _response_to_load(newton, state, name)
             )
-            du, dmu = _step(system, state, name, tangent)
+            du, dmu = _newton_step(system, state, name, tangent)
         except np.linalg.LinAlgError:
             raise FoldLost("the tangent is singular in more than one direction") from None
         b = tangent.v
-        steps.append(max_abs(system.comm, du) / system.length)
-        growing = len(steps) > 2 and steps[-1] > max(2 * steps[-2], FOLD_ROUNDING)
-        if growing or not steps[-1] <= LARGEST_STEP:
+        sizes.append(max_abs(system.comm, du) / system.length)
+        grows = len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], FOLD_ROUNDING_STEP)
+        if grows or not sizes[-1] <= MAX_STEP:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
-    phi = _oriented(system, tangent.improved(last, state), system.load(state.u, state.mu, name))
-    pull, cubic = (
-        dot(system.comm, phi, system.load(state.u, state.mu, name)),
-        third(system, state, phi),
-    )
+    load = system.load(state.u, state.mu, name)
+    phi = _oriented(system, tangent.null_vector_at(last, state), load)
+    work = dot(system.comm, phi, system.load(state.u, state.mu, name))
+    cubic = third_derivative(system, state, phi)
+    is_symmetric = not newton.factorisation.skewed
+    left_null_vector = phi if is_symmetric else _left_null_vector(newton, state, phi)
     return Fold(
         state=state,
         name=name,
         phi=phi,
-        left=_left(newton, state, phi) if newton.factorisation.skewed else phi,
-        curvature=-dot(system.comm, phi, cubic) * system.length**2 / pull,
+        left_null_vector=left_null_vector,
+        curvature=-dot(system.comm, phi, cubic) * system.length**2 / work,
         unstable=tangent.unstable,
-        iterations=len(steps),
-        factorisations=newton.factorisation.count - before,
+        iterations=len(sizes),
+        factorisations=newton.factorisation.count - count,
     )
 
 
 def sensitivity(system: System, fold: Fold, column: Vector) -> float:
-    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(left .
-    R_p)/(left . R_mu).
+    """Return the derivative of the fold's amplitude by a parameter p: -(l . R_p)/(l . R_mu).
 
-    For another amplitude, R_p is its load column.
+    Here l is the left null vector. Collective.
+
+    Parameters
+    ----------
+    column
+        R_p at the fold. For another amplitude it is that amplitude's load vector.
     """
-    pull = dot(system.comm, fold.left, system.load(fold.state.u, fold.state.mu, fold.name))
-    return -dot(system.comm, fold.left, column) / pull
+    load = system.load(fold.state.u, fold.state.mu, fold.name)
+    return -dot(system.comm, fold.left_null_vector, column) / dot(
+        system.comm, fold.left_null_vector, load
+    )
 
 
 def predict_fold(
     system: System, folds: Sequence[tuple[float, Fold]], p: float, others: Amplitudes
-) -> Guess:
-    """Extrapolate folds at other values of a parameter to `p`.
+) -> FoldGuess:
+    """Extrapolate folds at other values of a parameter to `p`. Collective.
 
     The polynomials through the last one, two and three folds are compared, and the one with the
     least residual is used: for long or uneven steps a quadratic may be worse than no extrapolation.
@@ -332,7 +372,7 @@ def predict_fold(
     ----------
     system
         The system at `p`.
-    known
+    folds
         Parameters and folds, in the unknowns of `system`, in the order of the continuation.
     others
         The other amplitudes at `p`.
@@ -342,21 +382,21 @@ def predict_fold(
     return guesses[int(np.argmin([dot(system.comm, R, R) for R in residuals]))]
 
 
-def _extrapolated(located: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+def _extrapolated(located: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> FoldGuess:
     values, folds = [value for value, _ in located], [fold for _, fold in located]
-    weights = [_lagrange(values, i, p) for i in range(len(values))]
+    weights = [_lagrange_weight(values, i, p) for i in range(len(values))]
     u = np.sum([w * fold.state.u for w, fold in zip(weights, folds, strict=True)], axis=0)
     mu = sum(w * fold.value for w, fold in zip(weights, folds, strict=True))
-    return Guess(State(u, {**others, folds[-1].name: mu}), folds[-1].phi)
+    return FoldGuess(State(u, {**others, folds[-1].name: mu}), folds[-1].phi)
 
 
-def _first_shape(newton: BorderedNewton, state: State, name: str) -> Vector:
-    """Near a fold the response to the load is nearly the null vector."""
+def _response_to_load(newton: BorderedNewton, state: State, name: str) -> Vector:
+    """Return the response to the load, which near a fold is nearly the null vector."""
     return newton.factor_at(state).solve(newton.system.load(state.u, state.mu, name))
 
 
-def _left(newton: BorderedNewton, state: State, v: Vector) -> Vector:
-    """The null vector of the transposed tangent, by inverse iteration."""
+def _left_null_vector(newton: BorderedNewton, state: State, v: Vector) -> Vector:
+    """Return the null vector of the transposed tangent, by inverse iteration from v."""
     factors = newton.factor_at(state)
     for _ in range(3):
         v = factors.solve_transposed(v)
@@ -364,48 +404,55 @@ def _left(newton: BorderedNewton, state: State, v: Vector) -> Vector:
     return v
 
 
-def _step(
+def _newton_step(
     system: System, state: State, name: str, tangent: AugmentedTangent
 ) -> tuple[Vector, float]:
-    """Newton's step du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g."""
+    """Return Newton's step (du, dmu) for R = 0 and g = 0.
+
+    du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g.
+    """
     comm, u, v = system.comm, state.u, tangent.v
     w_R, t_R = tangent.solve(system.residual(u, state.mu))
     w_mu, t_mu = tangent.solve(system.load(u, state.mu, name))
-    cubic = third(system, state, v)
+    cubic = third_derivative(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
-    turn = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)
-    rows = [[t_mu, -tangent.g], [turn, -dot(comm, cubic, v)]]
+    g_mu = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)
+    rows = [[t_mu, -tangent.g], [g_mu, -dot(comm, cubic, v)]]
     dmu, alpha = np.linalg.solve(rows, [-t_R, -tangent.g - dot(comm, cubic, w_R)])
     return alpha * v - w_R - dmu * w_mu, float(dmu)
 
 
 def _oriented(system: System, v: Vector, load: Vector) -> Vector:
+    """Return v with its largest entry one in magnitude, along which the conjugate grows."""
     sense = -np.sign(dot(system.comm, v, load))
     return np.asarray(sense * v / max_abs(system.comm, v))
 
 
-def _remaining(steps: Sequence[float]) -> float:
-    """Error after the last of a sequence of steps that shrinks at least as fast as a geometric one."""
-    rate = steps[-1] / steps[-2] if len(steps) > 1 else 0.5
-    if rate > 0.5 and steps[-1] <= FOLD_ROUNDING:
+def _remaining_error(sizes: Sequence[float]) -> float:
+    """Return the error after the last step, if sizes shrink like a geometric series or faster."""
+    ratio = sizes[-1] / sizes[-2] if len(sizes) > 1 else 0.5
+    if ratio > 0.5 and sizes[-1] <= FOLD_ROUNDING_STEP:
         return 0.0
-    return steps[-1] * rate / (1 - rate) if rate < 1 else np.inf
+    return sizes[-1] * ratio / (1 - ratio) if ratio < 1 else np.inf
 
 
-def _lagrange(values: Sequence[float], i: int, p: float) -> float:
-    """Weight of the value `i` in the polynomial through all."""
+def _lagrange_weight(values: Sequence[float], i: int, p: float) -> float:
+    """Return the weight at p of the value `i` in the polynomial through all values."""
     return float(np.prod([(p - v) / (values[i] - v) for j, v in enumerate(values) if j != i]))
 
 
-def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
-    """A guess of the next fold in the amplitude `name`, growing in size; None if it is far or not
-    seen yet.
+def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> FoldGuess | None:
+    """Predict the next fold in the amplitude `name`, for growing magnitude. Collective.
 
     Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu
     varied by m, equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi
     . R_mu = lambda phi . du/dmu. The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other
-    modes follow mu linearly. The null vector of the guess points the way that the path goes. One
-    factorisation.
+    modes follow mu linearly. The null vector of the guess points the way that the path goes. It
+    takes one factorisation.
+
+    Returns
+    -------
+    None if the fold is far, or the path does not show it yet.
     """
     system, state = newton.system, point.state
     comm, mu = system.comm, state.mu[name]
@@ -414,12 +461,13 @@ def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
     except NoEigenpair:
         return None
     rate, phi = np.asarray(point.du / point.dmu), mode.vector
-    along, cubic = dot(comm, phi, rate), dot(comm, phi, third(system, state, phi))
-    pull = mode.eigenvalue * along
-    if mode.eigenvalue <= 0 or not cubic * pull:
+    rate_along_phi = dot(comm, phi, rate)
+    cubic = dot(comm, phi, third_derivative(system, state, phi))
+    work = mode.eigenvalue * rate_along_phi
+    if mode.eigenvalue <= 0 or not cubic * work:
         return None
-    step = -(mode.eigenvalue**2) / (2 * cubic * pull)
-    if not 0 < step / mu < FAR:
+    dmu = -(mode.eigenvalue**2) / (2 * cubic * work)
+    if not 0 < dmu / mu < MAX_DISTANCE_TO_FOLD:
         return None
-    u = state.u + step * (rate - along * phi) - mode.eigenvalue / cubic * phi
-    return Guess(state.with_(u, name, mu + step), np.sign(step * along) * phi)
+    u = state.u + dmu * (rate - rate_along_phi * phi) - mode.eigenvalue / cubic * phi
+    return FoldGuess(state.with_(u, name, mu + dmu), np.sign(dmu * rate_along_phi) * phi)

@@ -1,4 +1,9 @@
-"""The steps of one solve by Newton's method, from which alone its convergence is judged."""
+"""Convergence of one Newton solve, judged by the sizes of its steps alone.
+
+Each step has its size in lengths of the system, and whether its matrix was computed at the same
+iterate. From these `Iterates.judge` decides whether the solve has converged, goes on, or is given
+up (P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -7,142 +12,147 @@ from typing import Literal
 
 import numpy as np
 
-GROWN = 2.0  # times as long as the one before, a step leads away
-FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
-SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
-GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
-STUCK = 5  # matrices after which a step is not half as long: a hasty solve is given up
-# steps that twice shrink more than to this part foresee the next ones; once may be by chance
-STEADY = 0.1
-SURE = 0.1  # part of the tolerance, for an error that is foreseen
-ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
+DIVERGENCE_RATIO = 2.0  # a step that is longer than the previous one by this factor diverges
+QUADRATIC_RATIO = 0.5  # a larger ratio of successive full steps shows no quadratic convergence
+SMALL_STEP = 1e-3  # full Newton steps below this size shrink, unless they are rounding
+PATIENCE_RATIO = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
+# matrices within which a step must be halved, or an early-stopping solve is given up
+MAX_MATRICES_TO_HALVE = 5
+# two successive ratios below this one allow extrapolation of the error; one may be by chance
+EXTRAPOLATION_RATIO = 0.1
+EXTRAPOLATED_TOLERANCE = 0.1  # fraction of the tolerance, for an error that is extrapolated
+ROUNDING_FACTOR = 10.0  # steps up to this many times the rounding error count as rounding
 
 Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
-def foreseen(sizes: Sequence[float], ratios: int) -> float:
-    """The error after the last of some steps, if all further ones shrink as so many did; infinite
-    if one shrank little.
+def extrapolated_error(sizes: Sequence[float], ratios: int) -> float:
+    """Return the error after the last of some steps, if all further ones shrink like the last ones.
 
-    See P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4.
+    Parameters
+    ----------
+    ratios
+        Number of the last ratios of successive steps of which the largest counts.
+
+    Returns
+    -------
+    The error; infinite if there are too few steps or one of the ratios is too large.
     """
-    rate = max(b / a for a, b in pairwise(sizes[-1 - ratios :])) if len(sizes) > ratios else np.inf
-    return sizes[-1] * rate / (1 - rate) if rate <= STEADY else np.inf
+    if len(sizes) <= ratios:
+        return np.inf
+    ratio = max(b / a for a, b in pairwise(sizes[-1 - ratios :]))
+    return sizes[-1] * ratio / (1 - ratio) if ratio <= EXTRAPOLATION_RATIO else np.inf
 
 
 @dataclass(frozen=True)
-class Step:
+class NewtonStep:
     """The next step at an iterate.
 
     Attributes
     ----------
     size
-        Size of the step, see `Bordered.size`.
-    own
+        Size of the step, see `BorderedMatrix.size`.
+    is_own
         Whether the matrix was computed at this iterate.
     pivots
-        Its negative ones.
+        Number of negative pivots of the matrix.
     """
 
     size: float
-    own: bool
+    is_own: bool
     pivots: int = 0
 
 
 @dataclass
 class Iterates:
-    """The steps of one solve, in lengths of the system, from which alone its convergence is judged.
+    """The steps of one solve, in lengths of the system, by which its convergence is judged.
 
     Parameters
     ----------
     largest
         A longer step counts as divergence.
     patience
-        Matrices after which steps must have shrunk.
+        Number of matrices after which steps must have shrunk.
     searched
-        Whether a line search shortens them: then they may grow.
+        Whether a line search shortens the steps: then they may grow.
     kinks
-        Whether steps may shrink suddenly less: then none is foreseen.
-    hasty
+        Whether convergence may suddenly slow down: then no error is extrapolated.
+    stops_early
         Whether the solve is given up early where a shorter step of the path costs less.
-    rough
-        Part of the first step up to which the error need not fall below.
+    relative_tolerance
+        Fraction of the first step; an error of that size is accepted.
     allowed
-        The foreseen error up to which the last iterate was accepted.
+        The extrapolated error up to which the last iterate was accepted.
     """
 
     largest: float = np.inf
     patience: int = 4
     searched: bool = False
     kinks: bool = False
-    hasty: bool = False
-    rough: float = 0.0
-    steps: list[Step] = field(default_factory=list)
+    stops_early: bool = False
+    relative_tolerance: float = 0.0
+    steps: list[NewtonStep] = field(default_factory=list)
     allowed: float = 0.0
 
     @property
-    def foreseen(self) -> float:
-        """The error after the last step, where the last two ratios foresee it.
+    def extrapolated_error(self) -> float:
+        """The error after the last step, extrapolated from the last two ratios.
 
         Bending may converge at once and hide stretching, which converges slowly: so one small ratio
-        foresees nothing.
+        is not enough.
         """
-        return (
-            np.inf
-            if self.kinks or self.searched
-            else foreseen([step.size for step in self.steps], 2)
-        )
+        if self.kinks or self.searched:
+            return np.inf
+        return extrapolated_error([step.size for step in self.steps], 2)
 
     @property
     def error(self) -> float:
-        """The estimated error after the last step; where that was foreseen, no less than what was
-        allowed.
-        """
-        return min(self.steps[-1].size, max(self.foreseen, self.allowed)) if self.steps else np.inf
+        """The estimated error after the last step; if extrapolated, at least what was allowed."""
+        if not self.steps:
+            return np.inf
+        return min(self.steps[-1].size, max(self.extrapolated_error, self.allowed))
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
-        """The verdict on the iterate, from the last step.
+        """Return the verdict on the iterate, from the last step.
 
         Parameters
         ----------
         tolerance
-            Of the iterate's error.
+            Largest error of the iterate.
         rounding
             Computes the error from rounding of the residual.
         """
-        step, before = self.steps[-1], self.steps[:-1]
-        tolerance = max(tolerance, self.rough * self.steps[0].size)
+        step, earlier = self.steps[-1], self.steps[:-1]
+        tolerance = max(tolerance, self.relative_tolerance * self.steps[0].size)
         if not step.size <= self.largest:
-            return "far" if self.hasty else "diverged"
-        self.allowed = SURE * tolerance * min(1.0, max(step.size for step in self.steps))
-        if step.size <= tolerance or self.foreseen <= self.allowed:
+            return "far" if self.stops_early else "diverged"
+        longest = max(step.size for step in self.steps)
+        self.allowed = EXTRAPOLATED_TOLERANCE * tolerance * min(1.0, longest)
+        if step.size <= tolerance or self.extrapolated_error <= self.allowed:
             return "converged"
-        own = [s for s in before if s.own]
-        full = [s.size for s in own]
-        if self.hasty and step.own and self._astray(own, step):
+        if not step.is_own:
+            return "go on"
+        earlier_own = [s for s in earlier if s.is_own]
+        if self.stops_early and self._leads_astray(earlier_own, step):
             return "far"
-        stalled = (
-            step.own and before and before[-1].own and FULL * before[-1].size < step.size < SMALL
-        )
-        if stalled and step.size <= ROUNDING * rounding():
-            return "rounding"
-        if (
-            step.own
-            and len(before) > 2
-            and full
-            and step.size > GROWN * full[-1]
-            and not self.searched
-        ):
+        if earlier and earlier[-1].is_own:
+            stalled = QUADRATIC_RATIO * earlier[-1].size < step.size < SMALL_STEP
+            if stalled and step.size <= ROUNDING_FACTOR * rounding():
+                return "rounding"
+        sizes = [s.size for s in earlier_own]
+        grows = bool(sizes) and step.size > DIVERGENCE_RATIO * sizes[-1]
+        if len(earlier) > 2 and grows and not self.searched:
             return "diverged"
-        if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
+        if len(sizes) >= self.patience and step.size > PATIENCE_RATIO * sizes[0]:
             return "diverged"
         return "go on"
 
-    def _astray(self, before: Sequence[Step], step: Step) -> bool:
-        """Whether steps with matrices of their own lead away, past an instability, or stay long."""
-        if len(before) == 1 and step.pivots != before[0].pivots:
-            past = (
-                step.pivots > before[0].pivots
-            )  # a shorter step of the path sees the instability, too
-            return step.size > (FULL if past else GROWN) * before[0].size
-        return len(before) >= STUCK and step.size > FULL * before[-STUCK].size
+    def _leads_astray(self, earlier: Sequence[NewtonStep], step: NewtonStep) -> bool:
+        """Return whether steps with own matrices lead away, past an instability, or stay long."""
+        if len(earlier) == 1 and step.pivots != earlier[0].pivots:
+            # past an instability, which a shorter step of the path meets too
+            is_past = step.pivots > earlier[0].pivots
+            return step.size > (QUADRATIC_RATIO if is_past else DIVERGENCE_RATIO) * earlier[0].size
+        if len(earlier) < MAX_MATRICES_TO_HALVE:
+            return False
+        return step.size > QUADRATIC_RATIO * earlier[-MAX_MATRICES_TO_HALVE].size

@@ -21,21 +21,19 @@ from slepc4py import SLEPc
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, dot, symmetric_part
 
-TOLERANCE = (
-    1e-8  # of K^-1 v - v/lambda, over 1/|lambda|; the error of the eigenvalue is of its square
-)
-MOST_SOLVES = 300
-MOST_VECTORS, KEPT = 24, 8  # vectors in the space before a restart, and after it
+# of K^-1 v - v/lambda, over 1/|lambda|; the error of the eigenvalue is of its square
+TOLERANCE = 1e-8
+MAX_SOLVES = 300
+MAX_VECTORS, VECTORS_AFTER_RESTART = 24, 8  # of the Krylov space
 # if a and -a are equally near to zero up to this relative difference, the negative one is returned
-TIED = 1e-6
-PATIENCE = (
-    12  # after so many solves without progress, a residual at the level of rounding is accepted
-)
+TIE_TOLERANCE = 1e-6
+# after so many solves without progress, a residual at the level of rounding is accepted
+PATIENCE = 12
 ROUNDING = 100 * np.finfo(float).eps  # level of rounding of K v - lambda v, over the norm of K
 LANCZOS_TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
 # eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
-MARGIN = 1e-6
-MOST_TRIALS = 30
+MULTIPLE_TOLERANCE = 1e-6
+MAX_TRIALS = 30
 
 
 class NoEigenpair(RuntimeError):
@@ -43,36 +41,42 @@ class NoEigenpair(RuntimeError):
 
 
 def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
-    """Eigenvalue and eigenvector of length one; for a nearly singular tangent that is the null
-    vector. Collective.
+    """Return the eigenvalue nearest to zero and its eigenvector of length one. Collective.
 
-    The sign of the vector is arbitrary; for a multiple eigenvalue it is any vector of the
-    eigenspace.
+    For a nearly singular tangent the eigenvector is the null vector. Its sign is arbitrary; for a
+    multiple eigenvalue it is any vector of the eigenspace.
 
     Raises
     ------
     NoEigenpair
         On all ranks, if the residual reaches neither the tolerance nor the level of rounding.
     """
-    space, best, waited = _Space(factors), np.inf, 0
-    while space.solves < MOST_SOLVES:
-        pair = space.grown()
-        if pair.error <= TOLERANCE or space.exhausted:
+    space, least_error, solves_without_progress = _InverseKrylovSpace(factors), np.inf, 0
+    while space.solves < MAX_SOLVES:
+        pair = space.grow()
+        if pair.error <= TOLERANCE or space.is_whole:
             return pair.value, pair.vector
-        waited = 0 if pair.error < best / 2 else waited + 1
-        best = min(best, pair.error)
-        if waited >= PATIENCE and pair.error * abs(pair.value) <= ROUNDING * space.norm:
+        progresses = pair.error < least_error / 2
+        solves_without_progress = 0 if progresses else solves_without_progress + 1
+        least_error = min(least_error, pair.error)
+        is_rounding = pair.error * abs(pair.value) <= ROUNDING * space.norm
+        if solves_without_progress >= PATIENCE and is_rounding:
             return pair.value, pair.vector
     raise NoEigenpair(
-        f"the tangent's eigenvalue nearest to zero is not found in {MOST_SOLVES} solves: at {pair.value:.3g} "
-        f"the residual is still {pair.error:.1g} of it"
+        f"the tangent's eigenvalue nearest to zero is not found in {MAX_SOLVES} solves: "
+        f"at {pair.value:.3g} the residual is still {pair.error:.1g} of it"
     )
 
 
 @dataclass(frozen=True)
-class _Pair:
-    """`error`: the residual over 1/|lambda|, including that of a pair of the other sign that may be
-    nearer to zero.
+class _RitzPair:
+    """An approximate eigenpair.
+
+    Attributes
+    ----------
+    error
+        The residual over 1/|lambda|, including that of a pair of the other sign that may be nearer
+        to zero.
     """
 
     value: float
@@ -80,24 +84,24 @@ class _Pair:
     error: float
 
 
-class _Space:
-    """Orthonormal vectors V and their images W = K^-1 V."""
+class _InverseKrylovSpace:
+    """A Krylov space of K^-1: orthonormal vectors V and their images W = K^-1 V, as rows."""
 
     def __init__(self, factors: Factorisation) -> None:
         self._factors, self._comm = factors, factors.comm
         n, self._size = factors.size
         self._count, self.solves = 0, 0
-        self._V, self._W = np.empty((MOST_VECTORS, n)), np.empty((MOST_VECTORS, n))
+        self._V, self._W = np.empty((MAX_VECTORS, n)), np.empty((MAX_VECTORS, n))
         self._next = np.sin(1.0 + np.arange(n) + self._comm.rank)
         self.norm = factors.norm
 
     @property
-    def exhausted(self) -> bool:
-        """Whether the space is the whole one."""
+    def is_whole(self) -> bool:
+        """Whether the space contains all vectors."""
         return self._count == self._size
 
-    def grown(self) -> _Pair:
-        """Add one vector; the pair nearest to zero in the larger space."""
+    def grow(self) -> _RitzPair:
+        """Add one vector; return the pair nearest to zero in the larger space."""
         v, k = self._next, self._count
         for _ in range(2):  # a second time against rounding
             v = v - self._sums(self._V[:k] @ v) @ self._V[:k]
@@ -114,40 +118,42 @@ class _Space:
             theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
         pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
-        if self._count == MOST_VECTORS:
-            far = np.argsort(-np.abs(theta))[:KEPT]
-            kept = np.linalg.qr(Y[:, far])[0] if self._factors.skewed else Y[:, far]
-            self._count = kept.shape[1]
-            V[: self._count], W[: self._count] = kept.T @ V, kept.T @ W
+        if self._count == MAX_VECTORS:
+            largest = np.argsort(-np.abs(theta))[:VECTORS_AFTER_RESTART]
+            Y = np.linalg.qr(Y[:, largest])[0] if self._factors.skewed else Y[:, largest]
+            self._count = Y.shape[1]
+            V[: self._count], W[: self._count] = Y.T @ V, Y.T @ W
         return pair
 
     def _pair(self, theta: float, y: NDArray[np.float64]) -> tuple[float, Vector, Vector]:
-        """1/lambda, its vector after one more inverse iteration, and the residual."""
+        """Return 1/lambda, its vector after one more inverse iteration, and the residual."""
         V, W = self._V[: self._count], self._W[: self._count]
         w = y @ W
         return theta, w / np.sqrt(dot(self._comm, w, w)), w - theta * (y @ V)
 
-    def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _Pair:
-        (theta, w, rest), *others = sorted(pairs, key=lambda pair: -abs(pair[0]))
-        size = np.sqrt(dot(self._comm, rest, rest))
-        self._next, error = rest, size / abs(theta)
-        for rival, rival_w, rival_rest in others:
-            rival_size = np.sqrt(dot(self._comm, rival_rest, rival_rest))
-            if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIED) * abs(theta):
+    def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _RitzPair:
+        """Return the pair nearest to zero; its residual is the next vector of the space."""
+        (theta, w, residual), *rivals = sorted(pairs, key=lambda pair: -abs(pair[0]))
+        size = np.sqrt(dot(self._comm, residual, residual))
+        self._next, error = residual, size / abs(theta)
+        for rival, rival_w, rival_residual in rivals:
+            rival_size = np.sqrt(dot(self._comm, rival_residual, rival_residual))
+            if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIE_TOLERANCE) * abs(theta):
                 error = max(error, rival_size / abs(theta))
-                self._next = rest if size > rival_size else rival_rest
-                if rival < 0 and abs(rival) >= (1 - TIED) * abs(theta):
+                self._next = residual if size > rival_size else rival_residual
+                if rival < 0 and abs(rival) >= (1 - TIE_TOLERANCE) * abs(theta):
                     theta, w = rival, rival_w
-        return _Pair(1 / theta, w, error)
+        return _RitzPair(1 / theta, w, error)
 
-    def _sums(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Inner products over all ranks."""
-        return np.asarray(self._comm.allreduce(shares))
+    def _sums(self, local_products: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return inner products over all ranks, from those on this rank."""
+        return np.asarray(self._comm.allreduce(local_products))
 
 
 def _real_pairs(A: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The eigenpairs of a small matrix, ascending; real eigenvalues alone if there are any, else
-    real parts.
+    """Return the eigenpairs of a small matrix, ascending.
+
+    They are those of real eigenvalues alone if there are any, else the real parts of all.
     """
     theta, Y = np.linalg.eig(A)
     real = theta.imag == 0.0
@@ -160,14 +166,12 @@ class Stability(Protocol):
     """A tangent whose inertia decides stability."""
 
     def factor_at(self, state: State) -> Factorisation:
-        """Factor the tangent at a state."""
+        """Factor the tangent at a state. Collective."""
 
 
 @dataclass(frozen=True)
 class CriticalMode:
-    """Eigenpair of a tangent whose eigenvalue is nearest to zero; `negative_pivots` of the same
-    tangent.
-    """
+    """The eigenpair of a tangent nearest to zero, and the tangent's number of negative pivots."""
 
     eigenvalue: float
     vector: Vector
@@ -175,7 +179,7 @@ class CriticalMode:
 
 
 def critical_mode(stability: Stability, state: State) -> CriticalMode:
-    """The eigenpair nearest to zero; the vector has length one."""
+    """Return the eigenpair of a tangent nearest to zero; the vector has length one. Collective."""
     factors = stability.factor_at(state)
     return CriticalMode(*nearest_to_zero(factors), factors.negative_pivots)
 
@@ -185,7 +189,7 @@ class ModesNotFound(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Mode:
+class Eigenpair:
     """An eigenpair.
 
     Attributes
@@ -200,8 +204,8 @@ class Mode:
     vector: Vector
 
 
-def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> list[Mode]:
-    """The algebraically lowest eigenpairs of K phi = lambda M phi, ascending.
+def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> list[Eigenpair]:
+    """Return the algebraically lowest eigenpairs of K phi = lambda M phi, ascending. Collective.
 
     Parameters
     ----------
@@ -210,7 +214,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
         that is given.
     M
         A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and
-        columns for the held ones. Its sparsity pattern is part of that of K.
+        columns for the constrained ones. Its sparsity pattern is part of that of K.
     count
         Number of eigenpairs. If there are more negative eigenvalues, all of these are returned.
     kernel
@@ -222,37 +226,40 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
     ModesNotFound
         If Lanczos does not converge, or Sylvester's law says that some eigenvalues stay hidden.
     """
-    slices = _Slices(K, M)
-    wanted = min(max(count, kernel or slices.below(0.0)), slices.finite)
+    slices = _SpectrumSlices(K, M)
+    requested = min(max(count, kernel or slices.count_below(0.0)), slices.finite_count)
     # (a) the eigenvalues nearest to zero give the order of magnitude
-    nearest = slices.around(-slices.rounding if kernel else 0.0, wanted + kernel + 1, 1e-3)
+    nearest = slices.nearest_to(-slices.rounding if kernel else 0.0, requested + kernel + 1, 1e-3)
     shift = -2 * max(abs(mode.eigenvalue) for mode in nearest)
     # (b) a shift with nothing below it
     trials = 0
-    while slices.below(shift):
-        if (trials := trials + 1) == MOST_TRIALS:
+    while slices.count_below(shift):
+        if (trials := trials + 1) == MAX_TRIALS:
             raise ModesNotFound(f"the tangent has eigenvalues below {shift:g}")
         shift *= 4
     # (c) the eigenvalues above it; again with more if some below the last one were missed
-    sought = wanted
-    for _ in range(MOST_TRIALS):
-        modes = slices.around(shift, sought, LANCZOS_TOLERANCE)
-        last = modes[wanted - 1].eigenvalue
-        above = last + MARGIN * (last - shift)
-        missed = slices.below(above) - sum(mode.eigenvalue < above for mode in modes)
+    computed = requested
+    for _ in range(MAX_TRIALS):
+        modes = slices.nearest_to(shift, computed, LANCZOS_TOLERANCE)
+        last = modes[requested - 1].eigenvalue
+        upper_bound = last + MULTIPLE_TOLERANCE * (last - shift)
+        missed = slices.count_below(upper_bound) - sum(
+            mode.eigenvalue < upper_bound for mode in modes
+        )
         if missed <= 0:
-            return [Mode(0.0, mode.vector) for mode in modes[:kernel]] + modes[kernel:wanted]
-        sought += missed
-    raise ModesNotFound(f"{missed} eigenvalues below {above:g} stay hidden from Lanczos")
+            kernel_modes = [Eigenpair(0.0, mode.vector) for mode in modes[:kernel]]
+            return kernel_modes + modes[kernel:requested]
+        computed += missed
+    raise ModesNotFound(f"{missed} eigenvalues below {upper_bound:g} stay hidden from Lanczos")
 
 
 def null_vector(K: Tangent) -> Vector:
-    """The eigenvector of length one of the eigenvalue nearest to zero of a tangent.
+    """Return the eigenvector of length one of a tangent's eigenvalue nearest to zero. Collective.
 
     Raises
     ------
     ModesNotFound
-        See `nearest_to_zero`.
+        If `nearest_to_zero` finds no eigenpair.
     """
     factorisation = Factorisation(symmetric_part(K).comm.tompi4py())
     factorisation.factor(K)
@@ -262,9 +269,15 @@ def null_vector(K: Tangent) -> Vector:
         raise ModesNotFound(str(e)) from None
 
 
-class _Slices:
-    """K - sigma M for several sigma: its inertia, and the eigenpairs around sigma; the latest
-    factors are kept.
+class _SpectrumSlices:
+    """The inertia of K - sigma M for several sigma, and the eigenpairs nearest to sigma.
+
+    The latest factors are kept.
+
+    Attributes
+    ----------
+    finite_count
+        Number of finite eigenvalues.
     """
 
     def __init__(self, K: PETSc.Mat, M: PETSc.Mat) -> None:
@@ -273,16 +286,17 @@ class _Slices:
         self._shifted.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._factorisation = Factorisation(K.comm.tompi4py())
         self._sigma: float | None = None
-        self.finite = K.comm.tompi4py().allreduce(int(np.count_nonzero(M.getDiagonal().array_r)))
+        diagonal = M.getDiagonal().array_r
+        self.finite_count = K.comm.tompi4py().allreduce(int(np.count_nonzero(diagonal)))
 
     @property
     def rounding(self) -> float:
-        """What rounding may make of an eigenvalue that is zero."""
+        """The magnitude that rounding may give to an eigenvalue that is zero."""
         norm = PETSc.NormType.INFINITY
         return float(ROUNDING * self._K.norm(norm) / self._M.norm(norm))
 
-    def below(self, sigma: float) -> int:
-        """The number of eigenvalues below sigma: negative pivots of K - sigma M."""
+    def count_below(self, sigma: float) -> int:
+        """Return the number of eigenvalues below sigma: negative pivots of K - sigma M."""
         if sigma != self._sigma:
             self._K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             self._shifted.axpy(-sigma, self._M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -290,10 +304,10 @@ class _Slices:
             self._sigma = sigma
         return self._factorisation.negative_pivots
 
-    def around(self, sigma: float, count: int, tolerance: float) -> list[Mode]:
-        """Eigenpairs nearest to sigma, ascending."""
-        self.below(sigma)
-        count = min(count, self.finite)
+    def nearest_to(self, sigma: float, count: int, tolerance: float) -> list[Eigenpair]:
+        """Return the eigenpairs nearest to sigma, ascending."""
+        self.count_below(sigma)
+        count = min(count, self.finite_count)
         eps = SLEPc.EPS().create(self._K.comm)
         eps.setOptionsPrefix("magshell_modes_")
         eps.setOperators(self._K, self._M)
@@ -317,7 +331,7 @@ class _Slices:
             )
         v = self._K.createVecRight()
         modes = [
-            Mode(float(eps.getEigenpair(i, v).real), np.array(v.array_r)) for i in range(count)
+            Eigenpair(float(eps.getEigenpair(i, v).real), np.array(v.array_r)) for i in range(count)
         ]
         eps.destroy()
         return sorted(modes, key=lambda mode: mode.eigenvalue)
@@ -325,7 +339,7 @@ class _Slices:
 
 @dataclass(frozen=True)
 class _BackSolve:
-    """A preconditioner for PETSc that solves with the factors."""
+    """A preconditioner for PETSc that solves with known factors."""
 
     factorisation: Factorisation
 

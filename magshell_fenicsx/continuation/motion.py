@@ -1,4 +1,4 @@
-"""A moving state, what acts on it, and what a loading device makes of it where it begins.
+"""A moving state, the forces that act on it, and its consistent start under a loading device.
 
 A device holds the conjugates q of some amplitudes: g(u, mu) = dPi/dmu + q = 0. Where g depends on
 its own amplitude (a gas, a body that is pressed on) that follows from u. Otherwise g constrains u:
@@ -25,10 +25,10 @@ from magshell_fenicsx.continuation.system import (
 )
 
 Array = NDArray[np.float64]
-Inverse = Callable[[Vector], Vector]
-MOST = 20  # iterations
-ROUNDING = 1e-13
-STEP = 1e-3  # lengths that a velocity moves the system by for the change of C
+InverseMass = Callable[[Vector], Vector]
+MAX_ITERATIONS = 20
+ROUNDING = 1e-13  # of the unknowns: smaller steps are rounding
+DIFFERENCE_STEP = 1e-3  # in lengths that a velocity moves the system by, for the change of C
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Motion:
     mu
         Amplitudes.
     work, dissipated
-        By the loads, and by drag and viscosity, since the begin.
+        Work of the loads, and of drag and viscosity, since the begin.
     potentials
         dPi/dmu of the loads.
     error
         Estimated error of the last step, over the system's length.
     memory
-        What viscous forces remember of the steps so far: a step that is refused leaves it.
+        History variables of viscous forces: a step that is refused does not change them.
     imbalance, turnover
         Kinetic + stored + dissipated - work, less its value at the begin, and the sum of their
         magnitudes; nan where the balance is not checked.
@@ -70,148 +70,174 @@ class Motion:
     turnover: float = np.nan
 
 
-class Viscous(Protocol):
-    """Forces that depend on the strains along a step.
+class ViscousForces(Protocol):
+    """Forces that depend on the strains along a time step.
 
     Attributes
     ----------
     memory
-        What they remember of the steps to u0; `accept` replaces it.
-    slowness
-        Longest time in which they let a displacement creep to its end, so that errors of steps add
-        up.
+        History variables of the steps up to u0; `accept` replaces them.
+    creep_time
+        Longest time in which the forces let a displacement creep to its end, so that errors of
+        steps add up.
     """
 
     memory: Any
-    slowness: float
+    creep_time: float
 
-    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
-        """The force at a part of the step from u0 to u1, with the velocity v there; zero at
-        supports.
+    def force(self, u0: Vector, u1: Vector, v: Vector, fraction: float, dt: float) -> Vector:
+        """Return the force at a fraction of the step from u0 to u1; zero at supports.
+
+        Parameters
+        ----------
+        v
+            The velocity there.
         """
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """The system's tangent with the derivative of the force by u1; dv/du at the end is `rate`."""
+        """Return the system's tangent with the derivative of the force by u1.
+
+        Parameters
+        ----------
+        rate
+            dv/du at the end of the step.
+        """
 
     def begin(self) -> None:
-        """A motion begins, or a load has a corner."""
+        """Begin a motion, or continue after a kink of a load."""
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """Go on from u1; the latest force."""
+        """Go on from u1; return the force there."""
 
-    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """The force at u1 of which an estimate of the error is made; None without an estimate."""
+    def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+        """Return the estimated error of the force at u1; None without an estimate."""
 
 
-class Averaged(Protocol):
-    """Forces of contact, which set in and cease within a step: each step takes their mean along its
-    way.
+class AveragedContact(Protocol):
+    """Contact forces, which begin and end within a step: each step takes their mean along it.
 
     Attributes
     ----------
     names
-        Amplitudes that are positions of what touches.
+        Amplitudes that are positions of touching bodies.
     settings
-        Names of the stiffnesses that `harder` may give.
+        Names of the stiffnesses that `stiffened_settings` may give.
     """
 
     names: frozenset[str]
     settings: frozenset[str]
 
-    def harder(self, begin: State, v: Vector) -> dict[str, float]:
-        """Settings of what must become stiffer before a step, since it may meet too fast, and
-        stores nothing yet.
+    def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
+        """Return the stiffnesses to raise before a step.
+
+        They belong to pairs that may meet too fast, and store no energy yet.
         """
 
-    def along(self, begin: State, end: State, part: float) -> None:
-        """Let the system's forces at this part of a step be its mean ones, until `present`."""
+    def average_along(self, begin: State, end: State, fraction: float) -> None:
+        """Let the system have the mean forces of a step, with their tangent at a fraction of it.
 
-    def present(self) -> None:
+        They stay until `use_state_forces`.
+        """
+
+    def use_state_forces(self) -> None:
         """Let the system have the forces of its state again."""
 
-    def passes(self, begin: State, end: State) -> str:
-        """What passes through each other in a step, in words; empty if nothing does."""
+    def penetration_message(self, begin: State, end: State) -> str:
+        """Return which surfaces pass through each other in a step; empty if none do."""
 
-    def stored(self, u: Vector, mu: Amplitudes) -> float:
-        """The energy without the potentials of loads."""
+    def stored_energy(self, u: Vector, mu: Amplitudes) -> float:
+        """Return the energy without the potentials of loads."""
 
 
-class Ground(Protocol):
-    """Supports that move; see `shells.mass`.
+class MovingSupports(Protocol):
+    """Supports that move in time; see `shells.mass`.
 
     Attributes
     ----------
     names
-        Their amplitudes.
+        Amplitudes of the motions.
     """
 
     names: frozenset[str]
 
-    def velocity(self, t: float, before: bool) -> Vector:
-        """Of supports."""
+    def velocity(self, t: float, before_kink: bool) -> Vector:
+        """Return the velocity at supports, zero elsewhere; at a kink before or after t."""
 
-    def acceleration(self, t: float, before: bool) -> Vector:
-        """Of supports."""
+    def acceleration(self, t: float, before_kink: bool) -> Vector:
+        """Return the acceleration at supports, zero elsewhere; at a kink before or after t."""
 
-    def along(self, mu: Amplitudes, name: str) -> Vector:
-        """Their displacement by an amplitude."""
+    def displacement_rate(self, mu: Amplitudes, name: str) -> Vector:
+        """Return the derivative of the supports' displacement by an amplitude."""
 
     def times(self, x: Vector) -> Vector:
-        """The mass of all nodes times a vector."""
+        """Return the mass of all nodes times a vector."""
 
-    def held(self, x: Vector) -> Vector:
-        """With zeros at supports."""
+    def zeroed_at_supports(self, x: Vector) -> Vector:
+        """Return a vector with zeros at supports."""
 
 
-def constrained(
-    system: System, device: Device, inverse: Inverse, u: Vector, v: Vector, mu: Amplitudes
+def consistent_state(
+    system: System, device: Device, inverse_mass: InverseMass, u: Vector, v: Vector, mu: Amplitudes
 ) -> tuple[Vector, Vector, dict[str, float]]:
-    """The nearest displacement and velocity, in the sense of the mass, that the device allows, with
-    its amplitudes.
+    """Return the nearest displacement and velocity that a device allows, with its amplitudes.
+
+    They are nearest in the norm of the mass. Collective.
 
     Parameters
     ----------
-    inverse
-        Of the mass.
+    inverse_mass
+        Solves with the mass.
     """
     y, comm = device.unknowns(mu), system.comm
-    for _ in range(MOST):
-        whole = {**mu, **device.values(y)}
-        C, D = device.edge(u, whole)
-        X, springs = [inverse(c) for c in C], np.diag(D) != 0
-        S = np.where(springs, D, [[dot(comm, c, x) for x in X] for c in C])
-        part = np.linalg.solve(S, device.rows(u, whole))
-        step = _sum(np.where(springs, 0.0, part), X)
-        y, u = y - np.where(springs, part, 0.0), u - step
-        moved = max_abs(comm, step) / system.length
-        if moved <= ROUNDING and np.abs(part[springs]).max(initial=0.0) <= ROUNDING * (
-            1 + np.abs(y).max()
-        ):
+    for _ in range(MAX_ITERATIONS):
+        amplitudes = {**mu, **device.values(y)}
+        C, D = device.border(u, amplitudes)
+        X, is_spring = [inverse_mass(c) for c in C], np.diag(D) != 0
+        S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
+        correction = np.linalg.solve(S, device.rows(u, amplitudes))
+        step = _combination(np.where(is_spring, 0.0, correction), X)
+        y, u = y - np.where(is_spring, correction, 0.0), u - step
+        size = max_abs(comm, step) / system.length
+        spring_size = np.abs(correction[is_spring]).max(initial=0.0)
+        if size <= ROUNDING and spring_size <= ROUNDING * (1 + np.abs(y).max()):
             break
-    across = np.where(springs, 0.0, [dot(comm, c, v) for c in C])
-    v = v - _sum(np.where(springs, 0.0, np.linalg.solve(S, across)), X)
+    normal_velocity = np.where(is_spring, 0.0, [dot(comm, c, v) for c in C])
+    v = v - _combination(np.where(is_spring, 0.0, np.linalg.solve(S, normal_velocity)), X)
     return u, v, {**mu, **device.values(y)}
 
 
-def _sum(parts: Array, vectors: list[Vector]) -> Vector:
-    return np.asarray(np.sum([part * x for part, x in zip(parts, vectors, strict=True)], axis=0))
+def _combination(coefficients: Array, vectors: list[Vector]) -> Vector:
+    terms = [c * x for c, x in zip(coefficients, vectors, strict=True)]
+    return np.asarray(np.sum(terms, axis=0))
 
 
-def held_back(
-    system: System, device: Device, inverse: Inverse, now: Motion
+def constrained_acceleration(
+    system: System, device: Device, inverse_mass: InverseMass, motion: Motion
 ) -> tuple[Vector, dict[str, float]]:
-    """The acceleration with the forces of constraints, and these; that of `now` is without their
-    change.
+    """Return the acceleration with the forces of constraints, and the amplitudes that are these.
+
+    Collective.
+
+    Parameters
+    ----------
+    motion
+        Its acceleration is without the change of these forces.
     """
-    C, D = device.edge(now.u, now.mu)
-    free, size = np.diag(D) == 0, max_abs(system.comm, now.v)
-    ahead, behind, step = C, C, 1.0
-    if size:
-        step = STEP * system.length / size
-        ahead, behind = (device.edge(now.u + side * step * now.v, now.mu)[0] for side in (1, -1))
-    X = [inverse(c) for c in C]
-    S = np.where(free, [[dot(system.comm, c, x) for x in X] for c in C], np.eye(len(C)))
-    bent = [dot(system.comm, a - b, now.v) / (2 * step) for a, b in zip(ahead, behind, strict=True)]
-    rest = np.array([dot(system.comm, c, now.a) for c in C]) + bent
-    dy = np.where(free, np.linalg.solve(S, np.where(free, rest, 0.0)), 0.0)
-    return now.a - _sum(dy, X), now.mu | device.values(device.unknowns(now.mu) + dy)
+    C, D = device.border(motion.u, motion.mu)
+    is_constraint, speed = np.diag(D) == 0, max_abs(system.comm, motion.v)
+    forward, backward, dt = C, C, 1.0
+    if speed:
+        dt = DIFFERENCE_STEP * system.length / speed
+        forward, backward = (
+            device.border(motion.u + sign * dt * motion.v, motion.mu)[0] for sign in (1, -1)
+        )
+    X = [inverse_mass(c) for c in C]
+    S = np.where(is_constraint, [[dot(system.comm, c, x) for x in X] for c in C], np.eye(len(C)))
+    curvature = [
+        dot(system.comm, a - b, motion.v) / (2 * dt) for a, b in zip(forward, backward, strict=True)
+    ]
+    violation = np.array([dot(system.comm, c, motion.a) for c in C]) + curvature
+    dy = np.linalg.solve(S, np.where(is_constraint, violation, 0.0))
+    dy = np.where(is_constraint, dy, 0.0)
+    amplitudes = device.values(device.unknowns(motion.mu) + dy)
+    return motion.a - _combination(dy, X), motion.mu | amplitudes

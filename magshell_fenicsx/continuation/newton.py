@@ -3,7 +3,8 @@
     R(u) + mu R_mu(u) = 0      K du + R_mu dmu = -R
     g(u, mu)          = 0      c.du + d    dmu = -g
 
-One factorisation of K and two back-solves make a step, whatever the last row.
+One factorisation of K and two back-solves make a step, whatever the last row. `BorderedNewton` is
+the corrector of a path, and computes the path's tangent at a solution.
 """
 
 from collections.abc import Sequence
@@ -12,39 +13,46 @@ from typing import Any
 
 import numpy as np
 
-from magshell_fenicsx.continuation.control import Bordered, Row, plus, refined_tangent
+from magshell_fenicsx.continuation.control import (
+    BorderedMatrix,
+    ConstraintRow,
+    add_scaled,
+    refined_tangent,
+)
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.snes import (
     DIVERGED,
-    FAR,
-    HIDDEN,
-    IN_WORDS,
+    GUESS_TOO_FAR,
+    HIDDEN_BY_ROUNDING,
+    REASON_MESSAGES,
     LatestTangent,
-    Linearised,
     NewtonOptions,
+    SnesCallbacks,
     make_snes,
 )
-from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, max_abs
+from magshell_fenicsx.continuation.system import (
+    State,
+    System,
+    Vector,
+    WeightedDisplacement,
+    dot,
+    max_abs,
+)
 
-SOFT = (
-    1e-6,
-    1e-5,
-    1e-4,
-    1e-3,
-    1e-2,
-    1e-1,
-)  # of the stiffness of faces that touch: the first is that of a shell
-# of the first step between soft faces: their error need not fall below it, for harder ones move
-# less
-ROUGH = 0.1
+# successive stiffnesses of touching faces, over the final ones; the first is about that of a shell
+STIFFNESS_FRACTIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+# error between soft faces, over the first step: harder faces move less, so a smaller one is wasted
+SOFT_FACES_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
-class Outcome:
+class NewtonResult:
     """The result of Newton's method, and its work.
 
     Attributes
     ----------
+    reason
+        "converged", or why the iteration ended.
     error
         Estimated error of u, over the system's length.
     """
@@ -58,12 +66,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Response:
-    """The tangent of a path at a solution, per unit of its row.
+    """The tangent (du, dmu) of a path at a solution, per unit of its row.
 
     Attributes
     ----------
     softness
         dq/dmu of the conjugate displacement q.
+    negative_pivots
+        Number of unstable directions at the fixed amplitude.
     """
 
     du: Vector
@@ -73,7 +83,9 @@ class Response:
 
 
 class BorderedNewton:
-    """Solves R(u, mu) = 0 with one more row; reusable for every amplitude and row of a system.
+    """Newton's method for R(u, mu) = 0 with one more row.
+
+    One solver serves every amplitude and row of a system.
 
     Attributes
     ----------
@@ -92,15 +104,17 @@ class BorderedNewton:
         self.factorisation = factorisation or Factorisation(system.comm)
         self._work = _Work()
         self._tangent = LatestTangent(system, self.factorisation)
-        self._linear = Linearised(self._tangent, self.options)
-        self._x = self._linear.vector()
-        self._snes = make_snes(self._linear, self._x, self.options)
-        kinks = self.options.kinks
-        self._searching = make_snes(self._linear, self._x, self.options, "bt") if kinks else None
+        self._callbacks = SnesCallbacks(self._tangent, self.options)
+        self._x = self._callbacks.new_vector()
+        self._full_steps = make_snes(self._callbacks, self._x, self.options)
+        self._line_search: Any = None
+        if self.options.has_onsets:
+            self._line_search = make_snes(self._callbacks, self._x, self.options, "bt")
 
-    def on(self, system: System) -> "BorderedNewton":
-        """A solver for another system whose tangent contains this one's; factors and counts of work
-        are shared.
+    def for_system(self, system: System) -> "BorderedNewton":
+        """Return a solver for another system whose tangent contains this one's.
+
+        Both share the factors and the counts of work.
         """
         other = BorderedNewton(system, self.options, self.factorisation)
         other._work = self._work
@@ -108,188 +122,225 @@ class BorderedNewton:
 
     @property
     def iterations(self) -> int:
-        """The iterations of all solves so far."""
+        """The number of iterations of all solves so far."""
         return self._work.iterations
 
     def solve(
         self,
         guess: State,
         name: str,
-        row: Row,
-        stress: Sequence[Weighted] = (),
+        row: ConstraintRow,
+        stress: Sequence[WeightedDisplacement] = (),
         *,
         search: bool = True,
-        near: float = 0.0,
-        most: float = np.inf,
-    ) -> Outcome:
+        reuse_distance: float = 0.0,
+        max_step: float = np.inf,
+    ) -> NewtonResult:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
+
+        Collective.
 
         Parameters
         ----------
         stress
-            As that of `System.tangent`, of the guess.
+            The stress of the guess, as in `System.tangent`.
         search
-            Whether softer faces and a line search are tried where full steps fail and forces set in
+            Whether softer faces and a line search are tried where full steps fail and forces begin
             within a step.
-        near
+        reuse_distance
             Distance from the guess, in lengths, up to which the factors of another state begin the
             solve.
-        most
+        max_step
             A longer step, in lengths, ends the solve early, and so do steps that lead astray: see
-            `Iterates.hasty`.
+            `Iterates.stops_early`.
         """
-        outcome = self._solved(
-            self._snes, guess, name, row, stress, near, most, foreseeing=self._tangent.foresees
+        result = self._run_snes(
+            self._full_steps,
+            guess,
+            name,
+            row,
+            stress,
+            reuse_distance,
+            max_step,
+            extrapolating=self._tangent.may_extrapolate,
         )
-        far = outcome.reason in (DIVERGED, FAR)
-        if (
-            not outcome.converged
-            and self._linear.foreseeing
-            and not (far and not self._linear.misled())
-        ):
-            outcome = self._solved(self._snes, guess, name, row, stress, near, most)
-        if search and self._searching and not outcome.converged and outcome.reason != HIDDEN:
-            again = self._hardened(guess, name, row) or self._solved(
-                self._searching, guess, name, row, stress
-            )
-            return again if again.converged else outcome
-        return outcome
+        if not result.converged and self._callbacks.extrapolating:
+            leads_away = result.reason in (DIVERGED, GUESS_TOO_FAR)
+            if not leads_away or self._callbacks.is_misled_by_extrapolation():
+                result = self._run_snes(
+                    self._full_steps, guess, name, row, stress, reuse_distance, max_step
+                )
+        if result.converged or result.reason == HIDDEN_BY_ROUNDING:
+            return result
+        if not (search and self._line_search):
+            return result
+        other_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(
+            self._line_search, guess, name, row, stress
+        )
+        return other_result if other_result.converged else result
 
-    def _hardened(self, guess: State, name: str, row: Row) -> Outcome | None:
-        """The solution that is found between faces that are soft at first, and harder time by time;
-        None if none is.
+    def _solve_by_stiffening(
+        self, guess: State, name: str, row: ConstraintRow
+    ) -> NewtonResult | None:
+        """Solve between touching faces that are soft at first and then harder; None if this fails.
 
-        Faces that lie deep in each other at a guess push shells far away, from where full steps do
-        not come back. Soft ones, as stiff as the shells, show where these touch.
+        Faces that penetrate each other deeply at a guess push shells far away, from where full
+        steps do not come back. Soft ones, as stiff as the shells, show where these touch.
         """
         state, iterations = guess, 0
-        for part in SOFT:
+        for fraction in STIFFNESS_FRACTIONS:
             softer = {
-                key: part * guess.mu.get(key, k) for key, k in self.options.stiffnesses.items()
+                key: fraction * guess.mu.get(key, k) for key, k in self.options.stiffnesses.items()
             }
-            outcome = self._solved(
-                self._snes, State(state.u, {**state.mu, **softer}), name, row, rough=ROUGH
+            result = self._run_snes(
+                self._full_steps,
+                State(state.u, {**state.mu, **softer}),
+                name,
+                row,
+                relative_tolerance=SOFT_FACES_TOLERANCE,
             )
-            state, iterations = outcome.state, iterations + outcome.iterations
-            if not outcome.converged:
+            state, iterations = result.state, iterations + result.iterations
+            if not result.converged:
                 return None
-        outcome = self._solved(self._snes, guess.with_(state.u, name, state.mu[name]), name, row)
-        return (
-            replace(outcome, iterations=iterations + outcome.iterations)
-            if outcome.converged
-            else None
-        )
+        hard_guess = guess.with_(state.u, name, state.mu[name])
+        result = self._run_snes(self._full_steps, hard_guess, name, row)
+        if not result.converged:
+            return None
+        return replace(result, iterations=iterations + result.iterations)
 
-    def _solved(
+    def _run_snes(
         self,
         snes: Any,
         guess: State,
         name: str,
-        row: Row,
-        stress: Sequence[Weighted] = (),
-        near: float = 0.0,
-        most: float = np.inf,
+        row: ConstraintRow,
+        stress: Sequence[WeightedDisplacement] = (),
+        reuse_distance: float = 0.0,
+        max_step: float = np.inf,
         *,
-        foreseeing: bool = False,
-        rough: float = 0.0,
-    ) -> Outcome:
-        linear, searched, at_most = self._linear, snes is self._searching, snes.getTolerances()[2]
-        of = guess, name, row, stress, at_most
-        linear.begin(
-            *of, searched=searched, near=near, most=most, foreseeing=foreseeing, rough=rough
+        extrapolating: bool = False,
+        relative_tolerance: float = 0.0,
+    ) -> NewtonResult:
+        """Run SNES from a guess; see `SnesCallbacks.begin` for the parameters."""
+        callbacks = self._callbacks
+        callbacks.begin(
+            guess,
+            name,
+            row,
+            stress,
+            snes.getTolerances()[2],
+            searched=snes is self._line_search,
+            reuse_distance=reuse_distance,
+            max_step=max_step,
+            extrapolating=extrapolating,
+            relative_tolerance=relative_tolerance,
         )
-        linear.join((guess.u, guess.mu[name]), self._x)
+        callbacks.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
-        ended, iterations = snes.getConvergedReason(), snes.getIterationNumber()
-        solution = linear.split(self._x)
-        if ended > 0 and (step := linear.step_at(self._x)):  # the last step is known already
-            solution = plus(solution, -1.0, step)
+        code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
+        u, mu = callbacks.split(self._x)
+        if code > 0 and (step := callbacks.step_at(self._x)):  # the last step is known already
+            u, mu = add_scaled((u, mu), -1.0, step)
         self._work.iterations += iterations
-        reason = "converged" if ended > 0 else IN_WORDS.get(ended, f"SNES reason {ended}")
-        return Outcome(
-            guess.with_(solution[0], name, solution[1]), ended > 0, iterations, reason, linear.error
-        )
+        reason = "converged" if code > 0 else REASON_MESSAGES.get(code, f"SNES reason {code}")
+        return NewtonResult(guess.with_(u, name, mu), code > 0, iterations, reason, callbacks.error)
 
-    def stand_at(self, state: State, most: float = np.inf) -> None:
-        """Factor the tangent at a state if no factors stand within so many lengths of it, as in a
-        resumed run.
+    def ensure_factors_near(self, state: State, distance: float = np.inf) -> None:
+        """Factor the tangent at a state unless factors of one within some lengths are known.
+
+        A resumed run may have none. Collective.
         """
-        if not self._tangent.near(state, most):
-            self._tangent.at(state, sure=False)
+        if not self._tangent.is_near(state, distance):
+            self._tangent.factor_at(state, needs_inertia=False)
 
-    def corrected(self, guess: State, name: str, row: Row, most: float) -> State | None:
-        """A guess after one step, of at most so many lengths, with the factors that stand; None if
-        it is longer.
+    def correct_once(
+        self, guess: State, name: str, row: ConstraintRow, max_step: float
+    ) -> State | None:
+        """Return a guess after one Newton step with the present factors. Collective.
+
+        None if the step is longer than `max_step` lengths.
         """
         system = self.system
-        matrix = Bordered(system, self.factorisation, guess, name, row)
-        step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess), rough=True)
-        if not matrix.size(step) <= most:
+        matrix = BorderedMatrix(system, self.factorisation, guess, name, row)
+        step = matrix.solve(
+            system.residual(guess.u, guess.mu), row.residual(guess), low_accuracy=True
+        )
+        if not matrix.size(step) <= max_step:
             return None
-        u, mu = plus((guess.u, guess.mu[name]), -1.0, step)
+        u, mu = add_scaled((guess.u, guess.mu[name]), -1.0, step)
         return guess.with_(u, name, mu)
 
-    def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
-        """Factor the tangent at a state, unless its factors are known."""
-        return self._tangent.at(state, stress)
+    def factor_at(self, state: State, stress: Sequence[WeightedDisplacement] = ()) -> Factorisation:
+        """Factor the tangent at a state, unless its factors are known. Collective."""
+        return self._tangent.factor_at(state, stress)
 
     def response(
         self,
         state: State,
         name: str,
-        row: Row,
+        row: ConstraintRow,
         *,
         exact: bool = False,
-        anew: bool = False,
-        counted: bool = True,
+        may_lag: bool = True,
+        needs_inertia: bool = True,
     ) -> Response:
-        """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
+        """Return the path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
-        Factors of a state near by are used if they serve; the tangent is then refined by
-        differences of the residual.
+        Factors of a nearby state are used if they serve; the tangent is then refined by differences
+        of the residual. Collective.
 
         Parameters
         ----------
         exact
-            Whether K is factored at the solution itself; a small part of it may be older.
-        anew
-            Whether no part may be older.
-        counted
-            If not, the number of negative pivots means nothing.
+            Whether K is factored at the solution itself; a small part of it may lag.
+        may_lag
+            Whether a small part of K may belong to an earlier state. If not, K is factored at the
+            solution.
+        needs_inertia
+            If not, the number of negative pivots is meaningless.
         """
-        comm, near = self.system.comm, self._tangent.state
-        moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
-        serves = moved <= self.options.fresh and not (exact or anew)
-        fresh = serves and (not counted or self._tangent.certain)
-        matrix = self._bordered(
-            near if fresh and near else state, name, row, rough=not anew, sure=counted
+        comm, factored = self.system.comm, self._tangent.state
+        distance = np.inf
+        if factored is not None:
+            distance = max_abs(comm, state.u - factored.u) / self.system.length
+        reuses_factors = distance <= self.options.reuse_distance and may_lag and not exact
+        if reuses_factors and needs_inertia:
+            reuses_factors = self._tangent.inertia_is_certain
+        matrix = self._bordered_matrix(
+            factored if reuses_factors and factored else state,
+            name,
+            row,
+            may_lag=may_lag,
+            needs_inertia=needs_inertia,
         )
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
-        if (moved and fresh) or self._tangent.rough:
+        if (distance and reuses_factors) or self._tangent.lagged:
             refined = refined_tangent(
-                self.system, matrix, tangent, state, load, row, foreseeing=self._tangent.foresees
+                self.system,
+                matrix,
+                tangent,
+                state,
+                load,
+                row,
+                extrapolating=self._tangent.may_extrapolate,
             )
             if refined is None:
-                return self.response(state, name, row, anew=True)
+                return self.response(state, name, row, may_lag=False)
             tangent = refined
         du, dmu = tangent
         softness = -dot(comm, load, du) / dmu - self.system.curvature(state.u, state.mu, name, name)
         return Response(du, dmu, softness, self.factorisation.negative_pivots)
 
-    def _bordered(self, state: State, name: str, row: Row, *, rough: bool, sure: bool) -> Bordered:
-        """The bordered matrix at a state; the one of the last solve if it has the same state and
-        row.
-        """
-        last, count = self._linear.matrix, self.factorisation.count
-        factors = self._tangent.at(state, rough=rough, sure=sure)
-        kept = (
-            count == factors.count and last and last.row is row and last.state is state
-        )  # the same object
-        return (
-            last
-            if kept and last
-            else Bordered(self.system, factors, state, name, row, rough=self._tangent.rough)
-        )
+    def _bordered_matrix(
+        self, state: State, name: str, row: ConstraintRow, *, may_lag: bool, needs_inertia: bool
+    ) -> BorderedMatrix:
+        """Return the bordered matrix at a state, or that of the last solve with the same row."""
+        last, count = self._callbacks.matrix, self.factorisation.count
+        factors = self._tangent.factor_at(state, may_lag=may_lag, needs_inertia=needs_inertia)
+        # the same objects, not equal ones
+        if count == factors.count and last and last.row is row and last.state is state:
+            return last
+        return BorderedMatrix(self.system, factors, state, name, row, lagged=self._tangent.lagged)
 
 
 @dataclass

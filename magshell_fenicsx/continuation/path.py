@@ -1,5 +1,10 @@
-"""Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive
-steps.
+"""Continuation of an equilibrium path by load, by conjugate displacement or by arc length.
+
+A polynomial through the last points and their tangents predicts the next point, Newton's method on
+the bordered system corrects it, and the step length adapts. A corrected point is rejected if the
+path between both points would not be smooth: then the step jumped to another branch. Where contact
+forces begin within a step, the path has kinks, and the step ends at the onset. Theory:
+docs/theory.md, "Equilibria, paths, instabilities".
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -9,46 +14,66 @@ from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
-from magshell_fenicsx.continuation.interpolated import flat_beyond, hermite
+from magshell_fenicsx.continuation.control import (
+    ConstraintRow,
+    Hyperplane,
+    Metric,
+    PrescribedConjugate,
+    PrescribedLoad,
+)
+from magshell_fenicsx.continuation.interpolation import flat_beyond, hermite
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import (
-    Finding,
-    Journal,
     NoJournal,
     NoProgress,
     PathStopped,
     Point,
     Progress,
+    RecordedValues,
+    SolverJournal,
     StepOptions,
 )
-from magshell_fenicsx.continuation.snes import FAR
-from magshell_fenicsx.continuation.stepping import LEAST_PART, LOOKED_BACK, Ahead, Course, Far, Plan
-from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.snes import GUESS_TOO_FAR
+from magshell_fenicsx.continuation.step_control import (
+    MIN_FRACTION_BEFORE_FOLD,
+    PREDICTOR_POINTS,
+    RejectedPoint,
+    StepController,
+    StepEvent,
+    StepPlan,
+)
+from magshell_fenicsx.continuation.system import (
+    Direction,
+    State,
+    WeightedDisplacement,
+    dot,
+    extrapolated_stress,
+    max_abs,
+)
 
 Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
-Arrive = Callable[[float, Sequence[Point]], float]
-# after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth
-# more time
-MANY = 2
-BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
-GUESSED = 0.05  # in lengths: an error of a first guess that shortens no step
-WORSE = 2.0  # such an error, over that of the last guess
-TURNS = "the path turns sharply, or the step jumped to another branch"
-# failures one after the other, after which no line search is tried: a path that ends has no point
-# ahead
-VAIN = 5
-NEAR = 0.05  # in lengths: old factors begin a solve up to here where nobody counts with them
-WILD, LEAST_MOST = (
-    3.0,
-    0.1,
-)  # of the way to a guess, and in lengths: a longer correction of it is given up
-ABOUT = (
-    0.01  # in lengths: a last correction of a state that is looked at, but is no point of the path
-)
-FARTHER = 3.0  # states so many times as far apart as their tangents lead are not on one path
-SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
+StepEnd = Callable[[float, Sequence[Point]], float]  # (s, predictors) -> s where the step ends
+# number of hard solves after which the tangent takes the stress extrapolated from the last point,
+# which costs a tenth more time
+HARD_SOLVES_BEFORE_EXTRAPOLATED_STRESS = 2
+# step limit, as a multiple of the predicted distance to a fold: a longer one may end on another
+# branch
+MAX_STEP_PAST_FOLD = 1.15
+HARMLESS_PREDICTION_ERROR = 0.05  # in lengths: such an error of a prediction shortens no step
+MAX_ERROR_GROWTH = 2.0  # prediction error over that of the last prediction
+SHARP_TURN = "the path turns sharply, or the step jumped to another branch"
+# successive failures after which no line search is tried: a path that ends has no point ahead
+FAILURES_BEFORE_NO_SEARCH = 5
+# in lengths: distance up to which old factors begin a solve where their inertia is not needed
+FACTOR_REUSE_DISTANCE = 0.05
+# a longer correction of a prediction is given up: over its distance, and at least in lengths
+MAX_CORRECTION, MIN_CORRECTION_LIMIT = 3.0, 0.1
+MAX_ESTIMATE_CORRECTION = 0.01  # in lengths: the single correction of an estimated point
+# ratio of the distance of two states to the length of their tangents, above which they are not on
+# one path
+MAX_DISTANCE_RATIO = 3.0
+ZERO_DISPLACEMENT = 1e-6  # in lengths: smaller displacements count as zero
 
 
 class NotANumber(RuntimeError):
@@ -60,20 +85,22 @@ class Path:
 
     Parameters
     ----------
+    newton
+        The corrector.
     name
         The amplitude that varies.
     control
         The meaning of s. "load": the amplitude; "conjugate": the displacement conjugate to it;
-        "arc": the arc length in a `Metric`, along the tangent of the point before.
+        "arc": the arc length in a `Metric`, along the tangent of the previous point.
     scale
         An amplitude that counts as of order one in the arc length.
     journal
-        Records every result of `recorded`, and replays the results of an interrupted run.
+        Stores every result of `recorded`, and replays the results of an interrupted run.
     progress
-        Gets every step before it is tried.
-    setting_in
-        What happens to forces on the straight way from a point to a first guess; None if nothing
-        does.
+        Is told of every step before it is tried.
+    step_event
+        Returns the onset and loss of forces on the straight segment from a point to a prediction;
+        None if there is none.
     """
 
     def __init__(
@@ -83,540 +110,614 @@ class Path:
         control: Control,
         options: StepOptions,
         scale: float = 1.0,
-        journal: Journal | None = None,
+        journal: SolverJournal | None = None,
         progress: Progress | None = None,
-        setting_in: Callable[[State, State], Ahead] | None = None,
+        step_event: Callable[[State, State], StepEvent] | None = None,
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
-        self._hard = 0  # number of solves that failed or took many matrices
-        self._vain = 0  # number of solves that failed, one after the other
+        self._hard_solves = 0  # solves that failed or took many factorisations
+        self._successive_failures = 0
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
-        self._setting_in = setting_in
+        self._step_event = step_event
 
     def start(self, state: State, sense: float = 1.0) -> Point:
-        """The first point of a path, from a state in equilibrium.
+        """Return the first point of a path, from a state in equilibrium.
 
         Parameters
         ----------
         sense
-            The sign of dmu/ds with control by arc length.
+            The sign of dmu/ds with arc-length control.
+
+        Raises
+        ------
+        NotANumber
+            If the tangent there is not a number.
         """
-        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
+        row = PrescribedLoad(self.name, 0.0)
+        response = self.newton.response(state, self.name, row, exact=True)
         if not np.isfinite(dot(self.system.comm, response.du, response.du)):
             raise NotANumber("the tangent at its begin is not a number")
         if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         else:
-            s, rate = (
-                self.value(self.control, state),
-                1.0 if self.control == "load" else response.softness,
-            )
-        return self._point(state, s, response).per(rate)
+            s = self.value(self.control, state)
+            rate = 1.0 if self.control == "load" else response.softness
+        return self._point(state, s, response).with_tangent_per(rate)
 
-    def at(self, s: float, guess: State, base: Point, *, most: float = np.inf) -> Point | str:
-        """The point at `s`, or the reason why the solve failed.
+    def correct(
+        self, s: float, guess: State, base: Point, *, max_step: float = np.inf
+    ) -> Point | str:
+        """Return the point at `s` near a guess, or the reason why the solve failed.
 
         Parameters
         ----------
         base
             Arc length is measured from this point, along its tangent.
-        most
-            As of `BorderedNewton.solve`.
+        max_step
+            As in `BorderedNewton.solve`.
         """
-        stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
-        return self.solve(self._row(s, base), s, guess, stress, most=most)
+        stress: Sequence[WeightedDisplacement] = ()
+        if self._has_many_hard_solves:
+            stress = extrapolated_stress(base.state.u, (s - base.s) * base.du)
+        return self.solve(self._row(s, base), s, guess, stress, max_step=max_step)
 
-    def inside(
-        self, s: float, low: Point, high: Point, base: Point, *, counted: bool = True
+    def correct_between(
+        self, s: float, low: Point, high: Point, base: Point, *, needs_inertia: bool = True
     ) -> Point | str:
-        """The point at `s` between two others, or the reason why the solve failed; `base` as in
-        `at`.
+        """Return the point at `s` between two others, or the reason why the solve failed.
+
+        Parameters
+        ----------
+        base
+            Arc length is measured from this point, along its tangent.
+        needs_inertia
+            Whether the numbers of unstable directions are needed.
         """
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        ends, near = (low,) if base.across else (low, high), None if counted else high.state
-        guess = self.between(s, *ends)  # to a corner, not around it
-        return self.solve(self._row(s, base), s, guess, stress, near=near, counted=counted)
+        ends = (low,) if base.across else (low, high)  # towards a kink, not around it
+        guess = self.interpolated_state(s, *ends)
+        neighbour = None if needs_inertia else high.state
+        return self.solve(
+            self._row(s, base), s, guess, stress, neighbour=neighbour, needs_inertia=needs_inertia
+        )
 
-    def about(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
-        """About the point at `s` between two others, without its own inertia; where that is too
-        uncertain, why.
+    def estimate_between(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
+        """Estimate the point at `s` between two others by one correction with known factors.
+
+        Its tangent is interpolated, and its inertia is that of `low`. If the correction is too
+        large, return the reason.
         """
 
-        def find() -> Point | str:
-            guess = self.between(s, low, high)
-            self.newton.stand_at(high.state)
-            state = self.newton.corrected(guess, self.name, self._row(s, base), ABOUT)
-            t = (s - low.s) / (high.s - low.s)
-            along = Response(
-                (1 - t) * low.du + t * high.du,
-                (1 - t) * low.dmu + t * high.dmu,
-                0.0,
-                low.negative_pivots,
+        def estimate() -> Point | str:
+            guess = self.interpolated_state(s, low, high)
+            self.newton.ensure_factors_near(high.state)
+            state = self.newton.correct_once(
+                guess, self.name, self._row(s, base), MAX_ESTIMATE_CORRECTION
             )
-            return self._point(state, s, along) if state else FAR
+            t = (s - low.s) / (high.s - low.s)
+            du, dmu = (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
+            tangent = Response(du, dmu, 0.0, low.negative_pivots)
+            return self._point(state, s, tangent) if state else GUESS_TOO_FAR
 
-        return self.recorded(find)
+        return self.recorded(estimate)
 
-    def renewed(self, point: Point, state: State) -> Point:
-        """The point at the same s with other amplitudes beside that of the path, from a state near
-        it.
+    def recorrected(self, point: Point, state: State) -> Point:
+        """Return the point at the same s with the other amplitudes of a nearby state.
 
         Raises
         ------
         PathStopped
             If none is found.
         """
-        again = self.at(point.s, state, point)
-        if isinstance(again, str):
-            raise PathStopped(again, point)
-        return self.as_base(again)
+        corrected = self.correct(point.s, state, point)
+        if isinstance(corrected, str):
+            raise PathStopped(corrected, point)
+        return self.as_base(corrected)
 
     def solve(
         self,
-        row: Row,
+        row: ConstraintRow,
         s: float,
         guess: State,
-        stress: Sequence[Weighted] = (),
+        stress: Sequence[WeightedDisplacement] = (),
         *,
-        near: State | None = None,
-        most: float = np.inf,
-        counted: bool = True,
+        neighbour: State | None = None,
+        max_step: float = np.inf,
+        needs_inertia: bool = True,
     ) -> Point | str:
-        """The point on which a row holds, or the reason why the solve failed; its tangent is per
-        unit of the row.
+        """Return the point on which a row holds, or the reason why the solve failed.
 
-        With a solution `near` by, old factors may begin. Unless `counted`, nobody asks for unstable
-        directions.
+        Its tangent is per unit of the row.
+
+        Parameters
+        ----------
+        neighbour
+            A nearby solution, whose factors may begin the solve.
+        max_step
+            As in `BorderedNewton.solve`.
+        needs_inertia
+            Whether the numbers of unstable directions are needed.
         """
-        old = (
-            NEAR if near else 0.0
-        )  # a tangent of the path must not depend on what was factored before its point
+        # a tangent of the path must not depend on what was factored before its point
+        reuse_distance = FACTOR_REUSE_DISTANCE if neighbour else 0.0
 
-        def find() -> Point | str:
-            if near:
-                close = (
-                    counted
-                    and max_abs(self.system.comm, guess.u - near.u) < NEAR * self.system.length
-                )
-                self.newton.stand_at(near, NEAR if close else np.inf)
-            before, search = self.newton.factorisation.count, self._vain < VAIN
-            outcome = self.newton.solve(
-                guess, self.name, row, stress, search=search, near=old, most=most
+        def solve() -> Point | str:
+            if neighbour:
+                distance = np.inf
+                reach = FACTOR_REUSE_DISTANCE * self.system.length
+                if needs_inertia and max_abs(self.system.comm, guess.u - neighbour.u) < reach:
+                    distance = FACTOR_REUSE_DISTANCE
+                self.newton.ensure_factors_near(neighbour, distance)
+            count = self.newton.factorisation.count
+            result = self.newton.solve(
+                guess,
+                self.name,
+                row,
+                stress,
+                search=self._successive_failures < FAILURES_BEFORE_NO_SEARCH,
+                reuse_distance=reuse_distance,
+                max_step=max_step,
             )
-            if not outcome.converged:
-                return outcome.reason
-            spent = self.newton.factorisation.count - before
-            exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
+            if not result.converged:
+                return result.reason
+            factorisations = self.newton.factorisation.count - count
             response = self.newton.response(
-                outcome.state, self.name, row, exact=exact, counted=counted
+                result.state,
+                self.name,
+                row,
+                exact=self._has_many_hard_solves,  # extrapolated stress is as good as the tangent
+                needs_inertia=needs_inertia,
             )
-            found = self._point(outcome.state, s, response)
             return replace(
-                found, iterations=outcome.iterations, factorisations=spent, error=outcome.error
+                self._point(result.state, s, response),
+                iterations=result.iterations,
+                factorisations=factorisations,
+                error=result.error,
             )
 
-        point = self.recorded(find)
-        self._hard += (
-            point != FAR if isinstance(point, str) else point.factorisations >= self.options.hard
-        )
-        self._vain = self._vain + 1 if isinstance(point, str) else 0
+        point = self.recorded(solve)
+        if isinstance(point, str):
+            self._hard_solves += point != GUESS_TOO_FAR
+            self._successive_failures += 1
+        else:
+            self._hard_solves += point.factorisations >= self.options.hard_factorisations
+            self._successive_failures = 0
         return point
 
-    def recorded(self, find: Callable[[], Point | str]) -> Point | str:
-        """The result of `find`, or the result of an interrupted run at this place in the journal."""
-        kept, factors = self._journal.replay(), self.newton.factorisation
-        if kept is not None:
-            if isinstance(kept, Point):
-                factors.habit = kept.habit
-            return kept
-        habit, result = factors.habit, find()
+    @property
+    def _has_many_hard_solves(self) -> bool:
+        return self._hard_solves >= HARD_SOLVES_BEFORE_EXTRAPOLATED_STRESS
+
+    def recorded(self, solve: Callable[[], Point | str]) -> Point | str:
+        """Return the result of `solve`, or what the journal has of an interrupted run here."""
+        recorded_result, factors = self._journal.replay(), self.newton.factorisation
+        if recorded_result is not None:
+            if isinstance(recorded_result, Point):
+                factors.habit = recorded_result.habit
+            return recorded_result
+        habit, result = factors.habit, solve()
         if isinstance(result, Point):
             result = replace(result, habit=factors.habit)
         else:
-            factors.habit = habit  # a failure is kept as its reason alone
+            factors.habit = habit  # of a failure only the reason is stored
         self._journal.record(result)
         return result
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
-        """What is found at points of the path, or was in an interrupted run at this place in the
-        journal."""
-        return self._journal.noted(find)
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
+        """Return the values of `find`, or what the journal has of an interrupted run here."""
+        return self._journal.recorded_values(find)
 
-    def _ahead(self, here: State, guess: State) -> Ahead:
-        """What happens to forces on the straight way between two states."""
-        setting_in = self._setting_in
-        if setting_in is None:
-            return Ahead()
-        return Ahead(**self.noted(lambda: Finding(asdict(setting_in(here, guess)))).values)
+    def _event(self, current: State, guess: State) -> StepEvent:
+        """Return the onset and loss of forces on the straight segment between two states."""
+        step_event = self._step_event
+        if step_event is None:
+            return StepEvent()
+        recorded = self.recorded_values(lambda: RecordedValues(asdict(step_event(current, guess))))
+        return StepEvent(**recorded.values)
 
-    def on(self, state: State, direction: Direction, base: Point, negative_pivots: int) -> Point:
-        """The point of a state on the path, with a given tangent of any length."""
+    def point_at_state(
+        self, state: State, direction: Direction, base: Point, negative_pivots: int
+    ) -> Point:
+        """Return the point of a state on the path, with a given tangent of any length.
+
+        Parameters
+        ----------
+        base
+            Arc length is measured from this point.
+        """
         du, dmu = direction
         u, mu, name = state.u, state.mu, self.name
-        bend = self.system.curvature(u, mu, name, name)
-        dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - bend * dmu
-        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner(base.normal, direction)}[
-            self.control
-        ]
+        curvature = self.system.curvature(u, mu, name, name)
+        dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - curvature * dmu
         softness = dq / dmu if dmu else np.inf
-        s = (
-            self._arc_length(state, base)
-            if self.control == "arc"
-            else self.value(self.control, state)
-        )
-        return self._point(state, s, Response(du, dmu, softness, negative_pivots)).per(rate)
+        if self.control == "arc":
+            s, rate = self._arc_length(state, base), self.metric.inner(base.normal, direction)
+        else:
+            s, rate = self.value(self.control, state), dmu if self.control == "load" else dq
+        response = Response(du, dmu, softness, negative_pivots)
+        return self._point(state, s, response).with_tangent_per(rate)
 
     def _arc_length(self, state: State, base: Point) -> float:
         chord = (state.u - base.state.u, state.mu[self.name] - base.state.mu[self.name])
         return base.s + self.metric.inner(base.normal, chord)
 
     def measured_from(self, base: Point, point: Point) -> Point:
-        """The point with its arc length from a base; unchanged with another control."""
-        return (
-            replace(point, s=self._arc_length(point.state, base))
-            if self.control == "arc"
-            else point
-        )
+        """Return the point with its arc length from a base; unchanged with another control."""
+        if self.control != "arc":
+            return point
+        return replace(point, s=self._arc_length(point.state, base))
 
     def as_base(self, point: Point) -> Point:
-        """The point with a tangent of length one, so that arc length can be measured from it."""
-        return (
-            point.per(self.metric.norm(point.du, point.dmu))
-            if self.control == "arc" and not point.across
-            else point
-        )
+        """Return the point with a tangent of length one, so that arc length is measured from it."""
+        if self.control != "arc" or point.across:
+            return point
+        return point.with_tangent_per(self.metric.norm(point.du, point.dmu))
 
-    def before(self, low: Point, high: Point) -> Point:
-        """The first of two points, from which the second is measured: see `_beside`."""
-        sharp = self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0
-        return self._beside(low) if sharp else low
+    def relative_to(self, base: Point, point: Point) -> Point:
+        """Return the point with its tangent per unit of s, where s is measured from `base`."""
+        if self.control != "arc":
+            return point
+        rate = self.metric.inner(base.normal, (point.du, point.dmu))
+        return point.with_tangent_per(rate)
 
-    def _beside(self, point: Point) -> Point:
-        """The point with arc length along its displacement: a path that turns sharply has none
-        along its tangent.
+    def base_before(self, low: Point, high: Point) -> Point:
+        """Return the first of two points as the base from which the second is measured.
+
+        Where the path turns sharply between them, arc length goes along the displacement: see
+        `_measured_along_displacement`.
+        """
+        if self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0:
+            return self._measured_along_displacement(low)
+        return low
+
+    def _measured_along_displacement(self, point: Point) -> Point:
+        """Return the point with arc length along its displacement rather than its tangent.
+
+        A path that turns sharply has no arc length along the tangent.
         """
         square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
-        return (
-            replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0))
-            if square
-            else point
-        )
+        if not square:
+            return point
+        return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0))
 
     def value(self, quantity: Quantity, state: State) -> float:
-        """The amplitude of the path, or the displacement conjugate to it, at a state."""
+        """Return the amplitude of the path, or the displacement conjugate to it, at a state."""
         if quantity == "load":
             return state.mu[self.name]
         return -self.system.potential(state.u, state.mu, self.name)
 
-    def given(self, quantity: Quantity, target: float) -> Row:
-        """The row that holds the amplitude, or the displacement conjugate to it, at a target."""
-        return (
-            GivenLoad(self.name, target)
-            if quantity == "load"
-            else GivenConjugate(self.system, self.name, target)
-        )
+    def prescribed(self, quantity: Quantity, target: float) -> ConstraintRow:
+        """Return the row that holds the amplitude, or its conjugate displacement, at a target."""
+        if quantity == "load":
+            return PrescribedLoad(self.name, target)
+        return PrescribedConjugate(self.system, self.name, target)
 
-    def towards(
-        self, start: Point, targets: Sequence[float], arrive: Arrive = lambda s, seen: s
+    def continue_to(
+        self,
+        start: Point,
+        targets: Sequence[float],
+        step_end: StepEnd = lambda s, predictors: s,
     ) -> Iterator[tuple[Point, bool]]:
-        """Accepted points through every target in turn; the flag marks the targets.
+        """Yield accepted points through every target in turn; the flag marks the targets.
 
-        A point that was found too far away is looked at again from the next points: it is a step of
-        theirs for nothing. `arrive` may shorten a step to some s that is foreseen from some points.
+        A point that was rejected as too far is compared with the next accepted points: if it lies
+        one step ahead of one of them, it is accepted without a solve.
+
+        Parameters
+        ----------
+        step_end
+            May shorten a step, given its s and the points that predict its end.
 
         Raises
         ------
         PathStopped
             If a step of the smallest length fails.
         """
-        course = Course([start], self.options.first)
+        controller = StepController([start], self.options.first)
         for target in targets:
-            while (here := course.here).s != target:
-                plan = self._planned(course, target, arrive)
-                tried = self._tried(here, plan)
-                corners = isinstance(tried, Far) and self._passes_corners(here, tried, plan)
-                if isinstance(tried, Far):
-                    course.far, tried = (
-                        (None, self.as_base(tried.point)) if corners else (tried, tried.reason)
-                    )
-                if isinstance(tried, str):
-                    course.failed(plan, tried, self.options.smallest)
+            while (current := controller.current).s != target:
+                plan = self._plan(controller, target, step_end)
+                result = self._try_plan(current, plan)
+                passes_kinks = False
+                if isinstance(result, RejectedPoint):
+                    passes_kinks = self._passes_kinks(current, result, plan)
+                    controller.rejected = None if passes_kinks else result
+                    result = self.as_base(result.point) if passes_kinks else result.reason
+                if isinstance(result, str):
+                    controller.reject_step(plan, result, self.options.smallest)
                     continue
-                straight = self._cosine(here, tried) > self.options.straight
-                corner = corners or self._corner(here, tried)
-                course.reached(tried, plan, self.options, straight=straight, corner=corner)
-                yield tried, tried.s == target
-                if course.far and self._look_again(course, course.far, np.sign(target - here.s)):
-                    yield course.here, course.here.s == target
+                straight = self._cosine(current, result) > self.options.growth_cosine
+                kink = passes_kinks or self._has_kink(current, result)
+                controller.accept_step(result, plan, self.options, straight=straight, kink=kink)
+                yield result, result.s == target
+                rejected = controller.rejected
+                if rejected and self._retry(controller, rejected, np.sign(target - current.s)):
+                    yield controller.current, controller.current.s == target
 
-    def _planned(self, course: Course, target: float, arrive: Arrive) -> Plan:
-        """The next step on the way to a target: it ends a little behind a fold, or where forces set
-        in.
+    def _plan(self, controller: StepController, target: float, step_end: StepEnd) -> StepPlan:
+        """Plan the next step towards a target.
+
+        It ends a little behind a fold, or where forces begin.
         """
-        passed, here, way = course.passed, course.here, target - course.here.s
-        length = course.length(way)
-        length = min(length, self._past_fold(passed, length))
-        cubic, quintic = self._missed(passed)
-        smooth = quintic < cubic
-        if smooth or (len(passed) == LOOKED_BACK - 1 and not self.newton.options.kinks):
-            length *= self._foreseen(passed, here.s + np.copysign(length, way), cubic)
-        s = target if length == abs(way) else here.s + np.copysign(length, way)
-        seen, ahead = passed[-3:] if smooth else passed[-2:], Ahead()
-        s = arrive(s, seen)
-        if here is not course.vain:
-            ahead = self._ahead(here.state, self.extended(s, seen))
-        if ahead.lets_go:  # others may meet on the way that its tangent foresees
-            seen = passed[-1:]
-            ahead = self._ahead(here.state, self.extended(s, seen))
-        return Plan(
-            here.s + ahead.part * (s - here.s) if ahead.part < 1 else s, seen, length, ahead
+        points, current, distance = (
+            controller.points,
+            controller.current,
+            target - controller.current.s,
         )
+        length = controller.length(distance)
+        length = min(length, self._length_past_fold(points, length))
+        cubic_error, quintic_error = self._prediction_errors(points)
+        smooth = quintic_error < cubic_error
+        is_third_point = len(points) == PREDICTOR_POINTS - 1
+        if smooth or (is_third_point and not self.newton.options.has_onsets):
+            end = current.s + np.copysign(length, distance)
+            length *= self._predictable_fraction(points, end, cubic_error)
+        s = target if length == abs(distance) else current.s + np.copysign(length, distance)
+        predictors, event = points[-3:] if smooth else points[-2:], StepEvent()
+        s = step_end(s, predictors)
+        if current is not controller.onset_without_solution:
+            event = self._event(current.state, self.predicted_state(s, predictors))
+        if event.loses_forces:  # the tangent alone may predict other onsets
+            predictors = points[-1:]
+            event = self._event(current.state, self.predicted_state(s, predictors))
+        if event.fraction < 1:
+            s = current.s + event.fraction * (s - current.s)
+        return StepPlan(s, predictors, length, event)
 
-    def _tried(self, here: Point, plan: Plan) -> Point | Far | str:
-        """The next point, one that is too far away, or why there is none; see `_reached` before
-        forces set in.
-        """
-        tried, ahead = self._try(plan.s, plan.seen), plan.ahead
-        if ahead.part < 1 and not ahead.behind:
-            return self._reached(here, tried)
-        sharp = ahead.behind and self.control == "arc" and not isinstance(tried, Point)
-        return self._try(plan.s, [self._beside(here)]) if sharp else tried
+    def _try_plan(self, current: Point, plan: StepPlan) -> Point | RejectedPoint | str:
+        """Return the next point, one that is too far away, or the reason why there is none."""
+        result, event = self._try_step(plan.s, plan.predictors), plan.event
+        if event.fraction < 1 and not event.ends_behind:
+            return self._checked_before_onset(current, result)
+        if event.ends_behind and self.control == "arc" and not isinstance(result, Point):
+            return self._try_step(plan.s, [self._measured_along_displacement(current)])
+        return result
 
-    def _look_again(self, course: Course, far: Far, sense: float) -> bool:
-        """Whether a point that was found too far away is a step from the last one; if so it is the
-        last one now.
-        """
-        here, again = course.here, self.measured_from(course.here, far.point)
-        length, far.looks = (again.s - here.s) * sense, far.looks + 1
-        solved = length > 0 and (far.exact or not again.turned_from(here))
-        if found := solved and not self._jumped(here, again := self.seen_from(here, again)):
-            course.reached_again(self.as_base(again), length)
-        else:
-            course.still_far(far, length)
-        return found
+    def _retry(self, controller: StepController, rejected: RejectedPoint, sense: float) -> bool:
+        """Accept a rejected point if it lies one step from the last point; return whether it does.
 
-    def _past_fold(self, passed: Sequence[Point], length: float) -> float:
-        """The length to a little behind the next fold of mu, where the cubic through two points has
-        its maximum.
+        Parameters
+        ----------
+        sense
+            The sign of the change of s towards the target.
         """
-        if len(passed) < 2 or self.control == "load":
+        current = controller.current
+        point = self.measured_from(current, rejected.point)
+        length, rejected.retries = (point.s - current.s) * sense, rejected.retries + 1
+        has_inertia = rejected.exact or not point.has_instability_since(current)
+        if length > 0 and has_inertia:
+            point = self.relative_to(current, point)
+            if not self._jump(current, point):
+                controller.accept_rejected(self.as_base(point), length)
+                return True
+        controller.keep_rejected(rejected, length)
+        return False
+
+    def _length_past_fold(self, points: Sequence[Point], length: float) -> float:
+        """Return the length to a little behind the next fold of mu.
+
+        The fold is where the cubic through two points has its maximum; infinite if it has none.
+        """
+        if len(points) < 2 or self.control == "load":
             return np.inf
-        before, here = passed[-2:]
-        way, last = here.s - before.s, self.seen_from(before, here)
-        rise = (here.state.mu[self.name] - before.state.mu[self.name]) / way
-        return max(
-            BEHIND * (flat_beyond(rise, before.dmu, last.dmu) - 1) * abs(way), LEAST_PART * length
-        )
+        previous, current = points[-2:]
+        step, last = current.s - previous.s, self.relative_to(previous, current)
+        slope = (current.state.mu[self.name] - previous.state.mu[self.name]) / step
+        to_fold = MAX_STEP_PAST_FOLD * (flat_beyond(slope, previous.dmu, last.dmu) - 1) * abs(step)
+        return max(to_fold, MIN_FRACTION_BEFORE_FOLD * length)
 
-    def _missed(self, passed: Sequence[Point]) -> list[float]:
-        """By how much the cubic through two points and the quintic through three miss the next one,
-        the last of all.
+    def _prediction_errors(self, points: Sequence[Point]) -> list[float]:
+        """Return the errors at the last point of the cubic and the quintic through earlier ones.
+
+        The cubic goes through two points, the quintic through three; infinite if there are fewer.
         """
         return [
-            self._distance(passed[-n:-1], passed[-1]) if len(passed) >= n else np.inf
+            self._prediction_error(points[-n:-1], points[-1]) if len(points) >= n else np.inf
             for n in (3, 4)
         ]
 
-    def _foreseen(self, passed: Sequence[Point], s: float, missed: float) -> float:
-        """The part of a step to `s` whose first guess misses little, or about as much as the last
-        cubic missed.
-        """
-        cubic, quintic = (self.extended(s, passed[-count:]).u for count in (2, 3))
-        error = max_abs(self.system.comm, quintic - cubic)
-        allowed = max(GUESSED * self.system.length, WORSE * missed)
-        return (
-            min(1.0, (allowed / error) ** 0.25) if error else 1.0
-        )  # the error of a cubic grows with the fourth power
+    def _predictable_fraction(self, points: Sequence[Point], s: float, last_error: float) -> float:
+        """Return the fraction of a step to `s` whose prediction error is allowed.
 
-    def _distance(self, passed: Sequence[Point], point: Point) -> float:
-        """How far a point is from where earlier ones led."""
-        guess = self.extended(self.measured_from(passed[-1], point).s, passed)
+        An error is allowed if it is harmless, or about as large as that of the last cubic.
+        """
+        cubic, quintic = (self.predicted_state(s, points[-count:]).u for count in (2, 3))
+        error = max_abs(self.system.comm, quintic - cubic)
+        allowed = max(HARMLESS_PREDICTION_ERROR * self.system.length, MAX_ERROR_GROWTH * last_error)
+        # the error of a cubic grows with the fourth power
+        return min(1.0, (allowed / error) ** 0.25) if error else 1.0
+
+    def _prediction_error(self, points: Sequence[Point], point: Point) -> float:
+        """Return the largest displacement between a point and its prediction by earlier ones."""
+        guess = self.predicted_state(self.measured_from(points[-1], point).s, points)
         return max_abs(self.system.comm, guess.u - point.state.u)
 
-    def extended(self, s: float, passed: Sequence[Point]) -> State:
-        """A state at `s`, of the polynomial through points with their tangents; arc length is from
-        the last.
+    def predicted_state(self, s: float, points: Sequence[Point]) -> State:
+        """Extrapolate the polynomial through points with their tangents to `s`.
 
-        Points before a turn of s do not count.
+        Arc length is measured from the last point. Points before a reversal of s do not count.
         """
-        last = passed[-1]
-        seen = [
-            *(self.seen_from(last, self.measured_from(last, point)) for point in passed[:-1]),
+        last = points[-1]
+        predictors = [
+            *(self.relative_to(last, self.measured_from(last, point)) for point in points[:-1]),
             last,
         ]
-        while (
-            len(seen) > 1 and min(steps := np.diff([point.s for point in seen])) * max(steps) <= 0
-        ):
-            seen.pop(0)
-        return self._joined(s, seen)
+        while len(predictors) > 1:
+            steps = np.diff([point.s for point in predictors])
+            if not min(steps) * max(steps) <= 0:
+                break
+            predictors.pop(0)
+        return self._hermite_state(s, predictors)
 
-    def between(self, s: float, *points: Point) -> State:
-        """A first guess at `s`: the Hermite polynomial through points with their tangents, a cubic
-        through two.
+    def interpolated_state(self, s: float, *points: Point) -> State:
+        """Interpolate a guess at `s` by the polynomial through points with their tangents.
+
+        Through two points it is a cubic.
         """
-        return self._joined(s, points)
+        return self._hermite_state(s, points)
 
-    def _joined(self, s: float, points: Sequence[Point]) -> State:
+    def _hermite_state(self, s: float, points: Sequence[Point]) -> State:
         last, name = points[-1].state, self.name
         u, mu = np.array(last.u), last.mu[name]
-        for (value, slope), point in zip(
-            hermite(s, [point.s for point in points]), points, strict=True
-        ):
-            u += (
-                value * (point.state.u - last.u) + slope * point.du
-            )  # what does not move stays, to the last digit
+        weights = hermite(s, [point.s for point in points])
+        for (value, slope), point in zip(weights, points, strict=True):
+            # what does not move stays, to the last digit
+            u += value * (point.state.u - last.u) + slope * point.du
             mu += value * (point.state.mu[name] - last.mu[name]) + slope * point.dmu
         return last.with_(u, name, float(mu))
 
-    def seen_from(self, base: Point, point: Point) -> Point:
-        """The point with its tangent per unit of s, where s is measured from `base`."""
-        if self.control != "arc":
-            return point
-        return point.per(self.metric.inner(base.normal, (point.du, point.dmu)))
+    def _try_step(self, s: float, predictors: Sequence[Point]) -> Point | RejectedPoint | str:
+        """Predict and correct the next point.
 
-    def _try(self, s: float, passed: Sequence[Point]) -> Point | Far | str:
-        """The next point, foreseen from some points, or one that is too far away, or the reason why
-        there is none.
+        Return it, one that is too far away, or the reason why there is none.
         """
-        here = passed[-1]
-        self.progress.trying(here, s - here.s)
-        guess = self.extended(s, passed)
-        moved = max_abs(self.system.comm, guess.u - here.state.u) / self.system.length
-        grows = (
-            self.newton.options.kinks
-        )  # steps may, where forces set in; given up there, they end beside the path
-        point = self.at(s, guess, here, most=np.inf if grows else max(WILD * moved, LEAST_MOST))
+        current = predictors[-1]
+        self.progress.trying(current, s - current.s)
+        guess = self.predicted_state(s, predictors)
+        max_step = np.inf
+        # where forces begin steps may grow; given up there, they end beside the path
+        if not self.newton.options.has_onsets:
+            distance = max_abs(self.system.comm, guess.u - current.state.u) / self.system.length
+            max_step = max(MAX_CORRECTION * distance, MIN_CORRECTION_LIMIT)
+        point = self.correct(s, guess, current, max_step=max_step)
         if isinstance(point, str):
             return point
-        if turned := point.turned_from(here):
-            point = self.exact(point, here)
-        reason = self._jumped(here, point)
-        return Far(point, reason, turned) if reason else self.as_base(point)
+        exact = point.has_instability_since(current)
+        if exact:
+            point = self.with_own_inertia(point, current)
+        reason = self._jump(current, point)
+        return RejectedPoint(point, reason, exact) if reason else self.as_base(point)
 
-    def _jumped(self, here: Point, there: Point) -> str | None:
-        """The reason to reject a step whose ends do not lie on one smooth arc; None if there is
-        none.
-        """
-        length = there.s - here.s
-        if (
-            abs(there.negative_pivots - here.negative_pivots) > 1
-            and abs(length) > self.options.passes_several
-        ):
+    def _jump(self, current: Point, next_point: Point) -> str | None:
+        """Return why the ends of a step are not on one smooth arc; None if they are."""
+        instabilities = abs(next_point.negative_pivots - current.negative_pivots)
+        if instabilities > 1 and abs(next_point.s - current.s) > self.options.max_step_past_several:
             return "the step passed several instabilities, or jumped to another branch"
-        same = there.negative_pivots == here.negative_pivots or here.across is not None
-        corner = (
-            self.newton.options.kinks and same
-        )  # no corner is an instability, but where the load turns back
-        return None if (self._explained if corner else self._smooth)(here, there) else TURNS
+        # no kink is an instability, but where the load turns back
+        may_have_kink = self.newton.options.has_onsets and (
+            instabilities == 0 or current.across is not None
+        )
+        if may_have_kink:
+            return None if self._is_explained_by_kink(current, next_point) else SHARP_TURN
+        return None if self._is_smooth(current, next_point) else SHARP_TURN
 
-    def _smooth(self, here: Point, there: Point) -> bool:
-        """Whether the ends of a step lie on one smooth arc, as far as their tangents show."""
-        chord = there.state.u - here.state.u
-        unexplained = chord - (there.s - here.s) / 2 * (here.du + there.du)
-        gap, whole = (
+    def _is_smooth(self, current: Point, next_point: Point) -> bool:
+        """Return whether the tangents at both ends of a step allow a smooth arc between them."""
+        chord = next_point.state.u - current.state.u
+        unexplained = chord - (next_point.s - current.s) / 2 * (current.du + next_point.du)
+        gap, distance = (
             max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
         )
-        return self._cosine(here, there) >= self.options.turn and gap <= max(
-            self.options.gap * whole, SEEN
-        )
+        is_straight = self._cosine(current, next_point) >= self.options.min_cosine
+        return is_straight and gap <= max(self.options.max_gap * distance, ZERO_DISPLACEMENT)
 
-    def _reached(self, here: Point, there: Point | Far | str) -> Point | Far | str:
-        """A point before forces set in, unless they did, or there is a corner."""
-        if not isinstance(there, Point):
-            return there
-        clear = self._ahead(here.state, there.state).part == 1.0
-        return there if clear and self._smooth(here, self.seen_from(here, there)) else TURNS
+    def _checked_before_onset(
+        self, current: Point, next_point: Point | RejectedPoint | str
+    ) -> Point | RejectedPoint | str:
+        """Return a point before an onset of forces, unless forces began, or there is a kink."""
+        if not isinstance(next_point, Point):
+            return next_point
+        is_before = self._event(current.state, next_point.state).fraction == 1.0
+        if is_before and self._is_smooth(current, self.relative_to(current, next_point)):
+            return next_point
+        return SHARP_TURN
 
-    def _corner(self, here: Point, there: Point) -> bool:
-        """Whether the path has a corner between two points, from before which nothing behind it is
-        foreseen.
+    def _has_kink(self, current: Point, next_point: Point) -> bool:
+        """Return whether the path has a kink between two points.
+
+        Then points before it predict nothing behind it.
         """
-        return self.newton.options.kinks and not self._smooth(here, self.seen_from(here, there))
+        if not self.newton.options.has_onsets:
+            return False
+        return not self._is_smooth(current, self.relative_to(current, next_point))
 
-    def _passes_corners(self, here: Point, far: Far, plan: Plan) -> bool:
-        """Whether a turn by arc length, in the shortest step, is that of corners where points of a
-        body touch.
+    def _passes_kinks(self, current: Point, rejected: RejectedPoint, plan: StepPlan) -> bool:
+        """Return whether the shortest step turns sharply at kinks, where points of a body touch.
 
-        Half as long a step would end before a corner that is just ahead, or behind two that are
+        Half as long a step would end before a kink that is just ahead, or behind two that are
         close.
         """
-        shortest = plan.length / 2 < self.options.smallest
-        if not (
-            shortest
-            and self.control == "arc"
-            and self.newton.options.corners
-            and far.reason == TURNS
-        ):
+        if plan.length / 2 >= self.options.smallest or self.control != "arc":
             return False
-        return not far.point.turned_from(here) and not self.are_apart(
-            here, self.seen_from(here, far.point)
-        )
+        if not self.newton.options.allows_kinks or rejected.reason != SHARP_TURN:
+            return False
+        if rejected.point.has_instability_since(current):
+            return False
+        return not self.are_apart(current, self.relative_to(current, rejected.point))
 
-    def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
-        """Whether two points are farther apart than a path between them is long, as their tangents
-        show it.
+    def are_apart(self, low: Point, high: Point, rounding: float = ZERO_DISPLACEMENT) -> bool:
+        """Return whether two points are too far apart for one path with their tangents.
 
-        A distance below `least`, in lengths of the system, is that of rounding.
+        Parameters
+        ----------
+        rounding
+            A smaller distance, in lengths, counts as zero.
         """
         comm = self.system.comm
-        reach = FARTHER * abs(high.s - low.s) * max(max_abs(comm, low.du), max_abs(comm, high.du))
-        return max_abs(comm, high.state.u - low.state.u) > max(reach, least * self.system.length)
+        speed = max(max_abs(comm, low.du), max_abs(comm, high.du))
+        reach = MAX_DISTANCE_RATIO * abs(high.s - low.s) * speed
+        distance = max_abs(comm, high.state.u - low.state.u)
+        return distance > max(reach, rounding * self.system.length)
 
-    def _explained(self, here: Point, there: Point) -> bool:
-        """Whether a path with a corner somewhere between two points leads from one to the other."""
-        comm, length = self.system.comm, there.s - here.s
-        turn, rest = there.du - here.du, there.state.u - here.state.u - length * here.du
+    def _is_explained_by_kink(self, current: Point, next_point: Point) -> bool:
+        """Return whether a path with one kink somewhere between two points joins them.
+
+        It follows the tangent of the first point up to the kink, then that of the second.
+        """
+        comm, length = self.system.comm, next_point.s - current.s
+        turn = next_point.du - current.du
+        deviation = next_point.state.u - current.state.u - length * current.du
         square = dot(comm, turn, turn)
-        after = dot(comm, turn, rest) / square if square else 0.0  # of the way, behind the corner
-        after = min(max(after / length, 0.0), 1.0) * length
-        gap = max_abs(comm, rest - after * turn)
-        return gap <= max(
-            self.options.gap * max_abs(comm, rest + length * here.du), SEEN * self.system.length
-        )
+        after_kink = dot(comm, turn, deviation) / square if square else 0.0
+        after_kink = min(max(after_kink / length, 0.0), 1.0) * length
+        gap = max_abs(comm, deviation - after_kink * turn)
+        distance = max_abs(comm, deviation + length * current.du)
+        return gap <= max(self.options.max_gap * distance, ZERO_DISPLACEMENT * self.system.length)
 
     def _cosine(self, a: Point, b: Point) -> float:
-        """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing
-        there.
+        """Return the cosine between the displacements of two tangents.
+
+        It is 1 if the amplitude moves nothing there.
         """
         lengths = self.metric.norm(a.du, 0.0) * self.metric.norm(b.du, 0.0)
-        if lengths < SEEN**2:
+        if lengths < ZERO_DISPLACEMENT**2:
             return 1.0
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
-    def exact(self, point: Point, base: Point) -> Point:
-        """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
+    def with_own_inertia(self, point: Point, base: Point) -> Point:
+        """Return the point with the tangent and inertia of its own K, not of a nearby one."""
         row = self._row(point.s, base)
-        again = self._point(
-            point.state, point.s, self.newton.response(point.state, self.name, row, exact=True)
-        )
+        response = self.newton.response(point.state, self.name, row, exact=True)
         return replace(
-            again,
+            self._point(point.state, point.s, response),
             iterations=point.iterations,
             factorisations=point.factorisations + 1,
             error=point.error,
         )
 
-    def _row(self, s: float, base: Point) -> Row:
+    def _row(self, s: float, base: Point) -> ConstraintRow:
         if self.control == "arc":
             return Hyperplane(self.metric, self.name, base.state, base.normal, s - base.s)
-        return self.given(self.control, s)
+        return self.prescribed(self.control, s)
 
     def _point(self, state: State, s: float, response: Response) -> Point:
-        """A point with its tangent and both numbers of unstable directions.
+        """Return a point with its tangent and both numbers of unstable directions.
 
         With q held instead of mu, there is one unstable direction less where dq/dmu < 0. This is
         Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur
         complement. A coordinate whose force is held has one more instead where dq/dmu > 0.
         """
         pivots = response.negative_pivots
-        held = pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)
-        return Point(state, s, response.du, response.dmu, pivots, held)
+        pivots_held = (
+            pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)
+        )
+        return Point(state, s, response.du, response.dmu, pivots, pivots_held)
 
-    def in_steps(self, options: StepOptions) -> "Path":
-        """The same path with other step lengths."""
+    def with_step_options(self, options: StepOptions) -> "Path":
+        """Return the same path with other step lengths."""
         other = copy(self)
         other.options = options
         return other

@@ -1,5 +1,7 @@
-"""An accepted point of an equilibrium path, the record of points for a resumed run, and reports on
-the way.
+"""Accepted points of an equilibrium path, the journal of a run, and reports of progress.
+
+A point is a state in equilibrium with the path's tangent and the numbers of unstable directions
+there. By the journal an interrupted run resumes. `StepOptions` says how step lengths adapt.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,15 +28,15 @@ class Point:
     negative_pivots_held
         Number of unstable directions with the conjugate displacement held instead of the amplitude.
     iterations, factorisations
-        Work since the point before.
+        Work since the previous point.
     error
         Estimated error of u, over the system's length.
     load_error
-        The estimated error of the amplitude of an instability.
+        Estimated error of the amplitude of an instability.
     habit
-        That of the factorisation after it, by which a resumed run goes on with the same rounding.
+        `Factorisation.habit` after this point: a resumed run continues with the same rounding.
     across
-        The direction along which arc length is measured from it, if that is not its tangent.
+        The direction along which arc length is measured from this point; None: its tangent.
     """
 
     state: State
@@ -52,25 +54,27 @@ class Point:
 
     @property
     def normal(self) -> Direction:
-        """The direction along which arc length is measured from it."""
+        """The direction along which arc length is measured from this point."""
         return self.across or (self.du, self.dmu)
 
-    def per(self, rate: float) -> "Point":
-        """The point with its tangent divided by `rate`."""
+    def with_tangent_per(self, rate: float) -> "Point":
+        """Return the point with its tangent divided by `rate`, the change of s along it."""
         return replace(self, du=np.asarray(self.du / rate), dmu=self.dmu / rate)
 
-    def turned_from(self, other: "Point") -> bool:
-        """Whether an instability lies between two points of a path, as far as they show."""
+    def has_instability_since(self, other: "Point") -> bool:
+        """Return whether inertia or the sign of dmu shows an instability between two points."""
         return self.negative_pivots != other.negative_pivots or self.dmu * other.dmu < 0
 
 
 class PathStopped(RuntimeError):
-    """The path could not be followed further; `point` is the last accepted one.
+    """The path could not be continued.
 
     Attributes
     ----------
+    point
+        The last accepted point.
     final
-        Whether it could not be followed in another way either.
+        Whether no other way of continuation would help either.
     """
 
     def __init__(self, reason: str, point: Point, *, final: bool = False) -> None:
@@ -79,17 +83,17 @@ class PathStopped(RuntimeError):
 
 
 class StepTooLong(RuntimeError):
-    """What lies between two points must not be: the step between them is to be shorter."""
+    """A step passed something that it must not pass: a shorter step is to be tried."""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What a history has seen at points that it has, where that costs as much as a solve.
+class RecordedValues:
+    """Results computed at known points of a path that are as expensive as a solve.
 
     Attributes
     ----------
     values
-        The same on all ranks: what JSON can hold.
+        Values that JSON can hold; the same on all ranks.
     vector
         This rank's part of a vector; None without one.
     """
@@ -98,44 +102,49 @@ class Finding:
     vector: Vector | None = None
 
 
-class Journal(Protocol):
-    """The results of `Path.recorded` and the findings of a history, in their order.
+class SolverJournal(Protocol):
+    """The results of `Path.recorded` and `Path.recorded_values`, in their order.
 
-    A history is deterministic: from the same results it chooses the same steps, targets and
-    brackets. So the results are a complete checkpoint. What is found at these results follows from
-    them, and is kept for its cost.
+    A run is deterministic: from the same results it chooses the same steps, targets and brackets.
+    So the results are a complete checkpoint. Recorded values follow from the results; they are
+    stored because they are expensive.
     """
 
     def replay(self) -> Point | str | None:
-        """The next recorded result; None if there is none and a solve is needed.
+        """Return the next recorded result; None if there is none and a solve is needed.
 
-        Collective. It may raise an exception to stop the history before a new solve begins.
+        Collective. It may raise an exception to stop the run before a new solve begins.
         """
 
     def record(self, result: Point | str) -> None:
-        """Keep a result. Collective."""
+        """Store a result. Collective."""
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
-        """What `find` returns, or has returned here in an interrupted run. Collective.
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
+        """Return what `find` returns, or what it returned here in an interrupted run. Collective.
 
         The vector is None where that run had other ranks.
         """
 
     def begin(self, space: object) -> None:
-        """The results from here on are of another system, with the unknowns of that space.
+        """Announce that the next results belong to another system, with unknowns in `space`.
 
         Collective.
         """
 
-    def check(self, known: bool) -> None:
-        """Between two steps in time towards one result, which may be `known` already. Collective.
+    def check(self, is_recorded: bool) -> None:
+        """Allow the run to stop between two time steps towards one result. Collective.
 
-        It may raise an exception to stop the history.
+        It may raise an exception to stop the run.
+
+        Parameters
+        ----------
+        is_recorded
+            Whether the result is already recorded.
         """
 
 
 class NoJournal:
-    """Keeps nothing."""
+    """A journal that stores nothing."""
 
     def replay(self) -> None:
         return None
@@ -143,36 +152,36 @@ class NoJournal:
     def record(self, result: Point | str) -> None:
         pass
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
         return find()
 
     def begin(self, space: object) -> None:
         pass
 
-    def check(self, known: bool) -> None:
+    def check(self, is_recorded: bool) -> None:
         pass
 
 
 class Progress(Protocol):
-    """Receives the next action of a history.
+    """Receives the next action of a run.
 
-    No method is collective, and no result may depend on it.
+    No method is collective, and no result may depend on one.
     """
 
-    def trying(self, here: Point, length: float) -> None:
-        """A step of a length in s from an accepted point begins."""
+    def trying(self, current: Point, length: float) -> None:
+        """Report that a step of a length in s from an accepted point begins."""
 
     def beginning(self, step: int) -> None:
-        """A step of the programme begins at the last accepted point; its number is from 1."""
+        """Report that a step of the programme begins at the last accepted point; from 1."""
 
     def doing(self, what: str) -> None:
-        """Some other long action begins; `what` describes it in a few words."""
+        """Report that some other long action begins; `what` describes it in a few words."""
 
 
 class NoProgress:
-    """Reports nothing."""
+    """A receiver that reports nothing."""
 
-    def trying(self, here: Point, length: float) -> None:
+    def trying(self, current: Point, length: float) -> None:
         pass
 
     def beginning(self, step: int) -> None:
@@ -184,23 +193,25 @@ class NoProgress:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Adaptive step length.
+    """Options of the adaptive step length.
 
     Attributes
     ----------
     first, largest, smallest
         Step lengths in units of s.
-    easy, hard
-        A step grows after at most `easy` factorisations, and shrinks after at least `hard`.
-    few
-        A step also grows after at most so many iterations.
-    straight
+    easy_factorisations
+        A step grows after at most this many factorisations ...
+    easy_iterations
+        ... or after at most this many iterations.
+    hard_factorisations
+        A step shrinks after at least this many factorisations.
+    growth_cosine
         A step grows only if the cosine between the tangents of successive points is larger.
-    turn
-        Least cosine between the tangents of successive points. A sharper turn counts as a jump to
-        another branch, and a smaller step is tried.
-    gap
-        Largest part of a step that the tangents at its ends may leave unexplained. A larger one
+    min_cosine
+        Smallest cosine between the tangents of successive points. A sharper turn counts as a jump
+        to another branch, and a smaller step is tried.
+    max_gap
+        Largest fraction of a step that the tangents at its ends may leave unexplained. A larger one
         counts as a jump too.
     several
         The longest step that may pass more than one instability; 0: an eighth of the first.
@@ -209,15 +220,15 @@ class StepOptions:
     first: float
     largest: float
     smallest: float
-    easy: int = 2
-    hard: int = 4
-    few: int = 4
-    straight: float = 0.9
-    turn: float = 0.5
-    gap: float = 0.1
+    easy_factorisations: int = 2
+    hard_factorisations: int = 4
+    easy_iterations: int = 4
+    growth_cosine: float = 0.9
+    min_cosine: float = 0.5
+    max_gap: float = 0.1
     several: float = 0.0
 
     @property
-    def passes_several(self) -> float:
+    def max_step_past_several(self) -> float:
         """The longest step that may pass more than one instability."""
         return self.several or self.first / 8

@@ -3,7 +3,7 @@
 A guess is tried in two ways: by Newton's method with all known solutions deflated, and by the path
 on which a force along its displacement that holds it is released. Each solution that is found gives
 two more guesses, along its softest mode. A search for stable solutions first lets each guess
-settle: go down in energy until it rests at one.
+settle: it follows a descent of the energy until it comes to rest.
 
 **Release.** R(u) + t b = 0 with -b . u = q, first that of the guess; then the path is followed by
 arc length, through folds, until the force t is zero: there is an equilibrium.
@@ -20,10 +20,10 @@ from functools import cached_property, partial
 import numpy as np
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.bifurcation import largest
-from magshell_fenicsx.continuation.control import GivenConjugate
-from magshell_fenicsx.continuation.deflated import deflated
-from magshell_fenicsx.continuation.device import FORCE, HeldAlong
+from magshell_fenicsx.continuation.bifurcation import largest_entry
+from magshell_fenicsx.continuation.control import PrescribedConjugate
+from magshell_fenicsx.continuation.deflation import find_deflated
+from magshell_fenicsx.continuation.device import FORCE, HoldingForceSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -38,79 +38,73 @@ from magshell_fenicsx.continuation.system import (
     symmetric_part,
 )
 
-FIRST, LONGEST, SHORTEST = (
-    0.02,
-    1000.0,
-    1e-3,
-)  # steps: the first in the metric's length, others over the first
-MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
-MOST_BRACKETS, LITTLE = (
-    4,
-    1e-2,
-)  # solves for the zero of the force; this part of its change counts as zero
-SCALE = 1e6  # the force counts as nothing in the arc length
-MOST_FACTORS = 40
-UNEXPLAINED = 0.7  # part of the residual that a step towards rest may leave
-EASY = 0.2  # where it leaves less, the next is longer
-RESTED = 0.05  # in lengths of the system: a shorter step with so small a shift ends
-SMALL = 0.01
-COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
-MODE, DOWN = (
-    1.0,
-    0.3,
-)  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
-MOST_CHANGED = 10  # times that a solution gets stiffer penalties or new cuts
-DESCENTS = 20  # times that a guess goes on settling
-OVER = "the time of the search is over"
+# steps along the path of a holding force: the first in the metric's length, others over the first
+FIRST_STEP, MAX_STEP_RATIO, MIN_STEP_RATIO = 0.02, 1000.0, 1e-3
+MAX_STEPS, MAX_FORCE_RATIO = 30, 10.0  # of that path; the force over the first one
+MAX_BRACKETS = 4  # solves for the zero of the force
+FORCE_TOLERANCE = 1e-2  # of the change of the force: less counts as zero
+FORCE_SCALE = 1e6  # of the arc length: the force counts as nothing in it
+MAX_SETTLING_FACTORISATIONS = 40
+MAX_UNEXPLAINED = 0.7  # fraction of the residual that a step of settling may leave
+EASY_UNEXPLAINED = 0.2  # where it leaves less, the next step is longer
+# settling ends after a step that is shorter, in lengths of the system, with a shift so small
+REST_STEP, REST_SHIFT = 0.05, 0.01
+SAME_SOLUTION_DISTANCE = 1e-3  # in lengths of the system: nearer solutions are one
+MODE_SIZE = 1.0  # in lengths: size of a mode in a guess
+DESCENT_SIZE = 0.3  # in lengths: size of a mode by which a descent leaves an unstable solution
+MAX_PARAMETER_CHANGES = 10  # times that a solution gets stiffer penalties or new cuts
+MAX_DESCENTS = 20  # times that a guess goes on settling
+TIME_IS_OVER = "the time of the search is over"
 
 
 def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]:
-    """Guesses of equilibria on the path of a force along b that holds a guess, each where the force
-    is zero.
+    """Yield guesses of equilibria on the path of a force along b that first holds a guess.
 
-    The path begins in the direction in which the force falls in size.
+    Each is a state where the force is zero. The path begins in the direction in which the force
+    falls in size.
     """
     system = newton.system
-    residual, size = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
-    b = np.asarray(
-        b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0)
-    )  # a force of order one
-    holder = newton.on(HeldAlong(system, b))
-    first = -dot(system.comm, b, residual) / dot(system.comm, b, b)
-    row = GivenConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
-    near = deflated(holder, State(guess.u, {**guess.mu, FORCE: first}), FORCE, row)
-    outcome = holder.solve(near, FORCE, row) if near else None
-    if outcome is None or not outcome.converged:
+    residual, square = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
+    # the amplitude of the force is of order one
+    scale = np.sqrt(dot(system.comm, residual, residual) / square) or 1.0
+    b = np.asarray(b * scale)
+    holder = newton.for_system(HoldingForceSystem(system, b))
+    force = -dot(system.comm, b, residual) / dot(system.comm, b, b)
+    row = PrescribedConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
+    start = find_deflated(holder, State(guess.u, {**guess.mu, FORCE: force}), FORCE, row)
+    result = holder.solve(start, FORCE, row) if start else None
+    if result is None or not result.converged:
         return
-    path = Path(holder, FORCE, "arc", StepOptions(FIRST, LONGEST * FIRST, SHORTEST * FIRST), SCALE)
-    largest = MOST_FORCE * abs(outcome.state.mu[FORCE])
-    reached = path.start(outcome.state, -float(np.copysign(1.0, outcome.state.mu[FORCE])))
+    options = StepOptions(FIRST_STEP, MAX_STEP_RATIO * FIRST_STEP, MIN_STEP_RATIO * FIRST_STEP)
+    path = Path(holder, FORCE, "arc", options, FORCE_SCALE)
+    max_force = MAX_FORCE_RATIO * abs(result.state.mu[FORCE])
+    last = path.start(result.state, -float(np.copysign(1.0, result.state.mu[FORCE])))
     try:
-        for count, (point, _) in enumerate(path.towards(reached, [np.inf]), 1):
-            before, after = (p.state.mu[FORCE] for p in (reached, point))
-            if before * after <= 0 and before != after:
-                yield State(
-                    _at_rest(path, reached, path.seen_from(reached, point)).u, dict(guess.mu)
-                )
-            reached = point
-            if count == MOST_STEPS or abs(after) > largest:
+        for count, (point, _) in enumerate(path.continue_to(last, [np.inf]), 1):
+            force_before, force_after = (p.state.mu[FORCE] for p in (last, point))
+            if force_before * force_after <= 0 and force_before != force_after:
+                state = _state_without_force(path, last, path.relative_to(last, point))
+                yield State(state.u, dict(guess.mu))
+            last = point
+            if count == MAX_STEPS or abs(force_after) > max_force:
                 return
     except PathStopped:
         return
 
 
-def _at_rest(path: Path, base: Point, high: Point) -> State:
-    """Where the holding force is zero between two points, by regula falsi until little of it is
-    left.
+def _state_without_force(path: Path, base: Point, high: Point) -> State:
+    """Return the state between two points where the holding force is zero.
+
+    Regula falsi is repeated until little of the force is left.
     """
-    low, most = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
-    for _ in range(MOST_BRACKETS):
+    low, change = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
+    for _ in range(MAX_BRACKETS):
         first, last = low.state.mu[FORCE], high.state.mu[FORCE]
         s = low.s + (high.s - low.s) * first / (first - last)
-        middle = path.inside(s, low, high, base)
+        middle = path.correct_between(s, low, high, base)
         if isinstance(middle, str):
-            return path.between(s, low, high)
-        if abs(middle.state.mu[FORCE]) <= LITTLE * most:
+            return path.interpolated_state(s, low, high)
+        if abs(middle.state.mu[FORCE]) <= FORCE_TOLERANCE * change:
             return middle.state
         low, high = (middle, high) if middle.state.mu[FORCE] * first > 0 else (low, middle)
     return min(low, high, key=lambda end: abs(end.state.mu[FORCE])).state
@@ -118,14 +112,14 @@ def _at_rest(path: Path, base: Point, high: Point) -> State:
 
 @dataclass
 class Settling:
-    """The flow of a system from any guess.
+    """The flow of a system from any guess towards a stable equilibrium.
 
     Parameters
     ----------
     unloaded
         A state with a positive definite tangent K0.
     passes
-        Whether a step must not be gone, as shells would pass through each other.
+        Whether shells would pass through each other in a step, which is then refused.
     """
 
     system: System
@@ -135,91 +129,94 @@ class Settling:
     def __post_init__(self) -> None:
         K = symmetric_part(self.system.tangent(self.unloaded.u, self.unloaded.mu))
         self._K0 = K.copy()
-        self._stiff, self._factors = (
-            Factorisation(self.system.comm),
-            Factorisation(self.system.comm),
-        )
-        self._stiff.factor(self._K0)
+        self._K0_factors = Factorisation(self.system.comm)
+        self._factors = Factorisation(self.system.comm)
+        self._K0_factors.factor(self._K0)
 
     def settled(self, guess: State) -> State:
-        """The state after a number of steps, or near the stable equilibrium where they end."""
-        system, u, shift, spent = self.system, guess.u, 1.0, 0
+        """Return the state after some steps, or near the stable equilibrium where they end.
+
+        Collective.
+        """
+        system, u, shift, factorisations = self.system, guess.u, 1.0, 0
         residual = system.residual(u, guess.mu)
-        while spent < MOST_FACTORS:
+        while factorisations < MAX_SETTLING_FACTORISATIONS:
             K = symmetric_part(system.tangent(u, guess.mu)).copy()
-            while spent < MOST_FACTORS:
-                spent += 1
+            while factorisations < MAX_SETTLING_FACTORISATIONS:
+                factorisations += 1
                 shifted = K.copy()
-                shifted.axpy(
-                    shift, self._K0, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-                )  # K has what touches too
+                # K has entries of contacts too
+                structure = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+                shifted.axpy(shift, self._K0, structure)
                 self._factors.factor(shifted)
                 if self._factors.negative_pivots:
                     shift *= 2
                     continue
                 du = -self._factors.solve(residual)
-                ahead = system.residual(u + du, guess.mu)
-                left = self._size(ahead + shift * self._stiff.times(du)) / self._size(residual)
-                if left <= UNEXPLAINED and not self.passes(
+                next_residual = system.residual(u + du, guess.mu)
+                unexplained_force = next_residual + shift * self._K0_factors.times(du)
+                unexplained = self._size(unexplained_force) / self._size(residual)
+                if unexplained <= MAX_UNEXPLAINED and not self.passes(
                     State(u, guess.mu), State(u + du, guess.mu)
                 ):
-                    u, residual = u + du, ahead
-                    ends = shift < SMALL and max_abs(system.comm, du) <= RESTED * system.length
-                    shift /= 4 if left < EASY else 1
-                    if ends:
+                    u, residual = u + du, next_residual
+                    is_at_rest = (
+                        shift < REST_SHIFT and max_abs(system.comm, du) <= REST_STEP * system.length
+                    )
+                    shift /= 4 if unexplained < EASY_UNEXPLAINED else 1
+                    if is_at_rest:
                         return State(u, guess.mu)
                     break
                 shift *= 3
         return State(u, guess.mu)
 
     def _size(self, residual: Vector) -> float:
-        """The size of a residual: of the displacement that it causes, in the norm of K0."""
-        return (
-            float(np.sqrt(abs(dot(self.system.comm, residual, self._stiff.solve(residual)))))
-            or np.finfo(float).tiny
-        )
+        """Return the size of a residual: of its displacement, in the norm of K0."""
+        square = dot(self.system.comm, residual, self._K0_factors.solve(residual))
+        return float(np.sqrt(abs(square))) or np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Where a search ends.
+class SearchLimits:
+    """The end of a search.
 
     Attributes
     ----------
     solutions, guesses
         Largest numbers of solutions and of guesses.
-    over
+    time_is_over
         Whether the time is over; the same on all ranks.
     """
 
     solutions: int
     guesses: int
-    over: Callable[[], bool] = lambda: False
+    time_is_over: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True)
-class Rules:
-    """What solutions of shells that may touch have to keep.
+class AcceptanceRules:
+    """Conditions on solutions of shells in contact.
 
     Attributes
     ----------
     passes
-        Whether shells pass through each other on the straight way between two states.
-    own
-        A solution with penalties and cuts of its own, to be solved again; None if it has them.
+        Whether shells pass through each other on the straight segment between two states.
+    with_own_parameters
+        Returns a solution with penalties and cuts of its own, to be solved again; None if it has
+        them.
     """
 
     passes: Callable[[State, State], bool] = lambda here, there: False
-    own: Callable[[State], State | None] = lambda state: None
+    with_own_parameters: Callable[[State], State | None] = lambda state: None
 
 
-class Guess:
-    """A guess, made when it is needed, and the direction in which it is away from a known solution.
+class SearchGuess:
+    """A guess, computed when it is needed, and its direction from a known solution.
 
     Attributes
     ----------
-    reached
-        Whether a way without shells that pass through each other leads there.
+    reachable
+        Whether a path without shells that pass through each other leads there.
     """
 
     def __init__(
@@ -228,9 +225,10 @@ class Guess:
         base: State,
         displacement: Callable[[Vector], Vector],
         *,
-        reached: bool,
+        reachable: bool,
     ) -> None:
-        self._make, self._base, self._displacement, self.reached = make, base, displacement, reached
+        self._make, self._base, self._displacement = make, base, displacement
+        self.reachable = reachable
 
     @cached_property
     def state(self) -> State:
@@ -238,55 +236,62 @@ class Guess:
 
     @property
     def direction(self) -> Vector:
+        """The displacement from the known solution."""
         return self._displacement(self.state.u - self._base.u)
 
 
-def further(
+def further_solutions(
     path: Path,
     start: State,
     guesses: Iterable[Callable[[], State]],
-    limits: Limits,
+    limits: SearchLimits,
     displacement: Callable[[Vector], Vector] = lambda u: u,
     descend: Callable[[State], State] | None = None,
-    rules: Rules | None = None,
+    rules: AcceptanceRules | None = None,
 ) -> Iterator[Point]:
-    """Solutions at the amplitudes of a known one, each accepted as a point of the path is.
+    """Yield solutions at the amplitudes of a known one, each accepted like a point of a path.
 
     Parameters
     ----------
     path
-        By load control, in any amplitude. Its journal gets the result of every attempt.
+        A path by load control, in any amplitude. Its journal stores the result of every attempt.
     start
         A solution.
     guesses
-        Further guesses, which are tried first; ways lead there on which no shells pass through each
-        other.
+        Further guesses, which are tried first; paths lead there on which no shells pass through
+        each other.
     displacement
-        A vector of the system with zeros for unknowns that are no displacements.
+        Returns a vector of the system with zeros for unknowns that are no displacements.
     descend
         Lets a state go down in energy by some steps; then only stable solutions count. None: all
         count.
     rules
-        Of shells that may touch.
+        Conditions on shells in contact.
     """
-    search = _Search(path, [start], descend, limits.over, rules or Rules())
-    queue = [Guess(make, start, displacement, reached=True) for make in guesses]
-    queue += search.along_mode(start, displacement)
+    search = _SolutionSearch(
+        path, [start], descend, limits.time_is_over, rules or AcceptanceRules()
+    )
+    queue = [SearchGuess(make, start, displacement, reachable=True) for make in guesses]
+    queue += search.guesses_along_mode(start, displacement)
     accepted = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
         attempts = [*([search.by_descent] if descend else []), search.by_newton, search.by_release]
         while attempts:
             attempt = attempts.pop(0)
             path.progress.doing(
-                f"searching: guess {number} of at most {limits.guesses}, solutions found: {accepted}"
+                f"searching: guess {number} of at most {limits.guesses}, "
+                f"solutions found: {accepted}"
             )
-            point = path.recorded(partial(_unless, limits.over, attempt, guess))
-            if point == OVER:
+            point = path.recorded(partial(_unless_over, limits.time_is_over, attempt, guess))
+            if point == TIME_IS_OVER:
                 return
-            if isinstance(point, str) or isinstance(point := search.kept(guess, point), str):
+            if isinstance(point, str):
                 continue
-            search.known.append(point.state)
-            queue += search.along_mode(point.state, displacement)
+            point = search.accept_by_rules(guess, point)
+            if isinstance(point, str):
+                continue
+            search.known_solutions.append(point.state)
+            queue += search.guesses_along_mode(point.state, displacement)
             accepted += not (descend and point.negative_pivots)
             yield point
             if accepted == limits.solutions:
@@ -296,146 +301,154 @@ def further(
             return
 
 
-def _unless(
-    over: Callable[[], bool], attempt: Callable[[Guess], Point | str], guess: Guess
+def _unless_over(
+    time_is_over: Callable[[], bool],
+    attempt: Callable[[SearchGuess], Point | str],
+    guess: SearchGuess,
 ) -> Point | str:
-    """The result of an attempt; states without meaning, far from equilibrium, may have no factors."""
+    """Return the result of an attempt, or `TIME_IS_OVER`.
+
+    States without meaning, far from equilibrium, may have no factors: that is a failure.
+    """
     try:
-        return OVER if over() else attempt(guess)
+        return TIME_IS_OVER if time_is_over() else attempt(guess)
     except (NoEigenpair, PETSc.Error, np.linalg.LinAlgError) as e:
         return str(e)
 
 
-class _Search:
+class _SolutionSearch:
     """The attempts of a search.
 
     Attributes
     ----------
-    known
+    known_solutions
         The solutions so far.
     """
 
     def __init__(
         self,
         path: Path,
-        known: list[State],
+        known_solutions: list[State],
         descend: Callable[[State], State] | None,
-        over: Callable[[], bool],
-        rules: Rules,
+        time_is_over: Callable[[], bool],
+        rules: AcceptanceRules,
     ) -> None:
-        self._path, self.known, self._descend, self._over, self._rules = (
-            path,
-            known,
-            descend,
-            over,
-            rules,
-        )
+        self._path, self.known_solutions, self._descend = path, known_solutions, descend
+        self._over, self._rules = time_is_over, rules
         self._system, self._newton = path.system, path.newton
         self._solver = Path(path.newton, path.name, "load", path.options)  # without a journal
-        self._value = known[0].mu[path.name]
-        self._row = path.given("load", self._value)
+        self._value = known_solutions[0].mu[path.name]
+        self._row = path.prescribed("load", self._value)
 
-    def kept(self, guess: Guess, point: Point) -> Point | str:
-        """A solution as the rules ask for it, or why it is none: every known one is reached without
-        passing through.
+    def accept_by_rules(self, guess: SearchGuess, point: Point) -> Point | str:
+        """Return a solution that obeys the rules, or the reason why it is none.
+
+        It has penalties of its own, and a known solution or a reachable guess leads there without
+        shells passing through each other.
         """
-        for _ in range(MOST_CHANGED):
-            if (own := self._rules.own(point.state)) is None:
+        for _ in range(MAX_PARAMETER_CHANGES):
+            if (state := self._rules.with_own_parameters(point.state)) is None:
                 break
-            again = self._path.recorded(partial(self._again, own))
-            if isinstance(again, str):
-                return again
-            point = again
+            solved = self._path.recorded(partial(self._solve_from, state))
+            if isinstance(solved, str):
+                return solved
+            point = solved
         else:
             return "the shells that touch have no cuts and penalties that last"
         if self._is_known(point.state):
             return "the solution is a known one"
-        begins = [*self.known, *([guess.state] if guess.reached else [])]
+        begins = [*self.known_solutions, *([guess.state] if guess.reachable else [])]
         if all(self._rules.passes(begin, point.state) for begin in begins):
             return "shells have passed through each other"
         return point
 
-    def _again(self, state: State) -> Point | str:
+    def _solve_from(self, state: State) -> Point | str:
         point = self._solver.solve(self._row, self._value, state)
-        return point if isinstance(point, str) else self._solver.exact(point, point)
+        return point if isinstance(point, str) else self._solver.with_own_inertia(point, point)
 
-    def by_newton(self, guess: Guess) -> Point | str:
-        """The solution that deflated Newton's method finds from a guess."""
-        return self._accepted(guess.state)
+    def by_newton(self, guess: SearchGuess) -> Point | str:
+        """Return the solution that deflated Newton's method finds from a guess."""
+        return self._new_solution(guess.state)
 
-    def by_descent(self, guess: Guess) -> Point | str:
-        """The stable solution below a guess; from an unstable one on the way it goes on along the
-        softest mode.
+    def by_descent(self, guess: SearchGuess) -> Point | str:
+        """Return the stable solution below a guess.
+
+        From an unstable one it descends further along the softest mode.
         """
         assert self._descend
-        state, tried = guess.state, "it does not come to rest"
-        for _ in range(DESCENTS):
+        state, reason = guess.state, "it does not come to rest"
+        for _ in range(MAX_DESCENTS):
             if self._over():
-                return OVER
+                return TIME_IS_OVER
             state = self._descend(state)
             if self._newton.factor_at(state).negative_pivots:
                 continue
-            near = deflated(self._newton, state, self._path.name, self._row)
-            outcome = (
-                self._solver.solve(self._row, self._value, near) if near else "no solution is near"
-            )
-            if isinstance(outcome, str):
-                tried = outcome
-            elif self._is_known(outcome.state):
+            start = find_deflated(self._newton, state, self._path.name, self._row)
+            result: Point | str = "no solution is near"
+            if start:
+                result = self._solver.solve(self._row, self._value, start)
+            if isinstance(result, str):
+                reason = result
+            elif self._is_known(result.state):
                 return "the solution is a known one"
             else:
-                point = self._solver.exact(outcome, outcome)
+                point = self._solver.with_own_inertia(result, result)
                 if not point.negative_pivots:
                     return point
-                state = _Mode(self._path, point.state).state(DOWN)
-        return tried
+                state = _SoftestMode(self._path, point.state).displaced_state(DESCENT_SIZE)
+        return reason
 
-    def by_release(self, guess: Guess) -> Point | str:
-        """The first solution on the path of a force that holds the guess."""
+    def by_release(self, guess: SearchGuess) -> Point | str:
+        """Return the first solution on the path of a force that holds the guess."""
         for state in released(self._newton, guess.state, guess.direction):
-            accepted = self._accepted(state)
-            if not isinstance(accepted, str):
-                return accepted
+            point = self._new_solution(state)
+            if not isinstance(point, str):
+                return point
         return "the force does not fall to zero"
 
-    def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:
-        """Guesses on both sides of a solution along its softest mode."""
-        mode = _Mode(self._path, state)
+    def guesses_along_mode(
+        self, state: State, displacement: Callable[[Vector], Vector]
+    ) -> list[SearchGuess]:
+        """Return guesses on both sides of a solution along its softest mode."""
+        mode = _SoftestMode(self._path, state)
         return [
-            Guess(partial(mode.state, size), state, displacement, reached=False)
-            for size in (MODE, -MODE)
+            SearchGuess(partial(mode.displaced_state, size), state, displacement, reachable=False)
+            for size in (MODE_SIZE, -MODE_SIZE)
         ]
 
-    def _accepted(self, guess: State) -> Point | str:
-        path = self._path
-        near = deflated(
-            self._newton, guess, path.name, self._row, [state.u for state in self.known]
-        )
-        if near is None:
+    def _new_solution(self, guess: State) -> Point | str:
+        path, known_solutions = self._path, [state.u for state in self.known_solutions]
+        start = find_deflated(self._newton, guess, path.name, self._row, known_solutions)
+        if start is None:
             return "Newton's method finds no other solution"
-        point = self._solver.solve(self._row, self._value, near)
+        point = self._solver.solve(self._row, self._value, start)
         if isinstance(point, str):
             return point
         if self._is_known(point.state):
             return "the solution is a known one"
-        return self._solver.exact(point, point)
+        return self._solver.with_own_inertia(point, point)
 
     def _is_known(self, solution: State) -> bool:
-        away = (max_abs(self._system.comm, solution.u - state.u) for state in self.known)
-        return min(away) <= COPY * self._system.length
+        distances = (
+            max_abs(self._system.comm, solution.u - state.u) for state in self.known_solutions
+        )
+        return min(distances) <= SAME_SOLUTION_DISTANCE * self._system.length
 
 
 @dataclass(frozen=True)
-class _Mode:
+class _SoftestMode:
     """The softest mode of a solution, computed when it is needed."""
 
     path: Path
-    at: State
+    solution: State
 
     @cached_property
     def vector(self) -> Vector:
-        _, mode = nearest_to_zero(self.path.newton.factor_at(self.at))
-        return np.asarray(mode * self.path.system.length / largest(self.path.system.comm, mode))
+        """The mode; its largest entry is one length of the system."""
+        _, mode = nearest_to_zero(self.path.newton.factor_at(self.solution))
+        largest = largest_entry(self.path.system.comm, mode)
+        return np.asarray(mode * self.path.system.length / largest)
 
-    def state(self, size: float) -> State:
-        return State(self.at.u + size * self.vector, self.at.mu)
+    def displaced_state(self, size: float) -> State:
+        """Return the solution displaced along the mode by a size in lengths."""
+        return State(self.solution.u + size * self.vector, self.solution.mu)

@@ -1,4 +1,4 @@
-"""PETSc's SNES on the bordered system: what it calls, its options, and the reasons why it ends.
+"""PETSc's SNES on the bordered system: its callbacks, options, and the reasons why it ends.
 
 SNES has the loop, the line search and the monitors. Its linear solver is the bordered matrix, which
 is kept while the steps shrink. Its test of convergence is the next step, which measures the error
@@ -15,47 +15,55 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
+from magshell_fenicsx.continuation.control import BorderedMatrix, Chord, ConstraintRow, add_scaled
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.iterates import FULL, Iterates, Step, Verdict, foreseen
+from magshell_fenicsx.continuation.iterates import (
+    QUADRATIC_RATIO,
+    Iterates,
+    NewtonStep,
+    Verdict,
+    extrapolated_error,
+)
 from magshell_fenicsx.continuation.system import (
     Direction,
-    Roughly,
+    InexactSystem,
     State,
     System,
-    Weighted,
-    followed,
+    WeightedDisplacement,
+    extrapolated_stress,
     max_abs,
 )
 from magshell_fenicsx.platform import compat
 
-# this part of the largest displacement counts as the length where it exceeds the system's length
-MOTION = 0.1
-DOUBT = 1.0  # see `Factorisation.doubt`: up to this one D may be that of an earlier state
-OLD = 3  # matrices of a solve after which an older part of them is made anew, once
-AWAY = 1.0  # in lengths: after a longer step that part would soon be too old again
-# a step with foreseen forces over those since they were computed: below it they are computed again
-FORESEEN = 0.01
-CERTAIN = (
-    0.1  # part of the tolerance, for an error after computed forces that is not looked at again
-)
-SEARCHED = 12  # matrices after which the steps of a line search must have shrunk
-PREFIX = "magshell_"  # options with this prefix are of this solver alone
-DIVERGED, FAR = "the iteration diverged", "the first guess is too far away"
-HIDDEN = "rounding hides the solution: the tangent is nearly singular"
+# this fraction of the largest displacement counts as the length where it exceeds the system's
+LENGTH_PER_DISPLACEMENT = 0.1
+# of `Factorisation.inertia_uncertainty`, up to which D may be that of an earlier state
+MAX_INERTIA_UNCERTAINTY = 1.0
+MATRICES_WITH_LAG = 3  # matrices of a solve after which their lagged part is renewed, once
+# in lengths: after a longer step a renewed part would soon be too old again
+MAX_STEP_WITH_RENEWAL = 1.0
+# size of a step with extrapolated forces over the largest one since forces were computed: below
+# this ratio they are computed again
+EXTRAPOLATED_STEP_RATIO = 0.01
+# fraction of the tolerance: a smaller error after computed forces is not verified again
+CERTAIN_ERROR = 0.1
+LINE_SEARCH_PATIENCE = 12  # matrices after which the steps of a line search must have shrunk
+PREFIX = "magshell_"  # options with this prefix belong to this solver alone
+DIVERGED, GUESS_TOO_FAR = "the iteration diverged", "the first guess is too far away"
+HIDDEN_BY_ROUNDING = "rounding hides the solution: the tangent is nearly singular"
 
 Reason = PETSc.SNES.ConvergedReason
-REASON_OF: dict[Verdict, Any] = {
+REASON_OF_VERDICT: dict[Verdict, Any] = {
     "go on": Reason.CONVERGED_ITERATING,
     "converged": Reason.CONVERGED_SNORM_RELATIVE,
     "diverged": Reason.DIVERGED_DTOL,
     "far": Reason.DIVERGED_LOCAL_MIN,
     "rounding": Reason.DIVERGED_INNER,
 }
-IN_WORDS = {
+REASON_MESSAGES = {
     Reason.DIVERGED_DTOL: DIVERGED,
-    Reason.DIVERGED_LOCAL_MIN: FAR,
-    Reason.DIVERGED_INNER: HIDDEN,
+    Reason.DIVERGED_LOCAL_MIN: GUESS_TOO_FAR,
+    Reason.DIVERGED_INNER: HIDDEN_BY_ROUNDING,
     Reason.DIVERGED_MAX_IT: "too many iterations",
     Reason.DIVERGED_LINE_SEARCH: "the line search failed",
     Reason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
@@ -76,62 +84,66 @@ class NewtonOptions:
     max_iterations
         Iterations after which a step is given up; `-snes_max_it` replaces it.
     contraction
-        The first factors are kept while a step is shorter than this part of the one before.
-    hard
+        The first factors are kept while a step is shorter than this fraction of the previous one.
+    late_contraction
         The same for later factors, and for all factors if the guess comes with a stress: old
         factors mislead there.
-    cheap
+    chord_steps_per_factorisation
         This many steps with old factors cost less than new factors. So old factors that halve the
         step are kept if that many steps reach the tolerance, but not if the guess comes with a
         stress.
-    fresh
+    reuse_distance
         Distance, in lengths, up to which factors are used for the tangent and the inertia of a
         solution.
     largest_step
         An iteration that moves u by more than this many lengths counts as divergence.
     patience
-        Matrices after which the steps of a solve must have shrunk.
+        Number of matrices after which the steps of a solve must have shrunk.
     stiffnesses
-        Amplitudes that are the stiffness of faces between which forces set in within a step, as
-        where shells touch, with their values in a state that has none.
-    corners
-        Whether a path has corners although full steps do not circle, as where points of rigid
-        bodies touch.
+        Amplitudes that are the stiffness of faces between which contact forces begin within a step,
+        with their values in a state that has none.
+    allows_kinks
+        Whether a path has kinks although full steps do not circle, as where points of rigid bodies
+        touch.
     """
 
     tolerance: float = 1e-9
     max_iterations: int = 25
     contraction: float = 0.6
-    hard: float = 0.1
-    cheap: int = 8
-    fresh: float = 0.05
+    late_contraction: float = 0.1
+    chord_steps_per_factorisation: int = 8
+    reuse_distance: float = 0.05
     largest_step: float = 1e4
     patience: int = 4
     stiffnesses: Mapping[str, float] = field(default_factory=dict)
-    corners: bool = False
+    allows_kinks: bool = False
 
     @property
-    def kinks(self) -> bool:
-        """Whether forces set in within a step: full steps then circle, and a path has corners."""
+    def has_onsets(self) -> bool:
+        """Whether forces begin within a step: full steps then circle, and a path has kinks."""
         return bool(self.stiffnesses)
 
 
 class LatestTangent:
-    """The factors of the latest tangent of a system, and the state to which they belong."""
+    """The factors of the latest tangent of a system, and the state to which they belong.
+
+    Attributes
+    ----------
+    lagged
+        Whether a small part of the tangent belongs to an earlier state.
+    """
 
     def __init__(self, system: System, factorisation: Factorisation) -> None:
         self.system, self._factorisation = system, factorisation
-        self._made: tuple[State | None, int] = (
-            None,
-            0,
-        )  # the state that was factored last, and its number
-        self._stressed = False  # whether it was factored with another stress than its own
-        self.rough = False  # whether a small part of it is that of an earlier state
+        # the state that was factored last, and the number of its factorisation
+        self._factored: tuple[State | None, int] = None, 0
+        self._has_other_stress = False  # whether the stress was not that of the state
+        self.lagged = False
 
     @property
     def state(self) -> State | None:
         """The state to which the latest factors belong; None if another solver made them."""
-        state, count = self._made
+        state, count = self._factored
         return state if count == self._factorisation.count else None
 
     @property
@@ -139,127 +151,159 @@ class LatestTangent:
         """The latest factors."""
         return self._factorisation
 
-    def near(self, state: State, most: float) -> bool:
-        """Whether the latest factors belong to a state less than so many lengths from another one;
-        of any load.
-        """
-        mine, system = self.state, self.system
-        return mine is not None and max_abs(system.comm, state.u - mine.u) < most * system.length
+    def is_near(self, state: State, distance: float) -> bool:
+        """Return whether the factored state is less than some lengths from another, at any load."""
+        factored, system = self.state, self.system
+        if factored is None:
+            return False
+        return max_abs(system.comm, state.u - factored.u) < distance * system.length
 
-    def at(
+    def factor_at(
         self,
         state: State,
-        stress: Sequence[Weighted] = (),
+        stress: Sequence[WeightedDisplacement] = (),
         *,
-        rough: bool = False,
-        sure: bool = True,
+        may_lag: bool = False,
+        needs_inertia: bool = True,
     ) -> Factorisation:
-        """See `BorderedNewton.factor_at`; if `rough`, a small part of the tangent may be that of an
-        earlier state.
+        """Factor the tangent at a state, unless its factors are known. Collective.
 
-        If also `sure`, it is so only where that cannot change the number of unstable directions.
+        Parameters
+        ----------
+        stress
+            As in `System.tangent`.
+        may_lag
+            Whether a small part of the tangent may belong to an earlier state.
+        needs_inertia
+            Whether the number of unstable directions must be right in spite of that.
         """
-        near, factors = self.state, self._factorisation
-        other = near is not state and (
-            near is None or self._stressed or not near.equals(state, self.system.comm)
+        factored, factors = self.state, self._factorisation
+        is_other = factored is not state and (
+            factored is None
+            or self._has_other_stress
+            or not factored.equals(state, self.system.comm)
         )
-        if other or (self.rough and not rough) or (sure and not self.certain):
-            self.rough = rough and factored_roughly(self.system, factors, state, stress, sure=sure)
-            if not self.rough:
+        is_too_old = self.lagged and not may_lag
+        if is_other or is_too_old or (needs_inertia and not self.inertia_is_certain):
+            self.lagged = may_lag and factor_with_lag(
+                self.system, factors, state, stress, needs_inertia=needs_inertia
+            )
+            if not self.lagged:
                 factors.factor(self.system.tangent(state.u, state.mu, stress))
-            self._made, self._stressed = (state, factors.count), bool(stress)
+            self._factored, self._has_other_stress = (state, factors.count), bool(stress)
         return factors
 
     @property
-    def foresees(self) -> bool:
-        """Whether a part of the forces may be foreseen from states before: it is small, and was so
-        far.
-        """
-        return isinstance(self.system, Roughly) and self.system.dear and self._factorisation.knows
+    def may_extrapolate(self) -> bool:
+        """Whether forces of dense terms may be extrapolated: these exist and have been small."""
+        return (
+            isinstance(self.system, InexactSystem)
+            and self.system.has_dense_terms
+            and self._factorisation.correction_is_small
+        )
 
     @property
-    def certain(self) -> bool:
-        """Whether the number of unstable directions is known, of the latest factors, in spite of an
-        older part.
-        """
+    def inertia_is_certain(self) -> bool:
+        """Whether the number of unstable directions is right in spite of a lagged part."""
         factors = self._factorisation
-        known = factors.counted or factors.count_beside()
-        return known and (not self.rough or factors.doubt <= DOUBT)
+        is_known = factors.inertia_is_known or factors.count_corrected_inertia()
+        return is_known and (
+            not self.lagged or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
+        )
 
 
-def factored_roughly(
+def factor_with_lag(
     system: System,
     factors: Factorisation,
     state: State,
-    stress: Sequence[Weighted] = (),
+    stress: Sequence[WeightedDisplacement] = (),
     *,
-    sure: bool = True,
+    needs_inertia: bool = True,
 ) -> bool:
-    """Factor a tangent whose small part is that of an earlier state; False if it is not small, now
-    or before.
+    """Factor a tangent whose dense terms belong to an earlier state. Collective.
+
+    Returns
+    -------
+    False if the system has none, or they are not small, now or before.
     """
-    if not (isinstance(system, Roughly) and system.dear and (factors.knows or sure)):
+    if not (isinstance(system, InexactSystem) and system.has_dense_terms):
         return False
-    factors.factor(system.tangent(state.u, state.mu, stress, rough=True), counted=sure)
-    return not sure or factors.doubt <= DOUBT
+    if not (factors.correction_is_small or needs_inertia):
+        return False
+    tangent = system.tangent(state.u, state.mu, stress, inexact=True)
+    factors.factor(tangent, needs_inertia=needs_inertia)
+    return not needs_inertia or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
 
 
-class Linearised:
-    """What SNES calls in a solve: function, Jacobian, linear solver and test of convergence.
+class SnesCallbacks:
+    """The callbacks of SNES in a solve: function, Jacobian, linear solver, test of convergence.
 
-    It knows no SNES, which knows it: PETSc would keep both in memory for ever.
+    It holds no reference to the SNES, which refers to it: PETSc would keep both in memory for ever.
+
+    Attributes
+    ----------
+    matrix
+        The bordered matrix of the present solve, or of the last one.
+    extrapolating
+        Whether the solve may extrapolate forces of dense terms.
     """
 
     def __init__(self, tangent: LatestTangent, options: NewtonOptions) -> None:
         self._tangent, self._system, self._options = tangent, tangent.system, options
         comm = self._system.comm
-        self._last = comm.rank == comm.size - 1
-        self.matrix: Bordered | None = None  # of the present solve, or of the last
+        self._is_last_rank = comm.rank == comm.size - 1
+        self.matrix: BorderedMatrix | None = None
         self._chord: Chord[Direction] | None = None
         self._state: State | None = None
-        self._ahead: Direction | None = None
+        self._next: Direction | None = None  # the next step at the present iterate
 
     def begin(
         self,
         guess: State,
         name: str,
-        row: Row,
-        stress: Sequence[Weighted],
+        row: ConstraintRow,
+        stress: Sequence[WeightedDisplacement],
         tolerance: float,
         *,
         searched: bool = False,
-        near: float = 0.0,
-        most: float = np.inf,
-        foreseeing: bool = False,
-        rough: float = 0.0,
+        reuse_distance: float = 0.0,
+        max_step: float = np.inf,
+        extrapolating: bool = False,
+        relative_tolerance: float = 0.0,
     ) -> None:
-        """Begin a solve, with a line search or without, with foreseen forces or not; as
-        `BorderedNewton.solve`.
+        """Begin a solve.
 
-        See `Iterates` for `rough`.
+        Parameters
+        ----------
+        guess, name, row, stress, reuse_distance, max_step
+            As in `BorderedNewton.solve`.
+        searched
+            Whether a line search shortens the steps.
+        extrapolating
+            Whether forces of dense terms may be extrapolated.
+        relative_tolerance
+            As in `Iterates`.
         """
-        self.foreseeing, self._foreseen, self._ventured = foreseeing, False, 0.0
-        self._computed = list[float]()  # steps with computed forces
-        self._tolerance, self._near = tolerance, near
-        self._guess, self._name, self._row, self._stress, self._followed = (
-            guess,
-            name,
-            row,
-            stress,
-            bool(stress),
-        )
-        patience = SEARCHED if searched else self._options.patience
-        o = self._options
-        kinks = (
-            o.kinks or foreseeing or bool(self._system.coordinates)
-        )  # the force of a body is stiff
+        # the extrapolation: whether the present residual uses it, the largest step since forces
+        # were computed, and the steps with computed forces
+        self.extrapolating, self._is_extrapolated, self._largest_step = extrapolating, False, 0.0
+        self._computed_steps = list[float]()
+        self._tolerance, self._reuse_distance = tolerance, reuse_distance
+        self._guess, self._name, self._row = guess, name, row
+        self._stress, self._has_stress = stress, bool(stress)
+        options = self._options
         self._iterates = Iterates(
-            min(o.largest_step, most), patience, searched, kinks, most < np.inf, rough
+            largest=min(options.largest_step, max_step),
+            patience=LINE_SEARCH_PATIENCE if searched else options.patience,
+            searched=searched,
+            # the force of a body is stiff
+            kinks=options.has_onsets or extrapolating or bool(self._system.coordinates),
+            stops_early=max_step < np.inf,
+            relative_tolerance=relative_tolerance,
         )
-        self.matrix = self._chord = self._state = self._ahead = None
-        self._at = (
-            self._residual
-        ) = -1  # PETSc's numbers of the vectors' contents for which `_ahead` is the step
+        self.matrix = self._chord = self._state = self._next = None
+        # PETSc's state counters of the vectors x and f to which `_next` belongs
+        self._x_counter = self._f_counter = -1
 
     @property
     def error(self) -> float:
@@ -267,205 +311,218 @@ class Linearised:
         return self._iterates.error
 
     def step_at(self, x: PETSc.Vec) -> Direction | None:
-        """The next step at an iterate, to be subtracted; None where none was computed."""
-        return self._ahead if x.stateGet() == self._at else None
+        """Return the next step at an iterate, to be subtracted; None where none was computed."""
+        return self._next if x.stateGet() == self._x_counter else None
 
     def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """R and g."""
-        self._foreseen = self.foreseeing
+        """Write R and g into f."""
+        self._is_extrapolated = self.extrapolating
         self._compute(self._state_of(x), f)
 
     def _compute(self, state: State, f: PETSc.Vec) -> None:
-        if self._foreseen:
-            assert isinstance(self._system, Roughly)
-            R = self._system.residual(state.u, state.mu, rough=True)
+        if self._is_extrapolated:
+            assert isinstance(self._system, InexactSystem)
+            R = self._system.residual(state.u, state.mu, inexact=True)
         else:
             R = self._system.residual(state.u, state.mu)
         self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
-        """The matrix for an iterate: that of an earlier one while the steps shrink."""
+        """Choose the matrix for an iterate: that of an earlier one while the steps shrink."""
         self._linearise(x, snes.getFunction()[0])
         J.assemble()
 
     def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The matrix times a vector."""
+        """Write the matrix times a vector into y."""
         assert self.matrix
         self.join(self.matrix.times(*self.split(x)), y)
 
     def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The inverse of the matrix times a vector; for the iterate's residual it is known since
-        the test.
+        """Write the inverse of the matrix times f into y.
+
+        For the iterate's residual it is known since the test of convergence.
         """
         assert self._chord
-        assert self._ahead
-        solved = f.stateGet() == self._residual and f.handle == self._handle
-        self.join(self._ahead if solved else self._chord.solve(self.split(f), self._ahead), y)
+        assert self._next
+        is_known = f.stateGet() == self._f_counter and f.handle == self._f_handle
+        self.join(self._next if is_known else self._chord.solve(self.split(f), self._next), y)
 
     def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
-        """Whether the next step is small enough, or will never be."""
+        """Return PETSc's reason: whether the next step is small enough, or never will be."""
         x, f = snes.getSolution(), snes.getFunction()[0]
         state = self._linearise(x, f)
-        return REASON_OF[self._iterates.judge(self._least(state), lambda: self._rounding(state, f))]
+        verdict = self._iterates.judge(
+            self._converged_size(state), lambda: self._rounding_error(state, f)
+        )
+        return REASON_OF_VERDICT[verdict]
 
-    def _least(self, state: State) -> float:
-        """The size of a step that counts as converged."""
+    def _converged_size(self, state: State) -> float:
+        """Return the size of a step that counts as converged."""
+        displacement = max_abs(self._system.comm, state.u)
         return self._tolerance * max(
-            1.0, MOTION * max_abs(self._system.comm, state.u) / self._system.length
+            1.0, LENGTH_PER_DISPLACEMENT * displacement / self._system.length
         )
 
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
         """Choose the matrix for an iterate, and compute its next step; once for each iterate."""
-        if self._state is not None and x.stateGet() == self._at:
+        if self._state is not None and x.stateGet() == self._x_counter:
             return self._state
-        state, before = self._state_of(x), self._state
-        if before is not None:
-            self._go_on(before, state)
-        self._at, self._state = x.stateGet(), state
-        self._ahead = self._next_step(state, self.split(f))
+        state, previous = self._state_of(x), self._state
+        if previous is not None:
+            self._go_on(previous, state)
+        self._x_counter, self._state = x.stateGet(), state
+        self._next = self._next_step(state, self.split(f))
         size = self._iterates.steps[-1].size
-        if self._foreseen and not size > self._foreseeable(state):
-            self._foreseen = False
+        if self._is_extrapolated and not size > self._extrapolated_size(state):
+            self._is_extrapolated = False
             self._compute(state, f)
-            self._ahead = self._again(self.split(f))
+            self._next = self._repeated_step(self.split(f))
             size = self._iterates.steps[-1].size
-            self._computed.append(size)
-            self._ventured = size
-        self._ventured = max(self._ventured, size)
-        self._handle, self._residual = f.handle, f.stateGet()
+            self._computed_steps.append(size)
+            self._largest_step = size
+        self._largest_step = max(self._largest_step, size)
+        self._f_handle, self._f_counter = f.handle, f.stateGet()
         return state
 
-    def _foreseeable(self, state: State) -> float:
-        """A step with foreseen forces that is not larger has forces computed in its place; negative
-        if it need not.
+    def _extrapolated_size(self, state: State) -> float:
+        """Return the size down to which a step may use extrapolated forces.
+
+        For a smaller step the forces are computed. Negative if that is not necessary any more.
         """
-        least = self._least(state)
-        if foreseen(self._computed, 1) <= CERTAIN * least:  # one ratio: each costs much
+        converged = self._converged_size(state)
+        # one ratio is enough here: each costs much
+        if extrapolated_error(self._computed_steps, 1) <= CERTAIN_ERROR * converged:
             return -1.0
-        return max(least, float(FORESEEN ** (1 + len(self._computed) / 2)) * self._ventured)
+        ratio = float(EXTRAPOLATED_STEP_RATIO ** (1 + len(self._computed_steps) / 2))
+        return max(converged, ratio * self._largest_step)
 
-    def misled(self) -> bool:
-        """Whether the last step is much shorter with computed forces than with foreseen ones; also
-        if nobody knows.
+    def is_misled_by_extrapolation(self) -> bool:
+        """Return whether computed forces make the last step much shorter; True if unknown.
+
+        Collective.
         """
-        if not (self._foreseen and self._state and self._chord and self.matrix):
-            return True  # nothing is known of it
-        state, before = self._state, self._iterates.steps[-1].size
+        if not (self._is_extrapolated and self._state and self._chord and self.matrix):
+            return True
+        state, size = self._state, self._iterates.steps[-1].size
         R = self._system.residual(state.u, state.mu), self._row.residual(state)
-        return not self.matrix.size(self._chord.step(R)) > FULL * before
+        return not self.matrix.size(self._chord.step(R)) > QUADRATIC_RATIO * size
 
-    def _again(self, f: Direction) -> Direction:
-        """The next step by the same matrix, in place of one with foreseen forces."""
+    def _repeated_step(self, f: Direction) -> Direction:
+        """Return the next step by the same matrix, in place of one with extrapolated forces."""
         assert self.matrix
         assert self._chord
         step = self._chord.step(f)
         self._iterates.steps[-1] = replace(self._iterates.steps[-1], size=self.matrix.size(step))
         return step
 
-    def _go_on(self, before: State, state: State) -> None:
-        """The iterate has moved, by the whole step unless a line search has made it shorter."""
+    def _go_on(self, previous: State, state: State) -> None:
+        """Go on to a new iterate; a line search may have shortened the step to it."""
         assert self._chord
-        assert self._ahead
-        whole = plus((before.u, before.mu[self._name]), -1.0, self._ahead)
-        full = whole[1] == state.mu[self._name] and np.array_equal(whole[0], state.u)
-        full = bool(self._system.comm.allreduce(full, MPI.LAND))
-        if full:
-            self._chord.took(self._ahead)
+        assert self._next
+        after_full = add_scaled((previous.u, previous.mu[self._name]), -1.0, self._next)
+        is_full = after_full[1] == state.mu[self._name] and np.array_equal(after_full[0], state.u)
+        is_full = bool(self._system.comm.allreduce(is_full, MPI.LAND))
+        if is_full:
+            self._chord.accept_step(self._next)
         else:
             self._chord = None
         # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano,
         # Leonetti, Garcea, Computer Methods in Applied Mechanics and Engineering 313, 2017)
-        self._stress = followed(before.u, -self._ahead[0] if full else state.u - before.u)
+        step = -self._next[0] if is_full else state.u - previous.u
+        self._stress = extrapolated_stress(previous.u, step)
 
     def _next_step(self, state: State, f: Direction) -> Direction:
-        """The next step, which SNES subtracts: from the latest matrix, or from a new one at this
-        iterate.
+        """Return the next step, which SNES subtracts.
+
+        It comes from the latest matrix while that serves, else from a new one at this iterate.
         """
         steps = self._iterates.steps
         if self._chord and self.matrix:
             step = self._chord.step(f)
             size = self.matrix.size(step)
-            if self._serves(size):
-                steps.append(Step(size, own=False))
+            if self._matrix_serves(size):
+                steps.append(NewtonStep(size, is_own=False))
                 return step
-        own = bool(steps) or not self._tangent.near(state, self._near)
-        anew = sum(step.own for step in steps) == OLD and not self.foreseeing
-        factors = (
-            self._tangent.at(state, self._stress, rough=not anew, sure=False)
-            if own
-            else self._tangent.latest
-        )
-        matrix, step = self._stepped(factors, state, f)
-        if own and self._too_old(matrix, step):
-            factors = self._tangent.at(state, self._stress, sure=False)
-            matrix, step = self._stepped(factors, state, f)
+        is_own = bool(steps) or not self._tangent.is_near(state, self._reuse_distance)
+        renews = sum(step.is_own for step in steps) == MATRICES_WITH_LAG and not self.extrapolating
+        factors = self._tangent.latest
+        if is_own:
+            factors = self._tangent.factor_at(
+                state, self._stress, may_lag=not renews, needs_inertia=False
+            )
+        matrix, step = self._matrix_and_step(factors, state, f)
+        if is_own and self._lag_slows(matrix, step):
+            factors = self._tangent.factor_at(state, self._stress, needs_inertia=False)
+            matrix, step = self._matrix_and_step(factors, state, f)
         self.matrix = matrix
-        self._chord = Chord(lambda f: matrix.solve(*f, rough=True), matrix.inner, plus)
-        steps.append(Step(matrix.size(step), own=own, pivots=factors.negative_pivots))
+        self._chord = Chord(lambda f: matrix.solve(*f, low_accuracy=True), matrix.inner, add_scaled)
+        steps.append(NewtonStep(matrix.size(step), is_own=is_own, pivots=factors.negative_pivots))
         return step
 
-    def _stepped(
+    def _matrix_and_step(
         self, factors: Factorisation, state: State, f: Direction
-    ) -> tuple[Bordered, Direction]:
-        """Return a matrix from some factors, and its step."""
-        matrix = Bordered(
-            self._system, factors, state, self._name, self._row, rough=self._tangent.rough
+    ) -> tuple[BorderedMatrix, Direction]:
+        """Return the bordered matrix with some factors, and its step."""
+        matrix = BorderedMatrix(
+            self._system, factors, state, self._name, self._row, lagged=self._tangent.lagged
         )
-        return matrix, matrix.solve(*f, rough=True)
+        return matrix, matrix.solve(*f, low_accuracy=True)
 
-    def _too_old(self, matrix: Bordered, step: Direction) -> bool:
-        """Return whether steps do not shrink because a part of the matrix is of an earlier state,
-        as is foreseen.
+    def _lag_slows(self, matrix: BorderedMatrix, step: Direction) -> bool:
+        """Return whether the lagged part of the matrix is why steps do not shrink.
 
-        It is small beside the rest at that state, but need not be so now. After the step the
-        residual is what the matrix lacks, times the step.
+        The part was small at its state, but need not be so now. After the step the residual is what
+        the matrix lacks, times the step; that is extrapolated.
         """
-        before, size, hard = (
-            [s.size for s in self._iterates.steps if s.own],
-            matrix.size(step),
-            self._options.hard,
-        )
-        if not (self._tangent.rough and before and hard * before[-1] < size < AWAY):
+        own_sizes = [s.size for s in self._iterates.steps if s.is_own]
+        size, contraction = matrix.size(step), self._options.late_contraction
+        if not (self._tangent.lagged and own_sizes):
             return False
-        lacks = self._tangent.latest.change(step[0])
-        return not matrix.size(matrix.solve(lacks, 0.0, rough=True)) <= hard * size
+        if not contraction * own_sizes[-1] < size < MAX_STEP_WITH_RENEWAL:
+            return False
+        missing = self._tangent.latest.missing_product(step[0])
+        return not matrix.size(matrix.solve(missing, 0.0, low_accuracy=True)) <= contraction * size
 
-    def _serves(self, size: float) -> bool:
-        """Whether a kept matrix serves that makes a next step of this size."""
-        steps, o = self._iterates.steps, self._options
+    def _matrix_serves(self, size: float) -> bool:
+        """Return whether to keep a matrix whose next step has this size."""
+        steps, options = self._iterates.steps, self._options
         ratio = size / steps[-1].size
-        first = sum(step.own for step in steps) <= 1 and not self._followed
-        ends = ratio <= 0.5 and size * ratio**o.cheap <= self._tolerance and not self._followed
-        late = (
-            first and len(steps) > 1 and size <= o.contraction**2 * steps[-2].size
-        )  # Broyden's steps shrink unevenly
-        return ends or late or ratio <= (o.contraction if first else o.hard)
+        is_first = sum(step.is_own for step in steps) <= 1 and not self._has_stress
+        if not self._has_stress and ratio <= 0.5:
+            size_at_end = size * ratio**options.chord_steps_per_factorisation
+            if size_at_end <= self._tolerance:
+                return True
+        # Broyden's steps shrink unevenly: two of them count together
+        if is_first and len(steps) > 1 and size <= options.contraction**2 * steps[-2].size:
+            return True
+        return ratio <= (options.contraction if is_first else options.late_contraction)
 
-    def _rounding(self, state: State, f: PETSc.Vec) -> float:
-        """The error from rounding of the residual, estimated from its change when u is rounded
-        differently.
+    def _rounding_error(self, state: State, f: PETSc.Vec) -> float:
+        """Return the error from rounding of the residual.
+
+        It is estimated from the change of the residual when u is rounded differently.
         """
         matrix = self.matrix
         assert matrix
-        side = np.random.default_rng(self._system.comm.rank).choice([-1.0, 1.0], state.u.size)
-        other = state.u + side * np.spacing(state.u)
-        change = self._system.residual(other, state.mu) - self.split(f)[0]
-        rest = change - matrix.times(other - state.u, 0.0)[0]
-        return matrix.size(matrix.solve(rest, 0.0))
+        signs = np.random.default_rng(self._system.comm.rank).choice([-1.0, 1.0], state.u.size)
+        rounded = state.u + signs * np.spacing(state.u)
+        change = self._system.residual(rounded, state.mu) - self.split(f)[0]
+        remainder = change - matrix.times(rounded - state.u, 0.0)[0]
+        return matrix.size(matrix.solve(remainder, 0.0))
 
-    def vector(self) -> PETSc.Vec:
-        """A new vector (u, mu)."""
-        size = self._system.size + self._last
+    def new_vector(self) -> PETSc.Vec:
+        """Return a new vector (u, mu); mu is on the last rank."""
+        size = self._system.size + self._is_last_rank
         return PETSc.Vec().createMPI((size, PETSc.DETERMINE), comm=self._system.comm)
 
-    def join(self, whole: Direction, x: PETSc.Vec) -> None:
+    def join(self, values: Direction, x: PETSc.Vec) -> None:
         """Write (u, mu) into a vector."""
-        x.setArray(np.append(*whole) if self._last else whole[0])
+        x.setArray(np.append(*values) if self._is_last_rank else values[0])
 
     def split(self, x: PETSc.Vec) -> Direction:
-        """Copies of u on this rank, and mu on every rank."""
+        """Return copies of u on this rank, and of mu on every rank. Collective."""
         local, comm = x.array_r, self._system.comm
-        mu = comm.bcast(float(local[-1]) if self._last else None, root=comm.size - 1)
+        mu = comm.bcast(float(local[-1]) if self._is_last_rank else None, root=comm.size - 1)
         return local[: self._system.size].copy(), mu
 
     def _state_of(self, x: PETSc.Vec) -> State:
@@ -474,31 +531,37 @@ class Linearised:
 
 
 def make_snes(
-    linearised: Linearised, x: PETSc.Vec, options: NewtonOptions, search: str = "basic"
+    callbacks: SnesCallbacks, x: PETSc.Vec, options: NewtonOptions, line_search: str = "basic"
 ) -> PETSc.SNES:
-    """A SNES for vectors like `x`, with a line search, full steps if `basic`; PETSc's options may
-    set another.
+    """Create a SNES for vectors like `x`.
+
+    Parameters
+    ----------
+    line_search
+        PETSc's type of line search; `basic` takes full steps. PETSc's options may set another.
     """
     sizes = x.getSizes()
-    J = PETSc.Mat().createPython((sizes, sizes), context=linearised, comm=x.comm)
+    J = PETSc.Mat().createPython((sizes, sizes), context=callbacks, comm=x.comm)
     J.setUp()
     snes = PETSc.SNES().create(x.comm)
     snes.setType("newtonls")
-    snes.setFunction(linearised.function, x.duplicate())
-    snes.setJacobian(linearised.jacobian, J)
-    snes.setConvergenceTest(linearised.test)
+    snes.setFunction(callbacks.function, x.duplicate())
+    snes.setJacobian(callbacks.jacobian, J)
+    snes.setConvergenceTest(callbacks.test)
     snes.setTolerances(stol=options.tolerance, max_it=options.max_iterations)
     snes.getKSP().setType("preonly")
-    given = PETSc.Options(PREFIX)
-    ours = not given.hasName("snes_linesearch_type")
-    if ours:  # full steps are not PETSc's default; if they fail, the path takes a smaller step
-        given["snes_linesearch_type"] = search
+    petsc_options = PETSc.Options(PREFIX)
+    sets_line_search = not petsc_options.hasName("snes_linesearch_type")
+    if (
+        sets_line_search
+    ):  # full steps are not PETSc's default; if they fail, the path takes a smaller step
+        petsc_options["snes_linesearch_type"] = line_search
     for prefix in (PREFIX, ""):
         snes.setOptionsPrefix(prefix)
         snes.setFromOptions()
-    if ours:
-        given.delValue("snes_linesearch_type")
+    if sets_line_search:
+        petsc_options.delValue("snes_linesearch_type")
     pc = snes.getKSP().getPC()
     pc.setType("python")
-    pc.setPythonContext(linearised)
+    pc.setPythonContext(callbacks)
     return snes

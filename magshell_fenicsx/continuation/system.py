@@ -1,4 +1,9 @@
-"""The interface of a system to the solvers: vectors, a matrix and named amplitudes, no shells."""
+"""The interface between a discrete system and the solvers: vectors, a tangent, named amplitudes.
+
+The solvers know nothing of finite elements. They see a distributed vector of unknowns u, amplitudes
+mu (load parameters and prescribed positions), and the residual and tangent of a potential
+Pi(u; mu). This module defines that interface and the forms that a tangent may have.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,115 +14,118 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-Vector = NDArray[np.float64]  # the owned part of a distributed vector
+Vector = NDArray[np.float64]  # the part of a distributed vector that this rank owns
 Amplitudes = Mapping[str, float]
-Weighted = tuple[float, Vector]
+WeightedDisplacement = tuple[float, Vector]
 Direction = tuple[Vector, float]  # (du, dmu)
 
 
-class Rest(Protocol):
-    """What is added to a sparse symmetric matrix, where all unknowns act on each other; it does not
-    change.
-    """
+class DenseCorrection(Protocol):
+    """A constant symmetric matrix D with all entries, which is added to a sparse matrix."""
 
     def times(self, v: Vector) -> Vector:
-        """Its product with a vector. Collective."""
+        """Return D v. Collective."""
 
-    def scaled(self, factor: float) -> "Rest":
-        """So many times this one."""
+    def scaled(self, factor: float) -> "DenseCorrection":
+        """Return the matrix `factor` D."""
 
-    def over(self, other: "Rest") -> float:
-        """How many times another one this is; 0 if it is no multiple of it, or nobody knows."""
+    def multiple_of(self, other: "DenseCorrection") -> float:
+        """Return c if D is c times another matrix; 0 if it is no multiple, or this is unknown."""
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
-        """The sum, with all entries; the matrix is reused by the next call. Collective."""
+        """Return K + D with all entries; the next call overwrites the result. Collective."""
 
 
 @dataclass(frozen=True)
-class Beside:
-    """The symmetric matrix K + D, with all entries: K sparse, D mostly small beside it.
+class CorrectedTangent:
+    """The symmetric matrix K + D, with all entries: K sparse, D mostly small compared with K.
 
     Attributes
     ----------
-    changing
-        What may be that of an earlier state: D and its part in K; D alone if None.
-    present
-        The product of that of the present state with a vector, dear; None if nothing is older.
-        Collective.
-    foreseen
-        The same product as foreseen from states where forces are known, cheap; None if nothing is
-        older. Collective.
+    lagged
+        The part of K + D that may belong to an earlier state: D and its share of K. None stands
+        for D alone.
+    present_product
+        Product of a vector with the same part at the present state: expensive. None if no part is
+        lagged. Collective.
+    extrapolated_product
+        The same product, extrapolated from states at which forces were computed: cheap. None if no
+        part is lagged. Collective.
     """
 
     K: PETSc.Mat
-    D: Rest
-    changing: Rest | None = None
-    present: Callable[[Vector], Vector] | None = None
-    foreseen: Callable[[Vector], Vector] | None = None
+    D: DenseCorrection
+    lagged: DenseCorrection | None = None
+    present_product: Callable[[Vector], Vector] | None = None
+    extrapolated_product: Callable[[Vector], Vector] | None = None
 
-    def change(self, v: Vector) -> Vector:
-        """Return the product of v with what is foreseen beyond the older part; zero if nothing is
-        older. Collective."""
-        if self.foreseen is None or self.changing is None:
+    def missing_product(self, v: Vector) -> Vector:
+        """Return v times what the lagged part lacks, as extrapolated; zero if no part is lagged.
+
+        Collective.
+        """
+        if self.extrapolated_product is None or self.lagged is None:
             return np.zeros_like(v)
-        return np.asarray(self.foreseen(v) - self.changing.times(v))
+        return np.asarray(self.extrapolated_product(v) - self.lagged.times(v))
 
 
 @dataclass(frozen=True)
-class Skewed:
-    """The matrix K + N of a load without potential: K symmetric, N skew."""
+class SkewedTangent:
+    """The matrix K + N of a load without potential: K symmetric, N skew-symmetric."""
 
     K: PETSc.Mat
     N: PETSc.Mat
 
 
 @dataclass(frozen=True)
-class Edged:
-    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers; K may
-    be skewed.
+class BorderedTangent:
+    """The symmetric matrix [K C; C^T D]: a tangent with k further scalar unknowns; K may be skewed.
 
     Attributes
     ----------
-    C, D
-        k columns on this rank, and (k, k) numbers.
+    C
+        k columns, each the part of this rank.
+    D
+        (k, k) numbers.
     multipliers
-        Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no
-        unstable direction.
+        Number of the unknowns that are Lagrange multipliers of a constraint. Each adds one negative
+        pivot that is no unstable direction.
     """
 
-    K: "PETSc.Mat | Beside | Skewed"
+    K: "PETSc.Mat | CorrectedTangent | SkewedTangent"
     C: Sequence[Vector]
     D: NDArray[np.float64]
     multipliers: int
 
 
-Tangent: TypeAlias = PETSc.Mat | Beside | Skewed | Edged
+Tangent: TypeAlias = PETSc.Mat | CorrectedTangent | SkewedTangent | BorderedTangent
 
 
 def symmetric_part(tangent: Tangent) -> PETSc.Mat:
-    """The symmetric matrix of u in a tangent, itself and no copy; with all entries where all
-    unknowns are coupled.
+    """Return the symmetric block of u of a tangent: the matrix itself, not a copy.
+
+    For a `CorrectedTangent` it is the sum K + D with all entries.
     """
-    while isinstance(tangent, Skewed | Edged):
+    while isinstance(tangent, SkewedTangent | BorderedTangent):
         tangent = tangent.K
-    return tangent.D.added_to(tangent.K) if isinstance(tangent, Beside) else tangent
+    return tangent.D.added_to(tangent.K) if isinstance(tangent, CorrectedTangent) else tangent
 
 
 class System(Protocol):
-    """Equilibrium of an energy Pi(u; mu), spread over the ranks of `comm`.
+    """Equilibrium of a potential Pi(u; mu), distributed over the ranks of `comm`.
 
-    Most amplitudes multiply a term, Pi = Pi_0 + sum_i mu_i Pi_i; a parameter may also enter freely.
+    Most amplitudes multiply a term, Pi = Pi_0 + sum_i mu_i Pi_i; others enter nonlinearly.
 
     Attributes
     ----------
     size
         Number of unknowns on this rank.
     length
-        A displacement that counts as of order one; convergence is measured with it.
+        A displacement that counts as of order one; convergence is measured in units of it.
     coordinates
         Amplitudes that are positions, for example of a body that presses on the shell. Their
-        conjugates are forces: where the force is held, the position is free. All other amplitudes
-        are forces: where the conjugate of one is held, that is a constraint.
+        conjugates are forces: where the force is prescribed, the position is free. All other
+        amplitudes are forces: to prescribe the conjugate of one is a constraint.
     """
 
     comm: MPI.Comm
@@ -126,20 +134,23 @@ class System(Protocol):
     coordinates: frozenset[str]
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        """dPi/du."""
+        """Return R = dPi/du."""
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        """d2Pi/du dmu_i: the column of the amplitude `name`."""
+        """Return R_mu = d2Pi/du dmu_i, the load vector of the amplitude `name`."""
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        """dPi/dmu_i, on every rank. The conjugate of the amplitude is -dPi/dmu_i."""
+        """Return dPi/dmu_i, on every rank. The conjugate of the amplitude is -dPi/dmu_i."""
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        """d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply their terms."""
+        """Return d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply a term."""
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
-        """d2Pi/du2, assembled, or dR/du where a load has no potential; the matrix is reused by the
-        next call.
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> Tangent:
+        """Assemble K = d2Pi/du2, or dR/du where a load has no potential.
+
+        The next call overwrites the matrix.
 
         Parameters
         ----------
@@ -151,59 +162,73 @@ class System(Protocol):
 
 
 @runtime_checkable
-class Roughly(Protocol):
-    """A system that may have a part of its tangent that is dear, and mostly small beside the
-    others.
+class InexactSystem(Protocol):
+    """A system whose dense terms may be lagged or extrapolated from earlier states.
+
+    Dense terms couple all unknowns. They are expensive, and mostly small compared with the others.
 
     Attributes
     ----------
-    dear
-        Whether it has one.
+    has_dense_terms
+        Whether the system has such terms.
     """
 
     @property
-    def dear(self) -> bool: ...
+    def has_dense_terms(self) -> bool: ...
 
-    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
-        """As that of `System`; if `rough`, forces of that part may be foreseen from states before."""
+    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
+        """Return the residual, see `System`.
 
-    def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        """Whether forces foreseen near a state are right along a direction."""
+        If `inexact`, forces of the dense terms may be extrapolated from earlier states.
+        """
+
+    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
+        """Return whether extrapolated forces near a state are accurate along the direction du."""
 
     def tangent(
-        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False
+        self,
+        u: Vector,
+        mu: Amplitudes,
+        stress: Sequence[WeightedDisplacement] = (),
+        *,
+        inexact: bool = False,
     ) -> Tangent:
-        """As that of `System`; if `rough`, that part may be that of an earlier state."""
+        """Assemble the tangent, see `System`.
+
+        If `inexact`, its dense terms may be those of an earlier state.
+        """
 
 
-def followed(u: Vector, step: Vector) -> list[Weighted]:
-    """The stress extrapolated linearly from u along a step, as weighted displacements; strain is
-    quadratic in u.
+def extrapolated_stress(u: Vector, step: Vector) -> list[WeightedDisplacement]:
+    """Return weighted displacements whose stress is that of u, extrapolated linearly along a step.
+
+    Strain is quadratic in u, so three displacements suffice.
     """
     return [(1.0, u), (0.5, u + step), (-0.5, u - step)]
 
 
 @dataclass(frozen=True)
 class State:
-    """A displacement and the amplitudes."""
+    """A displacement u, the part of this rank, and all amplitudes by name."""
 
     u: Vector = field(repr=False)
     mu: dict[str, float]
 
     def with_(self, u: Vector, name: str, value: float) -> "State":
+        """Return a state with another displacement and another value of one amplitude."""
         return State(u, {**self.mu, name: value})
 
     def equals(self, other: "State", comm: MPI.Comm) -> bool:
-        """Whether it is the same state, on all ranks."""
+        """Return whether both states are identical on all ranks. Collective."""
         equal = self.mu == other.mu and np.array_equal(self.u, other.u)
         return bool(comm.allreduce(equal, MPI.LAND))
 
 
 def dot(comm: MPI.Comm, a: Vector, b: Vector) -> float:
-    """Inner product over all ranks."""
+    """Return the inner product over all ranks. Collective."""
     return float(comm.allreduce(float(a @ b)))
 
 
 def max_abs(comm: MPI.Comm, a: Vector) -> float:
-    """Largest entry in magnitude over all ranks."""
+    """Return the largest magnitude of an entry over all ranks. Collective."""
     return float(comm.allreduce(float(np.abs(a).max(initial=0.0)), MPI.MAX))

@@ -1,5 +1,6 @@
-"""Requested points of a path by arc length: the loads or displacements that lie between two points,
-each solved for.
+"""Targets of a path by arc length: requested loads or displacements between two points, solved for.
+
+Polynomials through the points predict where a target lies; Newton's method solves at its value.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -7,52 +8,53 @@ from collections.abc import Callable, Iterator, Sequence
 from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
 
-# of the way to the last target: a step ends there, so that its factors serve at the target
-BEHIND = 1.01
-JOINED, APART = (
-    4,
-    0.1,
-)  # points that a polynomial goes through, and their least distance over that around a target
-MOST_TRIALS = 20
-CLOSE = 1e-6  # of the way that is left between two places: nearer ones are the same
+# a step ends at this multiple of the distance to the last target, so that its factors serve there
+END_PAST_TARGET = 1.01
+MAX_PREDICTORS = 4  # points that a polynomial goes through
+# least distance of these points, over the distance of the two points around a target
+MIN_PREDICTOR_DISTANCE = 0.1
+MAX_TRIALS = 20
+ZERO_TOLERANCE = 1e-6  # of the bracket that is left: nearer places are the same
 
 
 class TargetMissed(PathStopped):
     """The solve at a requested point between two points of the path failed."""
 
 
-def arriving(
-    path: Path, quantity: Quantity, target: float, s: float, seen: Sequence[Point]
+def end_near_last_target(
+    path: Path, quantity: Quantity, target: float, s: float, predictors: Sequence[Point]
 ) -> float:
-    """The end of a step to `s`: close behind the last target, where points foresee that it is
-    passed.
+    """Return the end of a step to `s`, close behind the last target if the step would pass it.
+
+    Parameters
+    ----------
+    predictors
+        Points from which the step is extrapolated, the last one its start.
     """
-    here = seen[-1].s
+    current = predictors[-1].s
 
-    def missed(s: float) -> float:
-        return path.value(quantity, path.extended(s, seen)) - target
+    def difference(s: float) -> float:
+        return path.value(quantity, path.predicted_state(s, predictors)) - target
 
-    passed = missed(here) * missed(s) < 0
-    return (
-        here + min(BEHIND * (_zero(missed, here, s) - here) / (s - here), 1.0) * (s - here)
-        if passed
-        else s
-    )
+    if not difference(current) * difference(s) < 0:
+        return s
+    fraction = END_PAST_TARGET * (_zero(difference, current, s) - current) / (s - current)
+    return current + min(fraction, 1.0) * (s - current)
 
 
 def targets_between(
     path: Path, quantity: Quantity, targets: Sequence[float], sense: float, points: Sequence[Point]
 ) -> Iterator[tuple[float, Point]]:
-    """The targets between two successive points with their own points, in the order of the path.
+    """Yield the targets between two successive points with their points, in the order of the path.
 
     Parameters
     ----------
     quantity, targets
-        What has these values at the requested points.
+        The quantity that has these values at the requested points.
     sense
         The sign of its change along the path.
     points
-        Both, and before them the point before, if there is one.
+        The two points, and before them the previous one, if there is one.
 
     Raises
     ------
@@ -63,54 +65,63 @@ def targets_between(
     a, b = path.value(quantity, low.state), path.value(quantity, high.state)
     if a in targets and (b - a) * sense < 0:  # a shorter step sees the load rise first
         raise PathStopped(f"{path.name} falls from the start", low)
-    smooth = (
-        points[-2:] if path.newton.options.kinks else points
-    )  # no polynomial goes on behind a corner
-    around = [path.seen_from(low, path.measured_from(low, point)) for point in smooth]
-    inside = [target for target in targets if (target - a) * (target - b) < 0 or b == target]
-    for target in sorted(inside, key=lambda target: abs(target - a)):
-        point = path.measured_from(low, _solved(path, quantity, target, around))
-        around.insert(-1, path.seen_from(low, point))
+    # no polynomial continues behind a kink
+    smooth = points[-2:] if path.newton.options.has_onsets else points
+    predictors = [path.relative_to(low, path.measured_from(low, point)) for point in smooth]
+    crossed_targets = [
+        target for target in targets if (target - a) * (target - b) < 0 or b == target
+    ]
+    for target in sorted(crossed_targets, key=lambda target: abs(target - a)):
+        point = path.measured_from(low, _solve(path, quantity, target, predictors))
+        predictors.insert(-1, path.relative_to(low, point))
         yield target, point
 
 
-def _solved(path: Path, quantity: Quantity, target: float, around: Sequence[Point]) -> Point:
-    """The point at a target between the last two of some points, from the polynomial through them
-    and some before.
+def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point]) -> Point:
+    """Return the point at a target between the last two of some points.
+
+    The polynomial through them and some earlier ones predicts it.
+
+    Raises
+    ------
+    TargetMissed
+        If the solve fails.
     """
-    low, high = near = list(around[-2:])
-    for earlier in reversed(around[:-2]):  # too close ones would multiply rounding
-        if len(near) < JOINED and abs(near[0].s - earlier.s) > APART * abs(high.s - low.s):
-            near.insert(0, earlier)
+    low, high = predictors = list(points[-2:])
+    for earlier in reversed(points[:-2]):  # too close ones would multiply rounding
+        distance = abs(predictors[0].s - earlier.s)
+        is_far = distance > MIN_PREDICTOR_DISTANCE * abs(high.s - low.s)
+        if len(predictors) < MAX_PREDICTORS and is_far:
+            predictors.insert(0, earlier)
 
-    def missed(s: float) -> float:
-        return path.value(quantity, path.between(s, *near)) - target
+    def difference(s: float) -> float:
+        return path.value(quantity, path.interpolated_state(s, *predictors)) - target
 
-    s = _zero(missed, low.s, high.s)
+    s = _zero(difference, low.s, high.s)
     t = (s - low.s) / (high.s - low.s)
     stress = [(1 - t, low.state.u), (t, high.state.u)]
-    # between different counts a target has its own; the step's end serves where it is close behind
-    counts = {(point.negative_pivots, point.negative_pivots_held) for point in (low, high)}
-    end = (
-        high.state
-        if len(counts) == 1 and abs(high.s - s) < 2 * (BEHIND - 1) * abs(high.s - low.s)
-        else None
-    )
-    point = path.solve(path.given(quantity, target), s, path.between(s, *near), stress, near=end)
+    # between different inertias a target has its own; the step's end serves where it is close
+    inertias = {(point.negative_pivots, point.negative_pivots_held) for point in (low, high)}
+    is_close = abs(high.s - s) < 2 * (END_PAST_TARGET - 1) * abs(high.s - low.s)
+    neighbour = high.state if len(inertias) == 1 and is_close else None
+    guess = path.interpolated_state(s, *predictors)
+    point = path.solve(path.prescribed(quantity, target), s, guess, stress, neighbour=neighbour)
     if isinstance(point, str):
         raise TargetMissed(f"a requested point cannot be found: {point}", low)
     return point
 
 
 def _zero(f: Callable[[float], float], low: float, high: float) -> float:
-    """About where a function is zero between two places, by Illinois' regula falsi; the second if
-    it has one sign.
+    """Return about where a function is zero between two places, by Illinois' regula falsi.
+
+    It is the second place if the function has one sign.
     """
     a, b = f(low), f(high)
     place, side = high, 0
-    for _ in range(MOST_TRIALS if a * b < 0 else 0):
-        before, place = place, low + (high - low) * a / (a - b)
-        if abs(place - before) <= CLOSE * abs(high - low) or not (value := f(place)):
+    for _ in range(MAX_TRIALS if a * b < 0 else 0):
+        previous, place = place, low + (high - low) * a / (a - b)
+        is_same = abs(place - previous) <= ZERO_TOLERANCE * abs(high - low)
+        if is_same or not (value := f(place)):
             break
         if value * b < 0:
             low, a, b = place, value, b / 2 if side < 0 else b

@@ -1,11 +1,11 @@
-"""One step in time of M a + c M v + D + dPi/du(u; mu(t)) = 0, by the generalised alpha method with
-the exact tangent.
+"""One time step of M a + c M v + D + dPi/du(u; mu(t)) = 0 by the generalised alpha method.
 
-J. Chung and G. M. Hulbert, Journal of Applied Mechanics 60 (1993): second order; high frequencies
-fade by the factor rho at each step. With rho = 1 the force is averaged along the step at Gauss
-points, which conserves the energy (G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41,
-2008). PETSc's TSALPHA2 has the same formulas for rho < 1, but shows neither its acceleration,
-without which a resumed run is another one, nor a place for that average.
+Newton's method solves each step with the exact tangent. J. Chung and G. M. Hulbert, Journal of
+Applied Mechanics 60 (1993): second order; high frequencies fade by the factor rho at each step.
+With rho = 1 the force is averaged along the step at Gauss points, which conserves the energy
+(G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41, 2008). PETSc's TSALPHA2 has the same
+formulas for rho < 1, but shows neither its acceleration, without which a resumed run is another
+one, nor a place for that average.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -20,19 +20,19 @@ from magshell_fenicsx.continuation.control import Chord
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.factor import Factorisation, join, split
 from magshell_fenicsx.continuation.motion import (
-    Averaged,
-    Ground,
+    AveragedContact,
     Motion,
-    Viscous,
-    constrained,
-    held_back,
+    MovingSupports,
+    ViscousForces,
+    consistent_state,
+    constrained_acceleration,
 )
-from magshell_fenicsx.continuation.snes import MOTION
+from magshell_fenicsx.continuation.snes import LENGTH_PER_DISPLACEMENT
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
-    Beside,
-    Edged,
-    Skewed,
+    BorderedTangent,
+    CorrectedTangent,
+    SkewedTangent,
     State,
     System,
     Tangent,
@@ -43,31 +43,40 @@ from magshell_fenicsx.continuation.system import (
 
 # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 TOLERANCE = 1e-10
-FLOOR = 1e-3  # of the length: energies below that of such a displacement count as none
-STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
-ROUNDED = 10.0  # steps up to this many times the rounding error are
-MOST = 20  # iterations
-FAR = 3.0  # lengths: a step that is longer, and than the first one, does not come back
-PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
-SLOW = 0.2  # new factors if a step is longer than this part of the one before
+# of the length: energies below that of such a displacement count as none
+MIN_ENERGY_DISPLACEMENT = 1e-3
+# steps below this that shrink no more, with new factors, may be rounding
+MAX_ROUNDING_STEP = 1e-7
+ROUNDING_FACTOR = 10.0  # steps up to this many times the rounding error are rounding
+MAX_ITERATIONS = 20
+MAX_STEP = 3.0  # lengths: a step that is longer, and longer than the first one, diverges
+# steps with new factors that may grow in contact with a body: they find what touches
+CONTACT_PATIENCE = 2
+REFACTOR_RATIO = 0.2  # new factors if a step is longer than this fraction of the previous one
 # error of the last step up to which the acceleration predicts the next: in stiff motions it
 # alternates
-SMOOTH = 1e-2
+MAX_ERROR_FOR_PREDICTION = 1e-2
 # changes of the acceleration times the square of the time step, from iterations that end at
 # TOLERANCE
-ROUNDING = 1e-8
-OTHER = 0.05  # relative change of the time step after which factors are renewed
-GAUSS = (
-    (0.5 - np.sqrt(1 / 12), 0.5),
-    (0.5 + np.sqrt(1 / 12), 0.5),
-)  # exact for the membrane's energy, of degree 4
+ACCELERATION_ROUNDING = 1e-8
+MAX_STEP_CHANGE = 0.05  # relative change of the time step after which factors are renewed
+# Gauss points of a step and their weights: exact for the membrane's energy, of degree 4
+GAUSS_POINTS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))
 Array = NDArray[np.float64]
 Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
 
 
 @dataclass(frozen=True)
-class Rule:
-    """The parameters of generalised alpha; forces are weighted sums at parts of the step."""
+class AlphaParameters:
+    """The parameters of the generalised alpha method.
+
+    Attributes
+    ----------
+    alpha_m, alpha_f, beta, gamma
+        As in the paper of Chung and Hulbert.
+    forces
+        Fractions of the step at which forces are taken, with their weights.
+    """
 
     alpha_m: float
     alpha_f: float
@@ -76,16 +85,22 @@ class Rule:
     forces: tuple[tuple[float, float], ...]
 
     @classmethod
-    def of(cls, rho: float) -> "Rule":
-        """Of a spectral radius at infinite frequency, 0 to 1."""
+    def from_spectral_radius(cls, rho: float) -> "AlphaParameters":
+        """Return the parameters for a spectral radius at infinite frequency, 0 to 1."""
         m, f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
-        at = GAUSS if rho == 1 else ((1 - f, 1.0),)
-        return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, at)
+        forces = GAUSS_POINTS if rho == 1 else ((1 - f, 1.0),)
+        return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, forces)
 
 
 @dataclass(frozen=True)
-class Factored:
-    """What the latest factors belong to, and the `Factorisation.habit` with which they were made."""
+class FactoredState:
+    """The state and time step of the latest factors.
+
+    Attributes
+    ----------
+    habit
+        `Factorisation.habit` with which they were made.
+    """
 
     u: Vector
     mu: dict[str, float]
@@ -99,29 +114,32 @@ class Integrator:
     Parameters
     ----------
     mass
-        Its pattern is part of that of the tangent; zero rows and columns at supports.
+        The mass matrix; its pattern is part of that of the tangent, with zero rows and columns at
+        supports.
     loads
         All amplitudes; at a jump the step before it ends with the value before.
+    rho
+        Spectral radius at infinite frequency, 0 to 1.
     drag
         c, force per mass and velocity.
     viscous
-        Further forces.
-    driven
+        Forces that depend on the strain's history.
+    moving_amplitudes
         Amplitudes that are positions and move.
-    ground
-        Supports that move.
-    averaged
-        Contacts, beside which the balance of energy is checked in each step.
     device
         Amplitudes that are unknown, since their conjugates are held at the end of each step; None:
         all are loads.
+    supports
+        Supports that move.
+    contact
+        Contacts, with which the balance of energy is checked in each step.
 
     Attributes
     ----------
     steps, iterations
         Work so far.
-    factored
-        What the latest factors belong to; None if the next step makes new ones.
+    factored_state
+        The state of the latest factors; None if the next step makes new ones.
     """
 
     def __init__(
@@ -131,101 +149,106 @@ class Integrator:
         loads: Loads,
         rho: float,
         drag: float = 0.0,
-        viscous: Viscous | None = None,
-        driven: Collection[str] = (),
+        viscous: ViscousForces | None = None,
+        moving_amplitudes: Collection[str] = (),
         device: Device | None = None,
-        ground: Ground | None = None,
-        averaged: Averaged | None = None,
+        supports: MovingSupports | None = None,
+        contact: AveragedContact | None = None,
     ) -> None:
-        self.system, self.mass, self.loads, self.drag, self.viscous = (
-            system,
-            mass,
-            loads,
-            drag,
-            viscous,
-        )
-        self.rule = Rule.of(rho)
-        self.ground, self.averaged, self._total = ground, averaged, np.nan
+        self.system, self.mass, self.loads = system, mass, loads
+        self.drag, self.viscous = drag, viscous
+        self.parameters = AlphaParameters.from_spectral_radius(rho)
+        self.supports, self.contact, self._total_energy = supports, contact, np.nan
         self.device, self._free = device, tuple(device.names) if device else ()
-        self._driven = frozenset({*driven, *self._free})
+        self._driven = frozenset({*moving_amplitudes, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
-        self._K: PETSc.Mat | None = (
-            None  # of the pattern of another one, which contact of shells changes
-        )
-        self._like: PETSc.Mat | None = None
-        self.factored: Factored | None = None
+        # the matrix of a step, with the pattern of the tangent, which contact of shells changes
+        self._K: PETSc.Mat | None = None
+        self._tangent: PETSc.Mat | None = None
+        self.factored_state: FactoredState | None = None
         self._x, self._y = mass.createVecs()
-        # what a state has from its history: turns of edges under moments, whose work is counted on
+        # updates history variables: turns of edges under moments, whose work is counted on
         self._advance: Callable[[State, Amplitudes], State] = getattr(
-            system, "advance", lambda state, before: state
+            system, "advance", lambda state, previous: state
         )
 
-    def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
-        """A motion with the acceleration that the loads after t give it; sums go on from those of
-        `before`.
+    def begin(self, t: float, u: Vector, v: Vector, earlier: Motion | None = None) -> Motion:
+        """Return a motion with the acceleration that the loads after t give it. Collective.
 
-        What a device constrains is put where it must be, along the forces of the constraint, and so
-        is its velocity.
+        Displacement and velocity are projected to what a device allows, along the forces of its
+        constraints.
+
+        Parameters
+        ----------
+        earlier
+            An earlier motion whose sums of work and dissipation continue.
         """
         mu = self.loads(t, False)
-        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
-        if before:
-            mu |= {name: before.mu[name] for name in self._free} | self._kept(before)
-        inverse = self._inverse_mass()
-        if (
-            self.ground
-        ):  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
-            work -= self._kinetic(v, t, True)
-            v = v - inverse(
-                self._pulled(self.ground.velocity(t, False) - self.ground.velocity(t, True))
-            )
-            work += self._kinetic(v, t, False)
+        work, dissipated = (earlier.work, earlier.dissipated) if earlier else (0.0, 0.0)
+        if earlier:
+            mu |= {name: earlier.mu[name] for name in self._free} | self._contact_settings(earlier)
+        inverse_mass = self._inverse_mass()
+        # a jump of the supports' velocity is an impulse, whose work is the change of the kinetic
+        # energy
+        if self.supports:
+            work -= self._kinetic_energy(v, t, before_jump=True)
+            jump = self.supports.velocity(t, False) - self.supports.velocity(t, True)
+            v = v - inverse_mass(self._mass_times_supports(jump))
+            work += self._kinetic_energy(v, t, before_jump=False)
         if self.device:
-            u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
-        mu = self._advance(State(u, mu), before.mu if before else mu).mu
+            u, v, mu = consistent_state(self.system, self.device, inverse_mass, u, v, mu)
+        mu = self._advance(State(u, mu), earlier.mu if earlier else mu).mu
         if self.viscous:
-            self.viscous.memory = before.memory if before else self.viscous.memory
+            self.viscous.memory = earlier.memory if earlier else self.viscous.memory
             self.viscous.begin()
         r = self.system.residual(u, mu) + self.drag * self._times(v)
-        if self.ground:
-            r = r + self._pulled(
-                self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False)
+        if self.supports:
+            acceleration, velocity = (
+                self.supports.acceleration(t, False),
+                self.supports.velocity(t, False),
             )
+            r = r + self._mass_times_supports(acceleration + self.drag * velocity)
         if self.viscous:
             r = r + self.viscous.force(u, u, v, 1.0, 0.0)
-        a = -inverse(r)
+        a = -inverse_mass(r)
         if self.device:
-            a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
-        now = Motion(t, u, v, a, mu, work, dissipated, memory=self.viscous and self.viscous.memory)
-        if self.averaged and not before:
-            self._total = self.kinetic(now) + self.averaged.stored(u, mu)
-        return self.balanced(replace(now, potentials=self._potentials(now, False)))
+            motion = Motion(t, u, v, a, mu)
+            a, mu = constrained_acceleration(self.system, self.device, inverse_mass, motion)
+        motion = Motion(
+            t, u, v, a, mu, work, dissipated, memory=self.viscous and self.viscous.memory
+        )
+        if self.contact and not earlier:
+            self._total_energy = self.kinetic(motion) + self.contact.stored_energy(u, mu)
+        potentials = self._potentials(motion, before_jump=False)
+        return self.with_imbalance(replace(motion, potentials=potentials))
 
-    def jumps(self, t: float) -> bool:
-        """Whether a motion begins anew at a kink or jump of the loads.
+    def begins_anew(self, t: float) -> bool:
+        """Return whether a motion begins anew at a kink or jump of the loads.
 
-        Beside a body it does not at a kink: the acceleration is continuous, and that of what is
-        left of the residual would be large where the contact is stiff.
+        In contact with a body it does not at a kink: the acceleration is continuous, and that of
+        the remaining residual would be large where the contact is stiff.
         """
         return (
-            not self.averaged
-            or self.ground is not None
+            not self.contact
+            or self.supports is not None
             or self.loads(t, True) != self.loads(t, False)
         )
 
-    def balanced(self, now: Motion) -> Motion:
-        """The motion with its imbalance, where that is checked."""
-        if not self.averaged:
-            return now
-        entries = self.kinetic(now), self.averaged.stored(now.u, now.mu), now.dissipated, -now.work
+    def with_imbalance(self, motion: Motion) -> Motion:
+        """Return the motion with its imbalance of energy, where that is checked. Collective."""
+        if not self.contact:
+            return motion
+        stored_energy = self.contact.stored_energy(motion.u, motion.mu)
+        energies = self.kinetic(motion), stored_energy, motion.dissipated, -motion.work
         return replace(
-            now,
-            imbalance=sum(entries) - self._total,
-            turnover=sum(map(abs, entries)) + (FLOOR * self.system.length) ** 2,
+            motion,
+            imbalance=sum(energies) - self._total_energy,
+            turnover=sum(map(abs, energies)) + (MIN_ENERGY_DISPLACEMENT * self.system.length) ** 2,
         )
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
+        """Return a solver with the mass, with ones on the diagonal of massless unknowns."""
         M = self.mass.copy()
         massless = M.getDiagonal()
         massless.setArray((massless.array_r == 0).astype(float))
@@ -237,308 +260,347 @@ class Integrator:
         factors.factor(M)
         return factors.solve
 
-    def kinetic(self, now: Motion) -> float:
-        """v . M v/2 on all ranks, with the velocity of supports."""
-        return self._kinetic(now.v, now.t, True)
+    def kinetic(self, motion: Motion) -> float:
+        """Return v . M v/2 on all ranks, with the velocity of supports. Collective."""
+        return self._kinetic_energy(motion.v, motion.t, before_jump=True)
 
-    def _kinetic(self, v: Vector, t: float, before: bool) -> float:
-        if self.ground is None:
+    def _kinetic_energy(self, v: Vector, t: float, *, before_jump: bool) -> float:
+        if self.supports is None:
             return dot(self.system.comm, v, self._times(v)) / 2
-        v = v + self.ground.velocity(t, before)
-        return dot(self.system.comm, v, self.ground.times(v)) / 2
+        v = v + self.supports.velocity(t, before_jump)
+        return dot(self.system.comm, v, self.supports.times(v)) / 2
 
-    def _pulled(self, x: Vector) -> Vector:
-        """The mass times a vector of supports, at all other nodes."""
-        assert self.ground
-        return self.ground.held(self.ground.times(x))
+    def _mass_times_supports(self, x: Vector) -> Vector:
+        """Return the mass times a vector of supports, at all other nodes."""
+        assert self.supports
+        return self.supports.zeroed_at_supports(self.supports.times(x))
 
-    def step(self, now: Motion, dt: float) -> Motion | str:
-        """The motion after a step; else the reason why there is none."""
-        if self.averaged:
-            v = now.v + self.ground.velocity(now.t, False) if self.ground else now.v
-            now = replace(now, mu=now.mu | self.averaged.harder(State(now.u, now.mu), v))
+    def step(self, motion: Motion, dt: float) -> Motion | str:
+        """Return the motion after a step, or the reason why there is none. Collective."""
+        if self.contact:
+            v = motion.v + self.supports.velocity(motion.t, False) if self.supports else motion.v
+            settings = self.contact.stiffened_settings(State(motion.u, motion.mu), v)
+            motion = replace(motion, mu=motion.mu | settings)
         try:
-            return self._step(now, dt)
+            return self._step(motion, dt)
         except np.linalg.LinAlgError:
             return "a body whose force is held has left the shell, and has no mass"
         finally:
-            if self.averaged:
-                self.averaged.present()
+            if self.contact:
+                self.contact.use_state_forces()
 
-    def _step(self, now: Motion, dt: float) -> Motion | str:
-        comm = self.system.comm
+    def _step(self, motion: Motion, dt: float) -> Motion | str:
+        comm, length = self.system.comm, self.system.length
         if self.viscous:
-            self.viscous.memory = now.memory
-        u = now.u + dt * now.v
-        if now.error < SMOOTH:
-            u = u + dt**2 / 2 * now.a
-        y = self.device.unknowns(now.mu) if self.device else np.empty(0)
-        pull = self._pull(now, dt)
-        last, first, fresh, grown = np.inf, np.inf, False, 0
-        if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
-            self._factor(now, u, y, dt)
+            self.viscous.memory = motion.memory
+        u = motion.u + dt * motion.v
+        if motion.error < MAX_ERROR_FOR_PREDICTION:
+            u = u + dt**2 / 2 * motion.a
+        y = self.device.unknowns(motion.mu) if self.device else np.empty(0)
+        support_forces = self._support_forces(motion, dt)
+        last_size, first_size, fresh, growths = np.inf, np.inf, False, 0
+        if self.factored_state is None or abs(dt - self.factored_state.dt) > MAX_STEP_CHANGE * dt:
+            self._factor_step(motion, u, y, dt)
             fresh = True
         chord = self._chord()
-        for _ in range(MOST):
-            a, v = self._rates(now, u, dt)
-            step = chord.step(pull + self._unbalanced(now, u, y, v, a, dt))
-            chord.took(step)
-            d, dy = split(step, y.size, comm)
-            u, y = u - d, y - dy
+        for _ in range(MAX_ITERATIONS):
+            a, v = self._rates(motion, u, dt)
+            step = chord.step(support_forces + self._residual(motion, u, y, v, a, dt))
+            chord.accept_step(step)
+            du, dy = split(step, y.size, comm)
+            u, y = u - du, y - dy
             self.iterations += 1
-            size = max_abs(comm, d) / self.system.length
+            size = max_abs(comm, du) / length
             if not np.isfinite(size):
                 return "the step is not a number"
-            tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
-            stalled = size <= STALLED and size > last / 2 and fresh
-            if size <= tolerance or (stalled and size <= ROUNDED * self._rounding(now, u, y, dt)):
-                end = State(u, self._at(now, y, 1.0, dt))
-                if self.averaged and (passed := self.averaged.passes(State(now.u, now.mu), end)):
-                    return passed
+            displacement = LENGTH_PER_DISPLACEMENT * max_abs(comm, u) / length
+            stalled = size <= MAX_ROUNDING_STEP and size > last_size / 2 and fresh
+            if size <= TOLERANCE * max(1.0, displacement) or (
+                stalled and size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
+            ):
+                end = State(u, self._amplitudes(motion, y, 1.0, dt))
+                if self.contact:
+                    message = self.contact.penetration_message(State(motion.u, motion.mu), end)
+                    if message:
+                        return message
                 self.steps += 1
-                return self._accepted(now, u, y, dt)
-            if size > SLOW * last:
-                grown = grown + 1 if fresh and size > last else 0
-                if grown > (PATIENCE if self.averaged else 0) or (fresh and size > max(FAR, first)):
+                return self._accept(motion, u, y, dt)
+            if size > REFACTOR_RATIO * last_size:
+                growths = growths + 1 if fresh and size > last_size else 0
+                diverges = fresh and size > max(MAX_STEP, first_size)
+                if growths > (CONTACT_PATIENCE if self.contact else 0) or diverges:
                     break
-                self._factor(now, u, y, dt)
+                self._factor_step(motion, u, y, dt)
                 fresh, chord = True, self._chord()
-            last, first = size, size if first == np.inf else first
-        self.factored = None
+            last_size, first_size = size, size if first_size == np.inf else first_size
+        self.factored_state = None
         return "Newton's method does not converge"
 
     def _chord(self) -> Chord[Vector]:
-        """The latest factors, which Broyden's update carries from iterate to iterate."""
+        """Return the chord method with the latest factors."""
         comm = self.system.comm
         return Chord(
             self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b
         )
 
-    def _pull(self, now: Motion, dt: float) -> Vector:
-        """The forces of inertia and drag by moving supports in a step, with zeros for unknown
-        amplitudes.
-        """
-        pull, ground, end = 0.0 * now.u, self.ground, now.t + dt
-        if ground:
-            m, f = self.rule.alpha_m, self.rule.alpha_f
-            a = (1 - m) * ground.acceleration(end, True) + m * ground.acceleration(now.t, False)
-            v = (1 - f) * ground.velocity(end, True) + f * ground.velocity(now.t, False)
-            pull = self._pulled(a + self.drag * v)
-        return self.device.padded(pull) if self.device else pull
+    def _support_forces(self, motion: Motion, dt: float) -> Vector:
+        """Return the forces of inertia and drag by moving supports in a step.
 
-    def _rates(self, now: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
-        """Acceleration and velocity at the end of a step to u (Newmark)."""
-        beta, gamma = self.rule.beta, self.rule.gamma
-        a = (u - now.u - dt * now.v) / (beta * dt**2) - (0.5 / beta - 1) * now.a
-        return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
-
-    def _at(self, now: Motion, y: Array, part: float, dt: float) -> dict[str, float]:
-        """Amplitudes at a part of a step; unknown ones and places of supports grow evenly, as
-        displacements do.
+        They have zeros for unknown amplitudes.
         """
-        mu = self.loads(now.t + part * dt, True)
+        forces, supports, end = 0.0 * motion.u, self.supports, motion.t + dt
+        if supports:
+            m, f = self.parameters.alpha_m, self.parameters.alpha_f
+            a = (1 - m) * supports.acceleration(end, True) + m * supports.acceleration(
+                motion.t, False
+            )
+            v = (1 - f) * supports.velocity(end, True) + f * supports.velocity(motion.t, False)
+            forces = self._mass_times_supports(a + self.drag * v)
+        return self.device.padded(forces) if self.device else forces
+
+    def _rates(self, motion: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
+        """Return acceleration and velocity at the end of a step to u (Newmark)."""
+        beta, gamma = self.parameters.beta, self.parameters.gamma
+        a = (u - motion.u - dt * motion.v) / (beta * dt**2) - (0.5 / beta - 1) * motion.a
+        return a, motion.v + dt * ((1 - gamma) * motion.a + gamma * a)
+
+    def _amplitudes(self, motion: Motion, y: Array, fraction: float, dt: float) -> dict[str, float]:
+        """Return the amplitudes at a fraction of a step.
+
+        Unknown ones and positions of supports grow linearly, as displacements do.
+        """
+        mu = self.loads(motion.t + fraction * dt, True)
         ends = self.device.values(y) if self.device else {}
-        if self.ground:
-            last = self.loads(now.t + dt, True)
-            ends |= {name: last[name] for name in self.ground.names & set(mu)}
-        return (
-            mu
-            | self._kept(now)
-            | {n: now.mu[n] + part * (end - now.mu[n]) for n, end in ends.items()}
-        )
+        if self.supports:
+            loads_at_end = self.loads(motion.t + dt, True)
+            ends |= {name: loads_at_end[name] for name in self.supports.names & set(mu)}
+        linear = {
+            name: motion.mu[name] + fraction * (end - motion.mu[name]) for name, end in ends.items()
+        }
+        return mu | self._contact_settings(motion) | linear
 
-    def _kept(self, now: Motion) -> dict[str, float]:
-        """The stiffnesses of contacts, which a motion raises and keeps."""
-        return (
-            {name: now.mu[name] for name in self.averaged.settings & set(now.mu)}
-            if self.averaged
-            else {}
-        )
+    def _contact_settings(self, motion: Motion) -> dict[str, float]:
+        """Return the stiffnesses of contacts, which a motion raises and keeps."""
+        if not self.contact:
+            return {}
+        return {name: motion.mu[name] for name in self.contact.settings & set(motion.mu)}
 
-    def _unbalanced(
-        self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float
+    def _residual(
+        self, motion: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float
     ) -> Vector:
-        rule = self.rule
-        m, f = rule.alpha_m, rule.alpha_f
-        self._average(now, u, y, dt)
-        r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
-        for part, weight in rule.forces:
+        """Return the residual of a step to u and y, without the forces by moving supports."""
+        m, f = self.parameters.alpha_m, self.parameters.alpha_f
+        self._average_contact(motion, u, y, dt)
+        r = self._times((1 - m) * a + m * motion.a + self.drag * ((1 - f) * v + f * motion.v))
+        for fraction, weight in self.parameters.forces:
             r = r + weight * self.system.residual(
-                now.u + part * (u - now.u), self._at(now, y, part, dt)
+                motion.u + fraction * (u - motion.u), self._amplitudes(motion, y, fraction, dt)
             )
         if self.viscous:
-            r = r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt)
+            r = r + self.viscous.force(motion.u, u, (1 - f) * v + f * motion.v, 1 - f, dt)
         if self.device is None:
             return r
-        if self.averaged:
-            self.averaged.present()
-        return join(r, (1 - f) * self.device.rows(u, self._at(now, y, 1.0, dt)), self.system.comm)
+        if self.contact:
+            self.contact.use_state_forces()
+        rows = (1 - f) * self.device.rows(u, self._amplitudes(motion, y, 1.0, dt))
+        return join(r, rows, self.system.comm)
 
-    def _average(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
-        if self.averaged:
-            end = State(u, self._at(now, y, 1.0, dt))
-            self.averaged.along(State(now.u, now.mu), end, 1 - self.rule.alpha_f)
+    def _average_contact(self, motion: Motion, u: Vector, y: Array, dt: float) -> None:
+        """Let the contact forces be the mean ones of a step to u and y."""
+        if self.contact:
+            end = State(u, self._amplitudes(motion, y, 1.0, dt))
+            self.contact.average_along(State(motion.u, motion.mu), end, 1 - self.parameters.alpha_f)
 
-    def _rounding(self, now: Motion, u: Vector, y: Array, dt: float) -> float:
-        """The size of a step that rounding of the forces makes, from their change when u is rounded
-        differently.
+    def _rounding_error(self, motion: Motion, u: Vector, y: Array, dt: float) -> float:
+        """Return the size of a step that rounding of the forces makes.
+
+        It is estimated from the change of the forces when u is rounded differently.
         """
-        side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
+        signs = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
 
-        def unbalanced(u: Vector) -> Vector:
-            a, v = self._rates(now, u, dt)
-            return self._unbalanced(now, u, y, v, a, dt)
+        def residual(u: Vector) -> Vector:
+            a, v = self._rates(motion, u, dt)
+            return self._residual(motion, u, y, v, a, dt)
 
-        change = unbalanced(u + side * np.spacing(u)) - unbalanced(u)
-        d, _ = split(self.factorisation.solve(change), y.size, self.system.comm)
-        return max_abs(self.system.comm, d) / self.system.length
+        change = residual(u + signs * np.spacing(u)) - residual(u)
+        du, _ = split(self.factorisation.solve(change), y.size, self.system.comm)
+        return max_abs(self.system.comm, du) / self.system.length
 
-    def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
-        """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the
-        step.
+    def _factor_step(self, motion: Motion, u: Vector, y: Array, dt: float) -> None:
+        """Factor the derivative of `_residual` by u and y.
+
+        One tangent serves all fractions of the step.
         """
-        part = 1 - self.rule.alpha_f
-        between, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
-        self._average(now, u, y, dt)
-        self.factor(Factored(between, mu, dt, self.factorisation.habit))
+        fraction = 1 - self.parameters.alpha_f
+        u_between = motion.u + fraction * (u - motion.u)
+        mu = self._amplitudes(motion, y, fraction, dt)
+        self._average_contact(motion, u, y, dt)
+        self.factor(FactoredState(u_between, mu, dt, self.factorisation.habit))
 
-    def factor(self, at: Factored) -> None:
-        """Make these factors."""
-        self.factorisation.habit = at.habit
-        rule, part, u, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
-        rate = rule.gamma / (rule.beta * dt)
-        tangent = (
-            self.viscous.tangent(u, mu, dt, rate) if self.viscous else self.system.tangent(u, mu)
-        )
-        assert not isinstance(tangent, Edged)
-        K = tangent.K if isinstance(tangent, Skewed | Beside) else tangent
-        if self._like is None or self._K is None or self._like.handle != K.handle:
-            self._like, self._K = K, K.duplicate()
+    def factor(self, state: FactoredState) -> None:
+        """Factor the matrix of a step at a state. Collective."""
+        self.factorisation.habit = state.habit
+        parameters, u, mu, dt = self.parameters, state.u, state.mu, state.dt
+        fraction, rate = 1 - parameters.alpha_f, parameters.gamma / (parameters.beta * dt)
+        viscous = self.viscous
+        tangent = viscous.tangent(u, mu, dt, rate) if viscous else self.system.tangent(u, mu)
+        assert not isinstance(tangent, BorderedTangent)
+        K = tangent.K if isinstance(tangent, SkewedTangent | CorrectedTangent) else tangent
+        if self._tangent is None or self._K is None or self._tangent.handle != K.handle:
+            self._tangent, self._K = K, K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._K.scale(part)
-        inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rate
+        self._K.scale(fraction)
+        inertia = (1 - parameters.alpha_m) / (parameters.beta * dt**2) + self.drag * fraction * rate
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        whole: Tangent = (
-            Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
-        )
-        if isinstance(tangent, Beside):
-            whole = Beside(self._K, tangent.D.scaled(part))
+        matrix: Tangent = self._K
+        if isinstance(tangent, SkewedTangent):
+            matrix = SkewedTangent(self._K, fraction * tangent.N)
+        elif isinstance(tangent, CorrectedTangent):
+            matrix = CorrectedTangent(self._K, tangent.D.scaled(fraction))
         if self.device:
-            C, D = self.device.edge(u, mu)
-            self.factorisation.factor(
-                Edged(whole, [part * c for c in C], part * D, self.device.multipliers)
-            )
-        else:
-            self.factorisation.factor(whole)
-        self.factored = at
+            C, D = self.device.border(u, mu)
+            columns = [fraction * c for c in C]
+            matrix = BorderedTangent(matrix, columns, fraction * D, self.device.multipliers)
+        self.factorisation.factor(matrix)
+        self.factored_state = state
 
-    def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
-        comm, rule, t = self.system.comm, self.rule, now.t + dt
-        a, v = self._rates(now, u, dt)
-        mu = self._advance(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
-        after, mean = Motion(t, u, v, a, mu), dict[str, float]()
-        beside = (
-            self.averaged.names | (self.ground.names if self.ground else frozenset())
-            if self.averaged
-            else ()
+    def _accept(self, motion: Motion, u: Vector, y: Array, dt: float) -> Motion:
+        """Return the motion at the end of a step that has converged."""
+        comm, f, t = self.system.comm, self.parameters.alpha_f, motion.t + dt
+        a, v = self._rates(motion, u, dt)
+        mu = self._advance(State(u, self._amplitudes(motion, y, 1.0, dt)), motion.mu).mu
+        end_motion = Motion(t, u, v, a, mu)
+        mean_forces = self._mean_forces(motion, end_motion, y, dt)
+        potentials = self._potentials(end_motion, before_jump=True)
+        work = sum(
+            self._work(name, motion, mu, potentials, mean_forces.get(name)) for name in potentials
         )
-        if self.averaged and (moving := self._driven.intersection(beside)):
-            self._average(now, u, y, dt)
-            mean = {name: self._mean(name, now, after, y, dt) for name in moving}
-            self.averaged.present()
-        potentials, moved, w = (
-            self._potentials(after, True),
-            u - now.u,
-            (1 - rule.alpha_f) * v + rule.alpha_f * now.v,
-        )
-        work = sum(self._work(name, now, mu, potentials, mean.get(name)) for name in potentials)
-        if self.ground and self.drag:
-            ends = self.ground.velocity(now.t, False), self.ground.velocity(t, True)
-            along, w = (
-                moved + dt / 2 * (ends[0] + ends[1]),
-                w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0],
-            )
-            lost = self.drag * dot(comm, along, self.ground.times(w))
+        step, velocity = u - motion.u, (1 - f) * v + f * motion.v
+        if self.supports and self.drag:
+            begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
+            step_of_all = step + dt / 2 * (begin + end)
+            velocity = velocity + (1 - f) * end + f * begin
+            dissipated = self.drag * dot(comm, step_of_all, self.supports.times(velocity))
         else:
-            lost = self.drag * dot(comm, moved, self._times(w)) if self.drag else 0.0
-        error = self._error(now, after, dt)
+            dissipated = self.drag * dot(comm, step, self._times(velocity)) if self.drag else 0.0
+        error = self._error(motion, end_motion, dt)
         if self.viscous:
-            lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
-        memory, dissipated = self.viscous and self.viscous.memory, now.dissipated + lost
-        after = replace(after, work=now.work + work, dissipated=dissipated, memory=memory)
-        return self.balanced(replace(after, potentials=potentials, error=error))
+            dissipated += dot(comm, step, self.viscous.accept(motion.u, u, dt))
+        end_motion = replace(
+            end_motion,
+            work=motion.work + work,
+            dissipated=motion.dissipated + dissipated,
+            memory=self.viscous and self.viscous.memory,
+        )
+        return self.with_imbalance(replace(end_motion, potentials=potentials, error=error))
 
-    def _error(self, now: Motion, after: Motion, dt: float) -> float:
-        """Estimated error of a step, over the system's length."""
-        comm, of = self.system.comm, self.system.length
-        change = max_abs(comm, after.a - now.a)
-        error = abs(self.rule.beta - 1 / 6) * dt**2 * change / of
-        if self.viscous is None:
+    def _error(self, motion: Motion, end_motion: Motion, dt: float) -> float:
+        """Return the estimated error of a step, over the system's length."""
+        comm, length, viscous = self.system.comm, self.system.length, self.viscous
+        change = max_abs(comm, end_motion.a - motion.a)
+        error = abs(self.parameters.beta - 1 / 6) * dt**2 * change / length
+        if viscous is None:
             return error
-        if (
-            self.viscous.slowness > dt and dt**2 * change > ROUNDING * of
-        ):  # errors add up in the motion's own time
-            most = max(max_abs(comm, after.a), change)
-            error *= max(
-                1.0, min(self.viscous.slowness, max_abs(comm, after.v) / max(most, 1e-300)) / dt
-            )
-        doubt = self.viscous.doubt(now.u, after.u, dt)
-        if doubt is not None:
-            whole = self.device.padded(doubt) if self.device else doubt
-            d = self.factorisation.solve((1 - self.rule.alpha_f) * whole)
-            error = max(error, max_abs(comm, split(d, len(self._free), comm)[0]) / of)
+        # errors add up in the motion's own time
+        if viscous.creep_time > dt and dt**2 * change > ACCELERATION_ROUNDING * length:
+            acceleration = max(max_abs(comm, end_motion.a), change)
+            motion_time = max_abs(comm, end_motion.v) / max(acceleration, 1e-300)
+            error *= max(1.0, min(viscous.creep_time, motion_time) / dt)
+        force = viscous.error_force(motion.u, end_motion.u, dt)
+        if force is not None:
+            force = self.device.padded(force) if self.device else force
+            step = self.factorisation.solve((1 - self.parameters.alpha_f) * force)
+            du, _ = split(step, len(self._free), comm)
+            error = max(error, max_abs(comm, du) / length)
         return error
 
-    def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
-        """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
-        mu, still = now.mu, (self.system.coordinates - self._driven) | set(self._kept(now))
+    def _potentials(self, motion: Motion, *, before_jump: bool) -> dict[str, float]:
+        """Return dPi/dmu of the loads, at a jump before or after it.
+
+        Those of moving supports include the forces of inertia and drag.
+        """
+        mu = motion.mu
+        without_work = (self.system.coordinates - self._driven) | set(
+            self._contact_settings(motion)
+        )
         potentials = {
-            name: self.system.potential(now.u, mu, name) for name in mu if name not in still
+            name: self.system.potential(motion.u, mu, name)
+            for name in mu
+            if name not in without_work
         }
-        if self.ground:
-            a = now.a + self.ground.acceleration(now.t, before)
-            forces = self.ground.times(
-                a + self.drag * (now.v + self.ground.velocity(now.t, before))
-            )
-            for name in self._driven & self.ground.names:
-                potentials[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
+        if self.supports:
+            a = motion.a + self.supports.acceleration(motion.t, before_jump)
+            v = motion.v + self.supports.velocity(motion.t, before_jump)
+            forces = self.supports.times(a + self.drag * v)
+            for name in self._driven & self.supports.names:
+                rate = self.supports.displacement_rate(mu, name)
+                potentials[name] += dot(self.system.comm, forces, rate)
         return potentials
 
-    def _mean(self, name: str, now: Motion, after: Motion, y: Array, dt: float) -> float:
-        """The force on what moves beside a contact in a step, as the step has it; of supports with
-        that of inertia.
-        """
-        ground, m, f, force = self.ground, self.rule.alpha_m, self.rule.alpha_f, 0.0
-        for part, weight in self.rule.forces:
-            place = now.u + part * (after.u - now.u), self._at(now, y, part, dt)
-            force += weight * self.system.potential(*place, name)
-        if ground and name in ground.names:
-            ends = (after, after.t, True), (now, now.t, False)
-            a, before = (each.a + ground.acceleration(t, side) for each, t, side in ends)
-            v, old = (each.v + ground.velocity(t, side) for each, t, side in ends)
-            pull = (1 - m) * a + m * before + self.drag * ((1 - f) * v + f * old)
-            along = ground.along(self._at(now, y, 1 - f, dt), name)
-            force += dot(self.system.comm, ground.times(pull), along)
+    def _mean_forces(
+        self, motion: Motion, end_motion: Motion, y: Array, dt: float
+    ) -> dict[str, float]:
+        """Return the mean forces in a step on moving positions, where there is contact."""
+        if not self.contact:
+            return {}
+        support_names = self.supports.names if self.supports else frozenset[str]()
+        moving = self._driven.intersection(self.contact.names | support_names)
+        if not moving:
+            return {}
+        self._average_contact(motion, end_motion.u, y, dt)
+        forces = {name: self._mean_force(name, motion, end_motion, y, dt) for name in moving}
+        self.contact.use_state_forces()
+        return forces
+
+    def _mean_force(
+        self, name: str, motion: Motion, end_motion: Motion, y: Array, dt: float
+    ) -> float:
+        """Return the mean force in a step on a moving position, with inertia for supports."""
+        supports, m, f = self.supports, self.parameters.alpha_m, self.parameters.alpha_f
+        force = 0.0
+        for fraction, weight in self.parameters.forces:
+            u = motion.u + fraction * (end_motion.u - motion.u)
+            mu = self._amplitudes(motion, y, fraction, dt)
+            force += weight * self.system.potential(u, mu, name)
+        if supports and name in supports.names:
+            ends = (end_motion, end_motion.t, True), (motion, motion.t, False)
+            a, a_before = (end.a + supports.acceleration(t, is_end) for end, t, is_end in ends)
+            v, v_before = (end.v + supports.velocity(t, is_end) for end, t, is_end in ends)
+            acceleration = (1 - m) * a + m * a_before
+            velocity = (1 - f) * v + f * v_before
+            rate = supports.displacement_rate(self._amplitudes(motion, y, 1 - f, dt), name)
+            inertia = supports.times(acceleration + self.drag * velocity)
+            force += dot(self.system.comm, inertia, rate)
         return force
 
     def _work(
         self,
         name: str,
-        now: Motion,
+        motion: Motion,
         mu: Mapping[str, float],
         potentials: Mapping[str, float],
-        mean: float | None,
+        mean_force: float | None,
     ) -> float:
-        """In a step: of a load on its displacement, of a position that moves on what it meets, with
-        its mean force.
+        """Return the work of an amplitude in a step.
+
+        A load works on its conjugate displacement; a moving position works with the force on it.
+
+        Parameters
+        ----------
+        mu, potentials
+            Amplitudes and dPi/dmu at the end of the step.
+        mean_force
+            The mean force on a position; None: the mean of both ends.
         """
-        a, b = now.potentials[name], potentials[name]
+        begin, end = motion.potentials[name], potentials[name]
         if name in self.system.coordinates:
-            return ((a + b) / 2 if mean is None else mean) * (mu[name] - now.mu[name])
-        return -(now.mu[name] + mu[name]) / 2 * (b - a)
+            force = (begin + end) / 2 if mean_force is None else mean_force
+            return force * (mu[name] - motion.mu[name])
+        return -(motion.mu[name] + mu[name]) / 2 * (end - begin)
 
     def _times(self, x: Vector) -> Vector:
+        """Return the mass times a vector."""
         self._x.setArray(x)
         self.mass.mult(self._x, self._y)
         return np.array(self._y.array_r)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.point import Finding
-from magshell_fenicsx.continuation.transient import FLOOR
+from magshell_fenicsx.continuation.point import RecordedValues
+from magshell_fenicsx.continuation.transient import MIN_ENERGY_DISPLACEMENT
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
@@ -35,7 +35,7 @@ class RowMaker:
         """The next row; `wall_s` is in seconds since the start of the history. Collective."""
         scene = record.scene or self._scene
         point = record.point
-        values = self._scene.journal.noted(lambda: Finding(scene.observe(point.state))).values
+        values = self._scene.journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
         if record.label in ("start", "field") or (
             self._listed and record.amplitude in ("lambda_m", "angle")
         ):
@@ -121,7 +121,7 @@ def departures(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> I
 def _imbalance(row: Row, length: float) -> float:
     """That of a row over its energies."""
     energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
-    return float(row["imbalance"]) / (energies + (FLOOR * length) ** 2)
+    return float(row["imbalance"]) / (energies + (MIN_ENERGY_DISPLACEMENT * length) ** 2)
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:

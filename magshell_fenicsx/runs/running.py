@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from mpi4py import MPI
 
-from magshell_fenicsx.assembly.kernels import reported
+from magshell_fenicsx.assembly.kernels import reporting_progress_to
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.modes import NoEigenpair
-from magshell_fenicsx.continuation.point import Finding, Journal, NoJournal, Point
+from magshell_fenicsx.continuation.point import NoJournal, Point, RecordedValues, SolverJournal
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.report.report import write_report
@@ -129,7 +129,7 @@ class Watch:
 class Stoppable:
     """A journal that stops the run before a new solve if the watch requests it."""
 
-    def __init__(self, journal: Journal, watch: Watch) -> None:
+    def __init__(self, journal: SolverJournal, watch: Watch) -> None:
         self._journal, self._watch = journal, watch
 
     def replay(self) -> Point | str | None:
@@ -141,8 +141,8 @@ class Stoppable:
     def record(self, result: Point | str) -> None:
         self._journal.record(result)
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
-        return self._journal.noted(find)
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
+        return self._journal.recorded_values(find)
 
     def begin(self, space: object) -> None:
         self._journal.begin(space)
@@ -178,7 +178,7 @@ def run(
     listened = tell is not None
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     with (
-        reported(_of_kernels(say, tell, start, apart=plain(comm.size)))
+        reporting_progress_to(_of_kernels(say, tell, start, apart=plain(comm.size)))
         if listened
         else nullcontext()
     ):

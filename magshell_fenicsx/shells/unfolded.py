@@ -17,11 +17,11 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
-from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.mirror import CUT, Sector
-from magshell_fenicsx.mesh.unfolding import folding_of, unfolded
+from magshell_fenicsx.mesh.mirror import SYMMETRY_EDGE, Sector
+from magshell_fenicsx.mesh.unfolding import unfold, unfolding_of
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class UnfoldedModes:
     """
 
     families: Sequence[
-        Family
+        ModeFamily
     ] = ()  # they are counted and not located: the turned shape is always neutral
     tangents = None  # nor are changes of these located
 
@@ -56,13 +56,13 @@ class UnfoldedModes:
         """The model whose tangents are counted."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
-        self._folding = folding_of(sector, patch)
+        self._folding = unfolding_of(sector, patch)
         half = self._as_half(
-            distribute(unfolded(patch, self._folding, (CUT, CUT)), self._model.system.comm)
+            distribute(unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE)), self._model.system.comm)
         )
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))
-        self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.back(chart))[1]
+        self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.to_sector(chart))[1]
         self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[
             self._folding.copies(chart)
         ]
@@ -73,7 +73,7 @@ class UnfoldedModes:
         half, system = self.half, self._model.system
         whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
-            half.system.held(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel())
+            half.system.zero_at_supports(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel())
         )
 
     def counts(self, state: State) -> Sequence[int]:
@@ -123,5 +123,5 @@ class UnfoldedModes:
         np.add.at(total, dofs, by_angle)
         np.add.at(count, dofs, 1.0)
         t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]
-        t = modes.system.held(t.ravel()[: system.size])
+        t = modes.system.zero_at_supports(t.ravel()[: system.size])
         return t if max_abs(system.comm, t) > SEEN * system.length else None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.coupled import Factors
+from magshell_fenicsx.assembly.nonlocal_terms import Factors
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.carriers import Carrier, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
@@ -82,7 +82,7 @@ class Viscosity:
     ----------
     memory
         Of the steps so far.
-    slowness
+    creep_time
         `kelvin`.
     """
 
@@ -93,7 +93,7 @@ class Viscosity:
         kelvin: float,
         branches: Sequence[Branch],
     ) -> None:
-        self._model, self._mu, self._branches, self.slowness = model, dict(mu), branches, kelvin
+        self._model, self._mu, self._branches, self.creep_time = model, dict(mu), branches, kelvin
         V, carrier = model.V, model.factory.carrier
         Q = carrier.discontinuous(SIZE)
         self._jets = carrier.tables(V, Q.element.basix_element.points)
@@ -126,8 +126,8 @@ class Viscosity:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         at = u0 + part * (u1 - u0)
         stress = (
-            self.slowness * self._rate(at, v)
-            if self.slowness
+            self.creep_time * self._rate(at, v)
+            if self.creep_time
             else np.zeros((*self._places.shape, SIZE))
         )
         if self._branches:
@@ -152,7 +152,7 @@ class Viscosity:
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
-        return self.slowness * rate + sum(
+        return self.creep_time * rate + sum(
             b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches
         )
 
@@ -170,7 +170,7 @@ class Viscosity:
             )
         return self._force
 
-    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+    def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
         """The force at the end by which the curvature of the strain in time counts; None if nothing
         does.
         """
@@ -189,7 +189,7 @@ class Viscosity:
         given.stiffness.value = stiffness
         for field, displacement in ((given.before, u0), (given.after, u1)):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
-        return system.at(State(u1, self._mu)).gradient(self._forms)
+        return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
         """q at the end of a step; the strain is quadratic in time through its ends and the begin of
@@ -238,7 +238,7 @@ class Viscosity:
 
 class _Slowing:
     """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's
-    `Couplings`.
+    `AddedTangent`.
 
     Viscous stresses are those of small strains: they make stiff what the strains of a stretched
     shell leave soft.
@@ -255,7 +255,7 @@ class _Slowing:
             for i, work in enumerate(_works(model, rates))
         ]
         self._added = fem_petsc.create_matrix(self._forms[0])
-        self._system.couplings.append(self)
+        self._system.added_tangents.append(self)
 
     @contextmanager
     def by(self, stiffness: float) -> Iterator[None]:
@@ -267,7 +267,7 @@ class _Slowing:
             self._stiffness.value = 0.0
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """See `Couplings`."""
+        """See `AddedTangent`."""
         if not self._stiffness.value:
             return K
         self._since.x.array[:] = self._system.u.x.array
@@ -280,7 +280,7 @@ class _Slowing:
         return stiffer
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """See `Couplings`: viscous forces have no part in what moves a support."""
+        """See `AddedTangent`: viscous forces have no part in what moves a support."""
         return np.zeros_like(v)
 
 

@@ -22,13 +22,13 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.assembly.coupled import with_entries
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.nonlocal_terms import with_entries
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
@@ -110,14 +110,14 @@ class Waves:
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
-        (entries,) = self._system.at(state).assembled(lambda: self._entries(state, [m]))
+        (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
         return self._touched(state, self._filled("tangent", entries.ravel(), m), m)
 
     def _touched(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
         """With the entries of contacts at a state."""
         if not self.touching:
             return K
-        entries = self._system.at(state).of(
+        entries = self._system.at_state(state).evaluate(
             lambda: [each.entries_of_waves(m) for each in self.touching]
         )
         rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
@@ -169,7 +169,7 @@ class Waves:
 
     def numbers(self, state: State) -> NDArray[np.float64]:
         """(5, entries) of the matrices at the five m."""
-        of_nodes = self._system.at(state).assembled(lambda: self._entries(state, self._nodes[:3]))
+        of_nodes = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, self._nodes[:3]))
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
     def counts_of(self, values: NDArray[np.float64]) -> list[int]:
@@ -345,7 +345,7 @@ def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class WavesOf:
-    """The waves of one number m; a `continuation.watch.Family`."""
+    """The waves of one number m; a `continuation.stability_monitor.ModeFamily`."""
 
     waves: Waves
     m: int
@@ -366,13 +366,13 @@ class ExcludedWaves:
     waves: Waves
 
     @property
-    def families(self) -> Sequence[Family]:
-        """For a `Watch`: every number of waves by itself."""
+    def families(self) -> Sequence[ModeFamily]:
+        """For a `StabilityMonitor`: every number of waves by itself."""
         return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
     @property
     def tangents(self) -> Waves | None:
-        """For a `Watch`; those of contacts have no pattern in common."""
+        """For a `StabilityMonitor`; those of contacts have no pattern in common."""
         return None if self.waves.touching else self.waves
 
     def counts(self, state: State) -> Sequence[int]:

@@ -4,10 +4,10 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from magshell_fenicsx.continuation.path import SEEN, NotANumber
-from magshell_fenicsx.continuation.point import Finding, Point
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal
+from magshell_fenicsx.continuation.path import ZERO_DISPLACEMENT, NotANumber
+from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.system import State, max_abs
-from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -124,7 +124,7 @@ def follow(
                     last, scene = record.label, record.scene or scene
                     yield _recorded(scene, step, record, remark, where)
         except (Stopped, NotANumber) as e:
-            names = scene.model.system.strange
+            names = scene.model.system.nan_terms
             strange = (
                 f"; where it was tried last, {' and '.join(names)} was not a number"
                 if names
@@ -173,8 +173,8 @@ def _recorded(
     if record.said:
         remark(where + record.said)
     state, moving = record.point.state, bool((record.clock or {}).get("kinetic"))
-    refused = scene.journal.noted(
-        lambda: Finding({"said": penetration_refused(at, state, moving=moving)})
+    refused = scene.journal.recorded_values(
+        lambda: RecordedValues({"said": penetration_refused(at, state, moving=moving)})
     ).values
     if refused["said"]:
         raise Stopped(refused["said"])
@@ -189,7 +189,7 @@ def pulling(scene: Scene, state: State) -> dict[str, float]:
         if max_abs(scene.comm, load) == 0:
             continue
         moved = term.value * scene.newton.factor_at(state).solve(load)
-        if max_abs(scene.comm, moved) > SEEN * system.length:
+        if max_abs(scene.comm, moved) > ZERO_DISPLACEMENT * system.length:
             own[term.name] = term.value
     return own
 
@@ -199,7 +199,7 @@ def _under(scene: Scene, name: str, value: float, state: State) -> Records:
     stage = plain(scene)
     path, start = stage.begin(name, "load", state, value / RISES, value)
     try:
-        return (yield from followed(stage, path, start, Goal("target", [value])))
+        return (yield from followed(stage, path, start, ContinuationGoal("target", [value])))
     except Stopped as e:
         raise Stopped(f"on the way to rest under the energy {name}: {e}") from None
 
@@ -226,9 +226,9 @@ def _refuse_not_numbers(scene: Scene, state: State, where: str) -> None:
         With the terms that are not.
     """
     system = scene.model.system
-    system.strange = []
+    system.nan_terms = []
     system.residual(state.u, state.mu)
-    if system.strange:
+    if system.nan_terms:
         raise Stopped(
-            f"{where}{' and '.join(system.strange)} is not a number at its begin, in value or derivative"
+            f"{where}{' and '.join(system.nan_terms)} is not a number at its begin, in value or derivative"
         )

@@ -16,13 +16,17 @@ import scipy
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.bifurcation import BifurcationLost, branching, find_bifurcation
+from magshell_fenicsx.continuation.bifurcation import (
+    BifurcationLost,
+    find_bifurcation,
+    switch_branch,
+)
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal
 from magshell_fenicsx.continuation.fold import held_along
 from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
-from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import MeshError
@@ -152,7 +156,7 @@ def larger(scene: Scene, mode: str) -> Scene:
     why = ""
     for symmetry in asked:
         try:
-            problem = scene.meshed(scene.problem.again({"symmetry": symmetry}))
+            problem = scene.meshed(scene.problem.with_values({"symmetry": symmetry}))
             new = Scene(problem, scene.comm)
         except (CaseError, MeshError) as e:
             why = why or str(e)
@@ -163,7 +167,7 @@ def larger(scene: Scene, mode: str) -> Scene:
     raise Stopped(f"no model has the mode {mode}: {why}")
 
 
-def leaving(stage: Stage, bifurcation: Record, goal: Goal, scale: float, number: int) -> Records:
+def leaving(stage: Stage, bifurcation: Record, goal: ContinuationGoal, scale: float, number: int) -> Records:
     """The records of the branch at a bifurcation in the model that has its mode; its value is the
     state at their end.
 
@@ -181,7 +185,7 @@ def leaving(stage: Stage, bifurcation: Record, goal: Goal, scale: float, number:
     """
     departure = departed(stage, bifurcation, scale)
     yield departure.record(number)
-    crossing = branching(departure.path, departure.point, partial(passes, departure.stage))
+    crossing = switch_branch(departure.path, departure.point, partial(passes, departure.stage))
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
     comm, u, phi = departure.scene.model.system.comm, departure.point.state.u, departure.point.du
@@ -265,7 +269,7 @@ def _differences(old: Scene, event: Record, departure: Departure) -> str:
     a, b = (amount_of(scene, name, s) for scene, s in ((old, event.point.state), (new, state)))
     energy = abs(two["energy"] - one["energy"]) / max(abs(one["energy"]), TINY)
     counted = ""
-    if new.problem.half:
+    if new.problem.is_half:
         besides = ", but for its turning about e3" if new.problem.turns else ""
         counted = f"; its excluded_pivots are those of all other modes of the shell{besides}"
     return (
@@ -289,14 +293,14 @@ def _carried(old: Scene, new: Scene, bifurcation: Record, mode: Vector) -> tuple
         both = _revolved(old.model, s, theta, u, mode, int(bifurcation.mode.removeprefix(WAVES)))
     else:
         both = _mirrored(old, new, u, mode)
-    return system.held(both[0].ravel()), system.held(both[1].ravel())
+    return system.zero_at_supports(both[0].ravel()), system.zero_at_supports(both[1].ravel())
 
 
 def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
     """Parameter of the meridian and azimuth (rad) of the nodes of a surface, in its model's frame."""
     span = old.problem.meridian
     assert span
-    s, theta = np.array([span.place(x) for x in new.model.chart()]).reshape(-1, 2).T
+    s, theta = np.array([span.locate(x) for x in new.model.chart()]).reshape(-1, 2).T
     return s, theta
 
 
@@ -333,7 +337,7 @@ def _sign(model: MeridianModel, wave: Vector) -> float:
 def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) -> Array:
     """Components (n, k) of a field on the meridian at its parameters s."""
     domain = model.meridian.mesh
-    ends = domain.geometry.x[compat.corner_numbers(domain), 0]
+    ends = domain.geometry.x[compat.geometry_dofs(domain), 0]
     begin = ends.min(axis=1)
     order = np.argsort(begin)
     cells = order[np.clip(np.searchsorted(begin[order], s, side="right") - 1, 0, len(order) - 1)]
@@ -352,7 +356,7 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     assert isinstance(mirror, Mirror)
     parts = [old.model.r0.x.array[:size], u[:size], mode[:size]]
     places, *fields = (np.concatenate(comm.allgather(part.reshape(-1, 3))) for part in parts)
-    off = mirror.beyond(places) > 1e-9
+    off = mirror.signed_distance(places) > 1e-9
     S = mirror.reflection
     x = np.concatenate([places, mirror.image(places[off])])
     both = [

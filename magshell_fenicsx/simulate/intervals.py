@@ -15,11 +15,11 @@ import numpy as np
 import scipy
 
 from magshell_fenicsx.continuation.advance import TimeSteps, TimeStopped, advance
-from magshell_fenicsx.continuation.device import Held
+from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
-from magshell_fenicsx.continuation.transient import Factored, Integrator
+from magshell_fenicsx.continuation.transient import FactoredState, Integrator
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
@@ -88,7 +88,7 @@ class Rehearsed:
     """
 
     scene: Scene
-    held: Mapping[str, Held]
+    held: Mapping[str, HeldConjugate]
     marks: Collection[float]
     begin: Callable[[], tuple[Integrator, Motion]]
     ends: Sequence[float]
@@ -151,7 +151,7 @@ class Intervals:
 
     scene: Scene
     integrator: Integrator
-    held: Mapping[str, Held]
+    held: Mapping[str, HeldConjugate]
     steps: TimeSteps
     marks: Collection[float]
     rehearse: Rehearsed | None = None
@@ -166,7 +166,7 @@ class Intervals:
         """The motion at a later time, which may be `known` already, and the step to go on with."""
         between = partial(self.scene.journal.check, known)
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
-            if now.t in self.marks and self.integrator.jumps(now.t):  # the acceleration after it
+            if now.t in self.marks and self.integrator.begins_anew(now.t):  # the acceleration after it
                 now = self.integrator.begin(now.t, now.u, now.v, now)
             now, dt = advance(self.integrator, now, t, self.steps, dt, between)
         return now, dt
@@ -225,7 +225,7 @@ class Intervals:
             ends = self.rehearse.ends
             row = int(np.searchsorted(ends, end))
             error = self._rehearsal.error(scene, row, now.u if end == ends[row] else None)
-        state = scene.model.system.placed(State(now.u, now.mu))
+        state = scene.model.system.with_moved_supports(State(now.u, now.mu))
         stage = staged(scene, state, self.held)
         # rigid motions that are free have no stiffness: the sign of their pivots is rounding
         pivots = (
@@ -237,7 +237,7 @@ class Intervals:
         rest = Point(
             State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error
         )
-        made = integrator.factored or Factored(still, {}, 0.0, integrator.factorisation.habit)
+        made = integrator.factored_state or FactoredState(still, {}, 0.0, integrator.factorisation.habit)
         factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
         for part in (point, rest, factors)[len(points) :]:
             scene.journal.record(part)
@@ -249,10 +249,10 @@ class Intervals:
         """
         last, self._last = self._last, None
         if (
-            self.integrator.averaged
+            self.integrator.contact
         ):  # beside a body factors belong to a whole step: each interval makes its own
-            self.integrator.factored = None
-        if last and last.s and not self.integrator.averaged:
-            self.integrator.factor(Factored(last.state.u, dict(last.state.mu), last.s, last.habit))
+            self.integrator.factored_state = None
+        if last and last.s and not self.integrator.contact:
+            self.integrator.factor(FactoredState(last.state.u, dict(last.state.mu), last.s, last.habit))
         elif last:
             self.integrator.factorisation.habit = last.habit

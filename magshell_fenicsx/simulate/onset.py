@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.stepping import Ahead
+from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.touching.touching import NEARER, Touching
 from magshell_fenicsx.simulate.scene import Scene
@@ -22,7 +22,7 @@ CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
 
 
-def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> Ahead:
+def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> StepEvent:
     """Where shells meet that do not touch yet, and whether all that touch let go; collective.
 
     Of pairs that meet on the straight way between two states of a step the first one counts. A step
@@ -32,18 +32,18 @@ def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, gue
         each for each in scene.model.touchings if isinstance(each, Touching)
     ]  # not those on meridians
     if not touchings:
-        return Ahead()
+        return StepEvent()
     ends = leave(here), leave(guess)
-    here_at, guess_at = map(scene.model.system.at, ends)
+    here_at, guess_at = map(scene.model.system.at_state, ends)
     u, v = (of_all_nodes(scene, state) for state in ends)
-    meets, lets_go = (1.0, False), False
+    meets, loses_forces = (1.0, False), False
     for each in touchings:
-        if here_at.of(each.penetration):
-            lets_go |= not guess_at.of(each.penetration)
+        if here_at.evaluate(each.penetration):
+            loses_forces |= not guess_at.evaluate(each.penetration)
         else:
             at = _onset(each, scene.problem.material.h, u, v)
             meets = min(meets, at, key=lambda each: (each[0], not each[1]))
-    return Ahead(*meets, lets_go)
+    return StepEvent(*meets, loses_forces)
 
 
 def of_all_nodes(scene: Scene, state: State) -> Array:

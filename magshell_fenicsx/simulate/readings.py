@@ -17,8 +17,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.forms import FieldGradient
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
+from magshell_fenicsx.continuation.control import ConstraintRow, PrescribedConjugate, PrescribedLoad
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, System, max_abs
@@ -141,13 +141,13 @@ class Places:
         potential = self.scene.model.system.potential(state.u, state.mu, self.name)
         return float(-self._size * potential / self._unit)
 
-    def row(self, system: System, place: float) -> Row:
+    def row(self, system: System, place: float) -> ConstraintRow:
         """What holds at a place."""
         value = place / self._size * self._unit
         return (
-            GivenConjugate(system, self.name, value)
+            PrescribedConjugate(system, self.name, value)
             if self.by_conjugate
-            else GivenLoad(self.name, value)
+            else PrescribedLoad(self.name, value)
         )
 
     def rate(self, key: str) -> float:
@@ -160,7 +160,7 @@ class Places:
         """
         problem = self.scene.problem
         value, step = number_of(problem.context, key), STEP * size_of(problem.context, key)
-        low, high = (problem.again({key: value + way * step}) for way in (-1, 1))
+        low, high = (problem.with_values({key: value + way * step}) for way in (-1, 1))
         sizes = [sizes_in_units(each).size(self.bare) for each in (low, high)]
         kept = [self._kept(each) for each in (low, high)]
         over = 2 * step
@@ -350,7 +350,7 @@ class Read:
         mu = {
             name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()
         }
-        guess = self.scene.model.system.placed(State((1 - part) * a.u + part * b.u, mu))
+        guess = self.scene.model.system.with_moved_supports(State((1 - part) * a.u + part * b.u, mu))
         row = self.places.row(stage.newton.system, place)
         ended = stage.newton.solve(stage.enter(guess), self.places.name, row)
         state, comm = stage.leave(ended.state), self.scene.comm

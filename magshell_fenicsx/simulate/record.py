@@ -36,7 +36,7 @@ class Record:
         0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation;
         of a solution its number.
     excluded_pivots
-        Number of unstable directions that the model excludes; see `continuation.watch.Watch`.
+        Number of unstable directions that the model excludes; see `continuation.stability_monitor.StabilityMonitor`.
     step
         Number of the programme's step, from 1; 0 at the start.
     clock

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, Progress
+from magshell_fenicsx.continuation.point import NoJournal, NoProgress, Progress, SolverJournal
 from magshell_fenicsx.continuation.snes import NewtonOptions
+from magshell_fenicsx.continuation.stability_monitor import StabilityMonitor
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.mirror import Y0, rotation
+from magshell_fenicsx.mesh.mirror import Y0_PLANE, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
@@ -37,7 +37,7 @@ from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.shells.meridian import MeridianModel
@@ -64,7 +64,7 @@ def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
         problem.loads,
         problem.mesh.penalty,
         problem.thickness,
-        problem.mirror or Y0,
+        problem.mirror or Y0_PLANE,
     )
     model.turns = problem.turns
     return model
@@ -92,8 +92,8 @@ def build_meridian(problem: Problem) -> Meridian:
         name: next(of for of, at in problem.points.items() if at is x)
         for name, x in problem.points.items()
     }
-    points = {name: span.place_of(named[name], x) for name, x in problem.points.items()}
-    pieces = [(piece.name, piece.ends) for piece in span.pieces]
+    points = {name: span.locate_named(named[name], x) for name, x in problem.points.items()}
+    pieces = [(piece.name, piece.ends) for piece in span.shell_meridians]
     held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
     vertices = meridian_vertices(problem)
     return make_meridian(
@@ -121,7 +121,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
         solid.material,
         problem.conditions,
         problem.loads,
-        problem.mirror or Y0,
+        problem.mirror or Y0_PLANE,
     )
 
 
@@ -178,7 +178,7 @@ class Scene:
             self.model = build_model(self.problem, comm)
         surface = self.model.midsurface
         several = (
-            surface is not None and surface.read
+            surface is not None and surface.from_mesh_file
         )  # a file may have pieces, of which each must be held
         unsure = self.model.axisymmetric or several or not self.problem.fixed
         self.loose = unsure and self.problem.at_rest
@@ -193,10 +193,12 @@ class Scene:
         faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
         stiff = self.model.contacts or faces
         options = (
-            NewtonOptions(fresh=0.0, patience=7, stiffnesses=faces, corners=True) if stiff else None
+            NewtonOptions(
+                reuse_distance=0.0, patience=7, stiffnesses=faces, allows_kinks=True
+            ) if stiff else None
         )
         self.newton = BorderedNewton(self.model.system, options)
-        self.journal: Journal = NoJournal()
+        self.journal: SolverJournal = NoJournal()
         self.progress: Progress = NoProgress()
         self.meshed: Callable[[Problem], Problem] = lambda problem: problem
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
@@ -240,12 +242,12 @@ class Scene:
         return int(topology.index_map(topology.dim).size_global)
 
     @cached_property
-    def watch(self) -> Watch:
+    def watch(self) -> StabilityMonitor:
         """The watch over the modes that the model excludes.
 
         Its first use compiles their kernels.
         """
-        return Watch(self.model.excluded_modes)
+        return StabilityMonitor(self.model.excluded_modes)
 
     @cached_property
     def unshown(self) -> list[str]:
@@ -296,20 +298,20 @@ class Scene:
         self.refuse_foreign(state, more=True)
         model, surface = self.model, self.model.midsurface
         displacement = fem.Function(model.u.function_space, name="u")
-        displacement.x.array[:] = model.system.at(state).of(lambda: model.u.x.array.copy())
-        given = self.problem.given
-        if not (surface and given and given.home):
+        displacement.x.array[:] = model.system.at_state(state).evaluate(lambda: model.u.x.array.copy())
+        given = self.problem.mesh_file
+        if not (surface and given and given.user_mesh):
             return displacement
-        if self.problem.half:
+        if self.problem.is_half:
             raise ValueError(
                 "u: symmetry: half: half of the mesh is not modelled: take symmetry: none"
             )
-        if MPI.Comm.Compare(self.comm, given.home.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+        if MPI.Comm.Compare(self.comm, given.user_mesh.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
-                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {given.home.comm.size}: "
+                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {given.user_mesh.comm.size}: "
                 "make the scene with those of the mesh, ms.Scene(problem)"
             )
-        return given.home.displacement(displacement, surface.given, given.scale)
+        return given.user_mesh.displacement(displacement, surface.source_triangles, given.scale)
 
     def refuse_foreign(self, state: State, *, more: bool = False) -> None:
         """Refuse a state of another scene, as far as it shows.
@@ -374,7 +376,7 @@ class Scene:
             **{
                 column: (state.mu[term.name] if term.density else 1.0)
                 * model.multiplicity
-                * model.system.at(state).integral(model.observed[column])
+                * model.system.at_state(state).integral(model.observed[column])
                 for term in self.problem.loads.own
                 for column in term.observed
             },

@@ -16,9 +16,14 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.search import Limits, Rules, Settling, further
+from magshell_fenicsx.continuation.search import (
+    AcceptanceRules,
+    SearchLimits,
+    Settling,
+    further_solutions,
+)
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.course import SearchSection
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -50,7 +55,7 @@ def dented(scene: Scene, state: State) -> Iterator[State]:
     for depth in DEPTHS:
         dents = [part.dent(depth, scene.problem.material.h) for part in curved]
         for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
-            yield State(state.u + system.held(dent.ravel()), dict(state.mu))
+            yield State(state.u + system.zero_at_supports(dent.ravel()), dict(state.mu))
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,7 @@ def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
     """
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
-        x = mirror.everywhere(x)
+        x = mirror.with_images(x)
     count = max(comm.allreduce(len(x)), 1)
     mean = comm.allreduce(x.sum(axis=0)) / count
     return mean, comm.allreduce((x - mean).T @ (x - mean)) / count
@@ -181,7 +186,7 @@ def solutions(
         if isinstance(start, Record) and start.amplitude in state.mu
         else next(iter(state.mu))
     )
-    rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
+    rest = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
@@ -198,17 +203,17 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
 
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     made = [partial(dents.settled, number) for number in range(dents.count)]
-    limits = Limits(search.solutions, search.guesses, over)
+    limits = SearchLimits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
     descend = dents.descended if search.stable else None
-    found = further(path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage))
+    found = further_solutions(path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage))
     for number, solution in enumerate(found, 1):
         point = stage.point(solution)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
 
 
-def _rules(stage: Stage) -> Rules:
+def _rules(stage: Stage) -> AcceptanceRules:
     """What solutions have to keep: penalties and cuts of their own, within the bound, and no shell
     through another.
     """
@@ -218,7 +223,7 @@ def _rules(stage: Stage) -> Rules:
         changed = of_its_own(scene, stage.leave(state))
         return State(state.u, {**state.mu, **changed.mu}) if changed else None
 
-    return Rules(partial(passes, stage), own) if scene.model.touchings else Rules()
+    return AcceptanceRules(partial(passes, stage), own) if scene.model.touchings else AcceptanceRules()
 
 
 class _Dents:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold, sensitivity
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.patch import Deviated, Deviation
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation
 from magshell_fenicsx.models.shell.patterns import Pattern, WithinRims
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
@@ -38,7 +38,7 @@ from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.outline import ground_of
+from magshell_fenicsx.shape.outline import reference_shell_of
 from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.simulate.numbers import number_of, scene_with, size_of
 from magshell_fenicsx.simulate.record import Record
@@ -70,7 +70,7 @@ def fold_at(scene: Scene, record: Record) -> Fold:
         raise ValueError(f"this record is no fold, but a {record.label}")
     scene.refuse_foreign(record.point.state)
     stage = stage_at(scene, record)
-    return find_fold(stage.newton, Guess(stage.enter(record.point.state)), record.amplitude)
+    return find_fold(stage.newton, FoldGuess(stage.enter(record.point.state)), record.amplitude)
 
 
 def stage_at(scene: Scene, record: Record) -> Stage:
@@ -125,7 +125,7 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     if problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
     none = dict.fromkeys(("magnetic.remanent.flux_density", "magnetic.applied.flux_density"))
-    with_field = problem.again({"magnetic.lambda_m": SOME_FIELD, **none})
+    with_field = problem.with_values({"magnetic.lambda_m": SOME_FIELD, **none})
     whole = not problem.axisymmetric and problem.mirror is None
     alike = (with_field.axisymmetric, with_field.mirror) == (problem.axisymmetric, problem.mirror)
     assert with_field.loads.magnetic
@@ -206,7 +206,7 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
             assert term.amplitude
             term.add_residual(column.x.array, state.mu.get(term.amplitude, 1.0))
 
-    system.at(state).of(add)
+    system.at_state(state).evaluate(add)
     column.x.scatter_reverse(InsertMode.add)
     for held in system.clamped:
         held.set(column.x.array)
@@ -291,11 +291,11 @@ def _in_other(stage: Stage, fold: Fold, other: Scene) -> float:
     assert same_mesh(scene, other)
     u, left = (
         np.concatenate([transfer(scene, other, v[:size]), v[size:]])
-        for v in (fold.state.u, fold.left)
+        for v in (fold.state.u, fold.left_null_vector)
     )
     expand(scene, other, stage.leave(fold.state))
     moved, system = (
-        replace(fold, state=State(u, fold.state.mu), left=left),
+        replace(fold, state=State(u, fold.state.mu), left_null_vector=left),
         stage.on(other).newton.system,
     )
     return sensitivity(system, moved, system.residual(u, fold.state.mu))
@@ -306,23 +306,23 @@ def expand(scene: Scene, other: Scene, state: State) -> None:
     of the first one.
     """
     touch_as_in(scene, other, state)
-    at = scene.model.system.at(state)
+    at = scene.model.system.at_state(state)
     for name, (pressing, _) in scene.model.contacts.items():
-        other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
+        other.model.contacts[name][0].expand_about(at.evaluate(partial(getattr, pressing, "gap")))
 
 
 def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
     """Take contact between shells in another scene on the same mesh as polynomials about a state of
     the first one.
     """
-    at = scene.model.system.at(state)
+    at = scene.model.system.at_state(state)
     of_one: Sequence[Any] = scene.model.touchings
     of_other: Sequence[Any] = other.model.touchings
     for touching, same in zip(of_one, of_other, strict=True):
         if touching.held:
             same.hold(touching.held)
         else:
-            same.expand_about(at.of(touching.pressed))
+            same.expand_about(at.evaluate(touching.pressed))
 
 
 def to_shells(stage: Stage, fold: Fold) -> dict[str, float]:
@@ -400,7 +400,7 @@ class _Mirrored:
 def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
     """The deviation of one of other imperfections, in the frame of the scene's model."""
     problem, number = scene.problem, list(sections).index(key)
-    flaw = list(flaws(sections, ground_of(problem.context.shell)).values())[
+    flaw = list(flaws(sections, reference_shell_of(problem.context.shell)).values())[
         number
     ]  # that has random dimples one by one
     turned = in_frame(flaw.deviation, problem.azimuth)
@@ -411,13 +411,13 @@ def reshaped(scene: Scene, deviation: Deviation) -> Scene:
     """The scene on the same mesh in the chart, with one more deviation."""
     problem, model = scene.problem, scene.model
 
-    def moved(embedding: object) -> Deviated:
-        assert isinstance(embedding, Deviated)
+    def moved(embedding: object) -> DeviatedEmbedding:
+        assert isinstance(embedding, DeviatedEmbedding)
         return replace(embedding, deviations=(*embedding.deviations, deviation))
 
     embedding = moved(problem.embedding)
     meridian = problem.meridian and replace(
         problem.meridian, embedding=moved(problem.meridian.embedding)
     )
-    shape = model.midsurface.reshaped(embedding) if model.midsurface else problem.shape
+    shape = model.midsurface.with_embedding(embedding) if model.midsurface else problem.shape
     return Scene(replace(problem, embedding=embedding, meridian=meridian, shape=shape), scene.comm)

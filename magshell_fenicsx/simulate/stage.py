@@ -4,7 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from magshell_fenicsx.continuation.device import Along, Curve, Device, Held, natural_scale
+from magshell_fenicsx.continuation.device import (
+    Curve,
+    Device,
+    HeldConjugate,
+    ParametrisedSystem,
+    natural_scale,
+)
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
@@ -31,7 +37,7 @@ class Stage:
     scene: Scene
     newton: BorderedNewton
     device: Device | None = None
-    along: Along | None = None
+    along: ParametrisedSystem | None = None
 
     def enter(self, state: State) -> State:
         """A state of the model as a state of the step's system."""
@@ -42,7 +48,7 @@ class Stage:
         """A state of the step's system as a state of the model."""
         state = self.along.expand(state) if self.along else state
         state = self.device.leave(state) if self.device else state
-        return self.scene.model.system.placed(state)
+        return self.scene.model.system.with_moved_supports(state)
 
     def point(self, point: Point) -> Point:
         """A point of the step's path with the model's displacement and amplitudes."""
@@ -52,9 +58,9 @@ class Stage:
     def on(self, scene: Scene) -> "Stage":
         """The same step on another scene, with the same values of what is held."""
         system: System = scene.model.system
-        device = self.device.on(system) if self.device else None
-        along = self.along.on(device or system) if self.along else None
-        return Stage(scene, scene.newton.on(along or device or system), device, along)
+        device = self.device.for_system(system) if self.device else None
+        along = self.along.for_system(device or system) if self.along else None
+        return Stage(scene, scene.newton.for_system(along or device or system), device, along)
 
     def padded(self, u: Vector) -> Vector:
         """A vector of the model as one of the step's system."""
@@ -64,7 +70,7 @@ class Stage:
         """A vector of the step's system with zeros for the unknown amplitudes and where nodes are
         held.
         """
-        held = self.scene.model.system.held
+        held = self.scene.model.system.zero_at_supports
         return self.device.padded(held(self.device.displacement(x))) if self.device else held(x)
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
@@ -104,7 +110,7 @@ class Stage:
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
         step = abs(first / start.dmu)
-        return path.in_steps(
+        return path.with_step_options(
             StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
         ), start
 
@@ -125,7 +131,7 @@ def plain(scene: Scene) -> Stage:
 def staged(
     scene: Scene,
     state: State,
-    held: Mapping[str, Held] | None = None,
+    held: Mapping[str, HeldConjugate] | None = None,
     curves: tuple[str, Mapping[str, Curve], float] | None = None,
 ) -> Stage:
     """The stage of a step.
@@ -153,5 +159,5 @@ def staged(
         scale = {name: natural_scale(system, factors, state, name) for name in held}
         system = device = Device(system, held, scale)
     if curves:
-        system = along = Along(system, *curves)
-    return Stage(scene, scene.newton.on(system) if held or curves else scene.newton, device, along)
+        system = along = ParametrisedSystem(system, *curves)
+    return Stage(scene, scene.newton.for_system(system) if held or curves else scene.newton, device, along)

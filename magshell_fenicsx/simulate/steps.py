@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
+from magshell_fenicsx.continuation.continuation_run import MAX_STEPS, ContinuationGoal
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
 from magshell_fenicsx.parts.bodies.press import finer as along_contact
 from magshell_fenicsx.parts.course import Drive, Gas, GasSection, Here
 from magshell_fenicsx.parts.pressure.pressure import Enclosed
@@ -57,16 +57,16 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     )
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
-        path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
+        path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     for finer in (course.finer, along_contact if scene.model.touchings else None):
-        path = path.in_steps(finer(path.options)) if finer else path
+        path = path.with_step_options(finer(path.options)) if finer else path
     if (
         drive.end is not None and not drive.targets and (course.until == "target" or load.bound)
     ):  # it is there
         yield Record("target", step.name, stage.point(start))
         return state
-    goal = Goal(
-        course.until, drive.targets, drive.quantity, course.steps or MOST_STEPS, drive.first
+    goal = ContinuationGoal(
+        course.until, drive.targets, drive.quantity, course.steps or MAX_STEPS, drive.first
     )
     walked = Walked(followed(stage, path, start, goal, load.branch_points))
     wrong, first = "", None
@@ -103,9 +103,9 @@ def followed_on(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Recor
     )
     end = drive.end
     goal = (
-        Goal("points", steps=step.load.points)
+        ContinuationGoal("points", steps=step.load.points)
         if end is None
-        else Goal("target", [end], drive.quantity)
+        else ContinuationGoal("target", [end], drive.quantity)
     )
     return (yield from leaving(stage, bifurcation, goal, abs(drive.scale), 0))
 
@@ -147,7 +147,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
     driven = f"conjugate of {name}"
     stage = staged(scene, state, {**others, name: driven})
     path, start = stage.begin(driven, "arc", State(state.u, state.mu | {driven: q}), drive.first)
-    walked = Walked(followed(stage, path.in_steps(steps), start, Goal("limit", sense=drive.first)))
+    walked = Walked(followed(stage, path.with_step_options(steps), start, ContinuationGoal("limit", sense=drive.first)))
     for record in walked:
         yield replace(record, amplitude=name)
     return walked.end

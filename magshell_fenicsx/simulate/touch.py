@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
@@ -78,7 +78,7 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     reason = ""
     for deep in TRIED:
         a = state.mu[name] + deep
-        outcome = scene.newton.solve(state.with_(state.u, name, a), name, GivenLoad(name, a))
+        outcome = scene.newton.solve(state.with_(state.u, name, a), name, PrescribedLoad(name, a))
         if outcome.converged:
             return outcome.state
         reason = outcome.reason
@@ -118,10 +118,10 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
     """Let numbers of cuts stand for those at a point of a step, as they did in an interrupted run;
     collective."""
-    at = stage.scene.model.system.at(stage.leave(high.state)) if numbers else None
+    at = stage.scene.model.system.at_state(stage.leave(high.state)) if numbers else None
     for each in _with_cuts(stage.scene):
         if at and each.pair.cuts in numbers:
-            at.of(partial(each.recall, numbers[each.pair.cuts]))
+            at.evaluate(partial(each.recall, numbers[each.pair.cuts]))
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
@@ -133,8 +133,8 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     one.
     """
     scene, state = stage.scene, stage.leave(high.state)
-    at = scene.model.system.at(state)
-    numbers = {each.pair.cuts: at.of(each.finer) for each in _with_cuts(scene)}
+    at = scene.model.system.at_state(state)
+    numbers = {each.pair.cuts: at.evaluate(each.finer) for each in _with_cuts(scene)}
     closer = {name: number for name, number in numbers.items() if number is not None}
     certain = not closer or all(_is_certain(stage, point, closer) for point in (high, low))
     return {} if certain else closer
@@ -159,8 +159,8 @@ def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
 
 def better_cuts(scene: Scene, state: State) -> dict[str, float]:
     """The numbers of cuts at a state that are much better than those it has; collective."""
-    at = scene.model.system.at(state)
-    numbers = {each.pair.cuts: at.of(each.recut) for each in _with_cuts(scene)}
+    at = scene.model.system.at_state(state)
+    numbers = {each.pair.cuts: at.evaluate(each.recut) for each in _with_cuts(scene)}
     return {name: number for name, number in numbers.items() if number is not None}
 
 
@@ -168,10 +168,10 @@ def with_cuts_here(scene: Scene, state: State) -> State:
     """A state, as one that another model gives, with the cuts of shells at its own displacement;
     collective.
     """
-    at = scene.model.system.at(state)
+    at = scene.model.system.at_state(state)
     return State(
         state.u,
-        {**state.mu, **{each.pair.cuts: at.of(each.numbered) for each in _with_cuts(scene)}},
+        {**state.mu, **{each.pair.cuts: at.evaluate(each.numbered) for each in _with_cuts(scene)}},
     )
 
 
@@ -194,8 +194,8 @@ def between(scene: Scene, state: State) -> list[tuple[Pair, float]]:
     """The pairs of shells that may touch, with their penetrations over the thickness there;
     collective.
     """
-    at = scene.model.system.at(state)
-    return [(each.pair, at.of(each.depth)) for each in scene.model.touchings]
+    at = scene.model.system.at_state(state)
+    return [(each.pair, at.evaluate(each.depth)) for each in scene.model.touchings]
 
 
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
@@ -221,13 +221,13 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     whole = [of_all_nodes(stage.scene, state) for state in (stage.leave(low.state), end)]
     x0 = model.r0.x.array[: model.system.size].reshape(-1, 3)
     x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
-    at, touchings = model.system.at(end), [t for t in model.touchings if isinstance(t, Touching)]
+    at, touchings = model.system.at_state(end), [t for t in model.touchings if isinstance(t, Touching)]
     own = slice(*model.V.dofmap.index_map.local_range)
-    undeformed, half = (each[own] for each in at.of(touchings[0].halves))
+    undeformed, half = (each[own] for each in at.evaluate(touchings[0].halves))
     half = np.minimum(half, undeformed)
-    seen_through = [*model.mirror.sides.values()] if model.multiplicity > 1 else []
+    seen_through = [*model.mirror.planes.values()] if model.multiplicity > 1 else []
     for plane in (each for each in model.planes if each not in seen_through):
-        before, after = plane.beyond(x0), plane.beyond(x)
+        before, after = plane.signed_distance(x0), plane.signed_distance(x)
         side = np.sign(comm.allreduce(float(before.sum())))
         if comm.allreduce(int(np.sum((side * before > 2 * undeformed) & (side * after < half)))):
             raise PathStopped(
@@ -274,7 +274,7 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
     for field in model.fields:
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
-            ends.append((model.system.at(state).of(partial(getattr, field, "places")), state.mu))
+            ends.append((model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu))
         if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
 
@@ -434,9 +434,9 @@ def pressed_as_at(scene: Scene, state: State | None) -> Iterator[None]:
     if state is None:
         yield
         return
-    at = scene.model.system.at(state)
+    at = scene.model.system.at_state(state)
     for each in scene.model.touchings:
-        each.hold(at.of(each.pressed))
+        each.hold(at.evaluate(each.pressed))
     try:
         yield
     finally:
@@ -454,7 +454,7 @@ def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
     }
     name = bodies[0].amplitude
     outcome = scene.newton.solve(
-        State(state.u, {**state.mu, **k}), name, GivenLoad(name, state.mu[name])
+        State(state.u, {**state.mu, **k}), name, PrescribedLoad(name, state.mu[name])
     )
     if (
         not outcome.converged

@@ -12,11 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.path import SEEN, Control, Quantity
+from magshell_fenicsx.continuation.continuation_run import MAX_STEPS, ContinuationGoal, Until
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.path import ZERO_DISPLACEMENT, Control, Quantity
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
-from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Until
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -85,7 +85,7 @@ def trace(
     targets: Sequence[Amount] | Amount = (),
     quantity: Quantity = "load",
     first: Amount | None = None,
-    steps: int = MOST_STEPS,
+    steps: int = MAX_STEPS,
 ) -> Iterator[Record]:
     """Follow the equilibria of a scene while one amplitude varies and the others are constant.
 
@@ -106,7 +106,7 @@ def trace(
         (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes
         folds of both.
     until
-        The end of the path, see `Goal`: "limit" at the first instability or the last target,
+        The end of the path, see `ContinuationGoal`: "limit" at the first instability or the last target,
         "bifurcation", "target" at the last target, "points" after `steps` steps.
     targets
         Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers,
@@ -147,14 +147,14 @@ def trace(
         raise ValueError(
             f"trace: {name}: give first, the change of the amplitude in the first step, not zero"
         )
-    rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
+    rest = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     if control == "conjugate":
-        moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), exact=True).du
+        moved = scene.newton.response(rest.state, name, PrescribedLoad(name, 0.0), exact=True).du
         if (
             max_abs(scene.newton.system.comm, moved) * abs(first)
-            < SEEN * scene.newton.system.length
+            < ZERO_DISPLACEMENT * scene.newton.system.length
         ):
             raise Stopped(
                 f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length"
@@ -162,10 +162,10 @@ def trace(
     path, first_point = plain(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
-        path = path.in_steps(StepOptions(step, 2 * step, 1e-5 * step))
+        path = path.with_step_options(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * first_point.dmu))
     records_of_path = followed(
-        plain(scene), path, first_point, Goal(until, targets, quantity, steps, sense)
+        plain(scene), path, first_point, ContinuationGoal(until, targets, quantity, steps, sense)
     )
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _marked(

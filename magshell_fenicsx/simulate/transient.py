@@ -12,11 +12,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.moving import in_space
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.prescribed_motion import vectors_in_space
 from magshell_fenicsx.continuation.advance import TimeSteps
-from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.device import Held
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
@@ -29,7 +29,7 @@ from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, mar
 from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection, level_in
 from magshell_fenicsx.parts.touching.in_steps import InSteps, looks_of_step
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.turning import vectors_of
+from magshell_fenicsx.shape.meridian_chart import vector_function
 from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.viscous import Branch, Viscosity
@@ -74,10 +74,10 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     """
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     axes = model.axes
-    places = in_space(model.r0.x.array, len(axes))
-    velocity = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
+    places = vectors_in_space(model.r0.x.array, len(axes))
+    velocity = vector_function(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
     return np.asarray(
-        model.system.held(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size])
+        model.system.zero_at_supports(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size])
     )
 
 
@@ -206,7 +206,7 @@ class Pressings:
         self.settings = frozenset(contact.pair.setting for contact in between)
         self._begin: tuple[Vector, _Ends] | None = None
 
-    def harder(self, begin: State, v: Vector) -> dict[str, float]:
+    def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
         """Settings of pairs of shells that do not touch, and may meet too fast for their penalty."""
         if not self._between:
             return {}
@@ -218,14 +218,14 @@ class Pressings:
         wanted = {
             each.pair: stiff_for(each.pair, speed, self._system.length) for each in self._between
         }
-        at, found = self._system.at(begin), dict[str, float]()
+        at, found = self._system.at_state(begin), dict[str, float]()
         for each in self._between:
             k = begin.mu.get(each.pair.setting, each.pair.stiffness)
-            if wanted[each.pair] > k and not each.pair.given and at.of(each.penetration) <= 0:
+            if wanted[each.pair] > k and not each.pair.given and at.evaluate(each.penetration) <= 0:
                 found[each.pair.setting] = wanted[each.pair]
         return found
 
-    def along(self, begin: State, end: State, part: float) -> None:
+    def average_along(self, begin: State, end: State, part: float) -> None:
         """Take the forces of a step at a part of it."""
         before, after = self._at_begin(begin), self._places(end)
         for pressing, low, high in zip(
@@ -236,14 +236,14 @@ class Pressings:
             contact.looks = ()
             contact.looks = looks_of_step(contact, u, v, part)
 
-    def present(self) -> None:
+    def use_state_forces(self) -> None:
         """Take the present forces again."""
         for pressing in self._pressings:
             pressing.present()
         for contact in self._between:
             contact.looks = ()
 
-    def passes(self, begin: State, end: State) -> str:
+    def penetration_message(self, begin: State, end: State) -> str:
         """Which shells pass through each other in a step."""
         ends = zip(
             self._between, self._at_begin(begin).of_shells, self._places(end).of_shells, strict=True
@@ -253,10 +253,10 @@ class Pressings:
         ]
         return f"{through[0]} pass through each other" if through else ""
 
-    def stored(self, u: Vector, mu: Amplitudes) -> float:
+    def stored_energy(self, u: Vector, mu: Amplitudes) -> float:
         """The energy of the shell itself with that of the contacts."""
-        self.present()
-        return self._system.stored(u, mu)
+        self.use_state_forces()
+        return self._system.stored_energy(u, mu)
 
     def _at_begin(self, begin: State) -> _Ends:
         if self._begin is None or self._begin[0] is not begin.u:
@@ -264,7 +264,7 @@ class Pressings:
         return self._begin[1]
 
     def _places(self, state: State) -> _Ends:
-        return self._system.at(state).of(
+        return self._system.at_state(state).evaluate(
             lambda: _Ends(
                 [each.where for each in self._pressings], [each.where for each in self._between]
             )
@@ -279,7 +279,7 @@ class Moving(State):
     ground: Vector | None = None
 
 
-def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Held]) -> Records:
+def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]) -> Records:
     """The records of a step in time; its return value is the state at its end.
 
     Parameters
@@ -333,11 +333,11 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         return integrator, integrator.begin(0.0, u, v)
 
     integrator, now = begin()
-    ground, duration = integrator.ground, time_of(problem, load.duration)
+    ground, duration = integrator.supports, time_of(problem, load.duration)
     fixed = None if load.step is None else time_of(problem, load.step)
     steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
-    total = most + system.stored(now.u, now.mu)
+    total = most + system.stored_energy(now.u, now.mu)
     outputs = [duration * i / load.points for i in range(1, load.points + 1)]
     watched, ended, size = _watched(scene, load.event, state), "", scene.model.multiplicity
 
@@ -372,7 +372,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             "dissipated": size * now.dissipated,
             "work": size * now.work,
             "imbalance": size
-            * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
+            * (kinetic + system.stored_energy(now.u, now.mu) + now.dissipated - now.work - total),
         }
         excluded = None if scene.free_in_time else scene.model.excluded_modes
         unseen = sum(excluded.counts(point.state)) if excluded else 0
@@ -392,7 +392,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
                 if n not in pull
             }
             work = now.work - sum(now.mu[name] * change for name, change in moved.items())
-            lacks = system.stored(rest.u, rest.mu) + now.dissipated - work - total
+            lacks = system.stored_energy(rest.u, rest.mu) + now.dissipated - work - total
             still = {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * lacks}
             yield Record(
                 "target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still
@@ -425,7 +425,7 @@ def _watched(
 
     def beyond(now: Motion) -> float:
         return (
-            scene.observe(scene.model.system.placed(State(now.u, now.mu)))[event.column]
+            scene.observe(scene.model.system.with_moved_supports(State(now.u, now.mu)))[event.column]
             - event.value
         )
 
@@ -446,7 +446,7 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), branches)
 
 
-def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:
+def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]) -> Records:
     """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state
     at its end.
 
@@ -473,18 +473,18 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
         errors=snap.errors,
         until="rest",
     )
-    away = scene.model.system.held(fold.point.du)
+    away = scene.model.system.zero_at_supports(fold.point.du)
     size = snap.push * system.length / max_abs(system.comm, away)
     return (yield from motion(scene, load, State(state.u + size * away, state.mu), held))
 
 
-def _rest(scene: Scene, held: Mapping[str, Held], state: State) -> State | None:
+def _rest(scene: Scene, held: Mapping[str, HeldConjugate], state: State) -> State | None:
     """The equilibrium near a state; None if there is none near, or an unstable one."""
     stage = staged(scene, state, held)
     start = stage.enter(state)
     start, raised = start.with_(start.u, IDLE, 0.0), dict[str, float]()
     while True:
-        outcome = stage.newton.solve(start, IDLE, GivenLoad(IDLE, 0.0))
+        outcome = stage.newton.solve(start, IDLE, PrescribedLoad(IDLE, 0.0))
         moved = (
             max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
         )

@@ -14,7 +14,7 @@ from math import isclose
 
 import numpy as np
 
-from magshell_fenicsx.continuation.augmented import Kind, Locus, NoSystem
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, Kind, NoSystem
 from magshell_fenicsx.continuation.boundary import BoundaryLost
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import times_tangent
@@ -232,13 +232,13 @@ class Varied:
         """Whether there are waves around a meridian, which its model excludes."""
         return self._base.scene.model.axisymmetric
 
-    def kind_of(self, m: int, at: Locus | None = None) -> Kind:
+    def kind_of(self, m: int, at: BoundaryPoint | None = None) -> Kind:
         """What a boundary of m waves is, or of the model's own mode (m = 0) near a point."""
         if m:
             return "bifurcation"
         if at is None:
             return self.kind
-        system, phi = self.at(at.p).system, self.mode_at(at, 0, self.m)
+        system, phi = self.solver_at(at.p).system, self.mode_at(at, 0, self.m)
         load = system.load(at.state.u, at.state.mu, self.name)
         return (
             "fold"
@@ -246,7 +246,7 @@ class Varied:
             else "bifurcation"
         )
 
-    def mode_at(self, crossing: Locus, m: int, before: int) -> Vector:
+    def mode_at(self, crossing: BoundaryPoint, m: int, before: int) -> Vector:
         """The mode of m waves (0: of the model itself) that is neutral, beside that of the boundary
         `before`.
 
@@ -257,7 +257,7 @@ class Varied:
         """
         if not m:
             try:
-                return critical_mode(self.at(crossing.p), crossing.state).vector
+                return critical_mode(self.solver_at(crossing.p), crossing.state).vector
             except NoEigenpair as e:
                 raise BoundaryLost(
                     f"the mode that becomes critical has no null vector: {e}"
@@ -268,7 +268,7 @@ class Varied:
 
     def null_vector(self, p: float, state: State, m: int, beside: Vector | None = None) -> Vector:
         """That of m waves at a state where these are neutral, nearly; across another one."""
-        factors = self.factored(p, state, m)
+        factors = self.factored_tangent(p, state, m)
         v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
         for _ in range(SOLVES):
             v = factors.solve(v)
@@ -276,17 +276,17 @@ class Varied:
             v /= np.linalg.norm(v)
         return v
 
-    def factored(self, p: float, state: State, m: int) -> Factorisation:
-        """See `continuation.excluded`."""
+    def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
+        """See `continuation.symmetry_breaking`."""
         stage = self._at(p)
         return _waves(stage).factor_at(stage.leave(state), m)
 
-    def along(self, p: float, state: State, m: int, v: Vector) -> float:
-        """See `continuation.excluded`."""
+    def quadratic_form(self, p: float, state: State, m: int, v: Vector) -> float:
+        """See `continuation.symmetry_breaking`."""
         return float(v @ self._times(self._at(p), state, m, v))
 
     def counts(self, p: float, state: State) -> list[int]:
-        """See `continuation.excluded`."""
+        """See `continuation.symmetry_breaking`."""
         stage = self._at(p)
         return _waves(stage).counts(stage.leave(state))
 
@@ -298,7 +298,7 @@ class Varied:
         K.mult(x, y)
         return np.array(y.array_r)
 
-    def at(self, p: float) -> BorderedNewton:
+    def solver_at(self, p: float) -> BorderedNewton:
         """The solver at a value."""
         return self._at(p).newton
 
@@ -314,14 +314,14 @@ class Varied:
         """Whether each value has a scene of its own."""
         return not self.alone
 
-    def beside(self, p: float, *, rough: bool = False) -> list[tuple[float, float]]:
+    def difference_weights(self, p: float, *, low_order: bool = False) -> list[tuple[float, float]]:
         """Weights and values of a difference of second order, on the side where values are allowed;
-        a rough one of first order, with one scene beside that of p itself.
+        one of low order is of first order, with one scene beside that of p itself.
         """
         d = STEP * abs(self._ends[1] - self._ends[0])
         if self._line:
             return [(0.5 / d, p + d), (-0.5 / d, p - d)]
-        if rough:
+        if low_order:
             try:
                 self.problem(p + d)
             except NoSystem:
@@ -510,7 +510,7 @@ def moved(scene: Scene, new: Problem) -> Problem:
             made, meridian=replace(made.meridian, vertices=np.interp(vertices, knots, places))
         )
     if scene.model.midsurface and not alike(old.shape, new.shape):
-        patch = scene.model.midsurface.reshaped(new.embedding)
+        patch = scene.model.midsurface.with_embedding(new.embedding)
         one, two = box_of(old.shape), box_of(new.shape)
         if one is None or two is None or patch.nodes.shape[1] != 2:
             raise NoSystem("the mesh of this shape cannot move with the number")

@@ -7,18 +7,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from magshell_fenicsx.continuation.bifurcation import Branching, branching
+from magshell_fenicsx.continuation.bifurcation import BranchSwitch, switch_branch
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import (
-    Finding,
     PathStopped,
     Point,
+    RecordedValues,
     StepOptions,
     StepTooLong,
 )
+from magshell_fenicsx.continuation.stability_monitor import Crossing
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Walk
-from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -55,7 +55,7 @@ class Walked:
         self.end = yield from self._records
 
 
-def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int = 0) -> Records:
+def followed(stage: Stage, path: Path, start: Point, goal: ContinuationGoal, branches: int = 0) -> Records:
     """The records of a walk, with instabilities that the reduced model excludes, and of branches.
 
     Each direction of the branch at the first bifurcation is followed for that number of steps, or
@@ -80,16 +80,16 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int =
     return advance(stage.leave(records.end), past)
 
 
-def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
+def _walk(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) -> ContinuationRun:
     """A walk on which bodies become stiffer, and shells are cut anew and get closer points where
     these move an instability; magnets on the way and returning bodies end it."""
     checks = _Checks(stage, path, goal.until != "points")
-    checks.walk = walk = Walk(path, start, goal, checks)
+    checks.walk = walk = ContinuationRun(path, start, goal, checks)
     return walk
 
 
 class _Checks:
-    """What is seen to between each two successive points of a walk, as `renew` of a `Walk`.
+    """What is seen to between each two successive points of a walk, as `renew` of a `ContinuationRun`.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class _Checks:
         The one that they are of.
     """
 
-    walk: Walk
+    walk: ContinuationRun
 
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
@@ -111,7 +111,7 @@ class _Checks:
         self._begin = np.nan, 0
 
     def __call__(self, low: Point, high: Point) -> State | None:
-        """See `Walk`.
+        """See `ContinuationRun`.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class _Checks:
         """
         if low.s != self._begin[0]:
             self._begin = low.s, low.negative_pivots
-        found = self._path.noted(partial(self._finding, low, high)).values
+        found = self._path.recorded_values(partial(self._finding, low, high)).values
         if "too_long" in found:
             raise StepTooLong(found["too_long"])
         if "stopped" in found:
@@ -133,7 +133,7 @@ class _Checks:
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
-    def _finding(self, low: Point, high: Point) -> Finding:
+    def _finding(self, low: Point, high: Point) -> RecordedValues:
         """Find out why the second of two points is refused, or which amplitudes change before it is
         solved again."""
         stage = self._stage
@@ -143,19 +143,19 @@ class _Checks:
             if self._returns:
                 refuse_return(stage, self._path.name, self.walk.points, high)
         except StepTooLong as e:
-            return Finding({"too_long": str(e)})
+            return RecordedValues({"too_long": str(e)})
         except PathStopped as e:
-            return Finding({"stopped": str(e), "at_high": e.point is high, "final": e.final})
+            return RecordedValues({"stopped": str(e), "at_high": e.point is high, "final": e.final})
         state = stage.leave(high.state)
         raised = stiffnesses(stage.scene, state)
         anew = not raised and low.s != self._cut_at  # slid points are better than none
         cuts = better_cuts(stage.scene, state) if anew else {}
-        turned = high.turned_from(low) or low.negative_pivots != self._begin[1]
+        turned = high.has_instability_since(low) or low.negative_pivots != self._begin[1]
         closer = closer_points(stage, low, high) if turned and not (raised or cuts) else {}
-        return Finding({"stiffer": raised, "cuts": cuts or closer})
+        return RecordedValues({"stiffer": raised, "cuts": cuts or closer})
 
 
-def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
+def _followed(stage: Stage, walk: ContinuationRun, branches: int) -> Records:
     """The same with the points of the stage's system; the state at the end of the last walk."""
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
@@ -168,14 +168,14 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     for applied in stage.scene.model.fields:
         applied.lost = ""
     watch.begin(path, start, stage.leave)
-    onward: Walk | None = walk
+    onward: ContinuationRun | None = walk
     while onward:
         walk, path, onward = onward, onward.path, None
         try:
             for label, point in walk:
                 mode, located = "", label in ("fold", "bifurcation")
                 beyond = walk.done or abs(point.state.mu[path.name]) > furthest
-                excluded = list(_excluded(path, watch.pass_to(point, look=located or beyond)))
+                excluded = list(_excluded(path, watch.pass_to(point, evaluate=located or beyond)))
                 if excluded and goal.until == "bifurcation":
                     yield excluded[0]
                     break
@@ -183,7 +183,7 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 if excluded and goal.until == "limit":
                     furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
                 if label == "bifurcation":
-                    crossing_at_point = branching(
+                    crossing_at_point = switch_branch(
                         _by_arc(stage, path), point, partial(passes, stage)
                     )
                     crossing = crossing or crossing_at_point
@@ -237,8 +237,8 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
 
 
 def _beyond(
-    stage: Stage, walk: Walk, finest: float, *, final: bool
-) -> tuple[list[Record], Walk | None]:
+    stage: Stage, walk: ContinuationRun, finest: float, *, final: bool
+) -> tuple[list[Record], ContinuationRun | None]:
     """What ends a walk that has stopped, a fold with the excluded instabilities before it; or the
     walk that goes on.
 
@@ -262,10 +262,10 @@ def _beyond(
 
 def _asking(path: Path, first: float, finest: float) -> Path:
     """The path in steps that end early, to look for a fold."""
-    return path.in_steps(replace(path.options, first=first, smallest=max(finest, ASKED * first)))
+    return path.with_step_options(replace(path.options, first=first, smallest=max(finest, ASKED * first)))
 
 
-def _onward(stage: Stage, walk: Walk) -> Walk | None:
+def _onward(stage: Stage, walk: ContinuationRun) -> ContinuationRun | None:
     """A walk by arc length from where another one stopped; None if it must not or cannot be.
 
     An instability is where it is however the path is controlled: only a target belongs to its
@@ -288,7 +288,7 @@ def _onward(stage: Stage, walk: Walk) -> Walk | None:
 
 
 def _branches(
-    stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int
+    stage: Stage, path: Path, crossing: BranchSwitch, goal: ContinuationGoal, steps: int
 ) -> Iterator[Record]:
     """Follow both directions of a branch, to the target of the path or for a number of steps."""
     lost = []
@@ -301,12 +301,12 @@ def _branches(
         raise Stopped("; ".join(lost))
 
 
-def off_path(goal: Goal, steps: int) -> Goal:
+def off_path(goal: ContinuationGoal, steps: int) -> ContinuationGoal:
     """Where a branch ends: at the target of the path, or after a number of steps."""
-    return goal if goal.until == "target" else Goal("points", steps=steps)
+    return goal if goal.until == "target" else ContinuationGoal("points", steps=steps)
 
 
-def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> Records:
+def branch(stage: Stage, path: Path, start: Point, goal: ContinuationGoal, number: int) -> Records:
     """The records of a branch, by arc length, with its `number`; the state at the end of the step's
     system.
 
@@ -319,16 +319,16 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
         for _ in range(MOST_CHANGED):
             if not (own := of_its_own(stage.scene, stage.leave(start.state))):
                 break
-            start = path.renewed(start, State(start.state.u, {**start.state.mu, **own.mu}))
+            start = path.recorrected(start, State(start.state.u, {**start.state.mu, **own.mu}))
     except PathStopped as e:
         raise Stopped(f"no first point of the branch with contact of its own: {e}") from None
     walk, watch, lost = _walk(stage, path, start, goal), stage.scene.watch, ""
-    watch.begin(path, start, stage.leave, look=True)
+    watch.begin(path, start, stage.leave, evaluate=True)
     yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
     try:
         for label, point in walk:
             for record in _excluded(
-                path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))
+                path, watch.pass_to(point, evaluate=walk.done or label in ("fold", "bifurcation"))
             ):
                 yield replace(record, branch=number)
             said = words_of_cluster(stage.scene, walk, point)
@@ -350,7 +350,7 @@ def _by_arc(stage: Stage, path: Path) -> Path:
     return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
 
 
-def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
+def _fold_ahead(stage: Stage, walk: ContinuationRun, within: float) -> list[Record]:
     """The fold that ended a path under load control, located by arc length, after any excluded
     instabilities.
 
@@ -364,8 +364,8 @@ def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
     stage.scene.watch.begin(by_arc, start, stage.leave)
     passed: list[Record] = []
     try:
-        for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
-            passed += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
+        for label, point in ContinuationRun(by_arc, start, ContinuationGoal("limit", steps=20)):
+            passed += _excluded(by_arc, stage.scene.watch.pass_to(point, evaluate=label == "fold"))
             if abs(point.state.mu[name] - last.s) > within:
                 return []
             if label == "fold":
@@ -390,7 +390,7 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
         )
 
 
-def words_of_cluster(scene: Scene, walk: Walk, point: Point) -> str:
+def words_of_cluster(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     """Return what is said of instabilities that were not parted, at the point that stands for them;
     "" at others."""
     behind = next((high for low, high in walk.clusters if low is point), None)

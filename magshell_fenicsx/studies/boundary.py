@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.augmented import Locus, NoSystem
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, NoSystem
 from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
-from magshell_fenicsx.continuation.critical import critical, first_mode
+from magshell_fenicsx.continuation.critical import critical_boundary, first_mode
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
@@ -29,7 +29,7 @@ from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow_alone
@@ -349,7 +349,7 @@ def _followed(
     rows: list[dict[str, Any]] = []
     begun, end = time.perf_counter(), span.ends[sense > 0]
 
-    def take(label: Label, locus: Locus, mode: Boundary) -> None:
+    def take(label: Label, locus: BoundaryPoint, mode: Boundary) -> None:
         row = _row(varied, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
         part = max(
@@ -360,7 +360,7 @@ def _followed(
         at = f"{row['key']:.9g} {span.unit}".rstrip()
         say(f"{span.key} = {at}: {row['kind']} at {load_said(row, varied.name)}{beside}{left}")
 
-    def curve(m: int, at: Locus | None = None) -> Boundary:
+    def curve(m: int, at: BoundaryPoint | None = None) -> Boundary:
         kind = varied.kind_of(m, at)
         return Boundary(varied, varied.name, kind, scales, own.recorded, m, varied.excludes)
 
@@ -370,7 +370,7 @@ def _followed(
         if begin["is_first"]:
             mode, start = first_mode(curve, varied.mode_at, mode, start)
         rows.append(_row(varied, "start", start, mode, begin["name_of_mode"]))
-        for label, locus, on in critical(
+        for label, locus, on in critical_boundary(
             curve, varied.mode_at, mode, start, sense, span.ends, span.steps
         ):
             take(label, locus, on)
@@ -382,7 +382,7 @@ def _followed(
 
 
 def _row(
-    varied: Varied, label: Label, locus: Locus, mode: Boundary, name_of_mode: str
+    varied: Varied, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
 ) -> dict[str, Any]:
     """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
     whole."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.continuation.augmented import Locus, Way
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, CurveVector
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.studies.runner import keep, kept
@@ -37,7 +37,7 @@ class Journal:
         for file in self._folder.glob(f"{self._name}-*.json"):
             file.unlink(missing_ok=True)
 
-    def recorded(self, solve: Callable[[], Locus | str]) -> Locus | str:
+    def recorded(self, solve: Callable[[], BoundaryPoint | str]) -> BoundaryPoint | str:
         """The result of a solve, or that of an interrupted boundary at this place."""
         name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
         if (saved := self._kept(name)) is not None:
@@ -59,14 +59,14 @@ def vector_of(text: str) -> Vector:
     return np.frombuffer(base64.b64decode(text)).copy()
 
 
-def _as_data(locus: Locus) -> dict[str, Any]:
+def _as_data(locus: BoundaryPoint) -> dict[str, Any]:
     data = {each.name: getattr(locus, each.name) for each in fields(locus)}
     state = {"u": text_of(locus.state.u), "mu": locus.state.mu}
     way = {"du": text_of(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
     return data | {"state": state, "way": way, "phi": text_of(locus.phi)}
 
 
-def _locus(data: dict[str, Any]) -> Locus:
+def _locus(data: dict[str, Any]) -> BoundaryPoint:
     state = State(vector_of(data["state"]["u"]), data["state"]["mu"])
-    way = Way(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
-    return Locus(**{**data, "state": state, "way": way, "phi": vector_of(data["phi"])})
+    way = CurveVector(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
+    return BoundaryPoint(**{**data, "state": state, "way": way, "phi": vector_of(data["phi"])})

@@ -14,7 +14,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, fold_ahead
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, fold_ahead
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole
@@ -284,7 +284,7 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
             result.rows.append(made.row(record, 0.0))
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue
-            guess = Guess(record.point.state, record.point.du) if record.label == "fold" else None
+            guess = FoldGuess(record.point.state, record.point.du) if record.label == "fold" else None
             if record.label == "step" and tries and not record.point.negative_pivots:
                 guess = fold_ahead(scene.newton, record.point, "pressure")
                 tries -= guess is not None

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, predict_fold
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_fold, predict_fold
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.simulate.perfect import with_modes
@@ -96,7 +96,7 @@ class Continuation:
     """
 
     def __init__(self, p: float, scene: Scene, state: State) -> None:
-        fold = find_fold(scene.newton, Guess(state), "pressure")
+        fold = find_fold(scene.newton, FoldGuess(state), "pressure")
         refuse_later(scene, fold, fold.phi)
         self._known, self._scene = [(p, fold)], scene
 
@@ -125,7 +125,7 @@ class Continuation:
         """Whether a scene has the mesh of the last one."""
         alike = (
             type(scene.model) is type(self._scene.model)
-            and scene.problem.half == self._scene.problem.half
+            and scene.problem.is_half == self._scene.problem.is_half
         )
         return alike and same_mesh(self._scene, scene)
 
@@ -156,7 +156,7 @@ class KnownFolds:
         self._known: list[_Known] = []
 
     def polished(
-        self, values: Values, scene: Scene, guess: Guess, expected: Vector | None = None
+        self, values: Values, scene: Scene, guess: FoldGuess, expected: Vector | None = None
     ) -> Fold:
         """The fold near a guess, to 1e-9; it is kept.
 
@@ -195,7 +195,7 @@ class KnownFolds:
                 continue
             u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (near.u, near.phi))
             return self.polished(
-                values, scene, Guess(State(u, held | {"pressure": near.pressure}), phi), phi
+                values, scene, FoldGuess(State(u, held | {"pressure": near.pressure}), phi), phi
             )
         raise FoldLost("no fold is known on this mesh")
 

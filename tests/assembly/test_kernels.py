@@ -10,9 +10,9 @@ from dolfinx import fem
 
 from magshell_fenicsx.assembly import kernels
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Points, point_values
-from magshell_fenicsx.continuation.system import Skewed, State
-from magshell_fenicsx.platform import compat, kept
+from magshell_fenicsx.assembly.point_kernels import PointStorage, point_values
+from magshell_fenicsx.continuation.system import SkewedTangent, State
+from magshell_fenicsx.platform import compat, disk_cache
 from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -43,11 +43,11 @@ RING = CAP | {  # a pressure without potential, and its skew tangent
 def _evaluated(case: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
     scene = Scene(problem_of(case))
     system, start = scene.model.system, scene.unloaded()
-    u = system.held(1e-3 * np.sin(np.arange(system.size)))
+    u = system.zero_at_supports(1e-3 * np.sin(np.arange(system.size)))
     state = State(u, start.mu | {"pressure": 0.3})
     tangent = system.tangent(state.u, state.mu)
     products = list[np.ndarray[Any, Any]]()
-    for part in (tangent.K, tangent.N) if isinstance(tangent, Skewed) else (tangent,):
+    for part in (tangent.K, tangent.N) if isinstance(tangent, SkewedTangent) else (tangent,):
         x, y = part.createVecs()
         x.setArray(u)
         part.mult(x, y)
@@ -95,19 +95,19 @@ def test_progress_where_nobody_listens(
 
 def test_what_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """How many kernels are there, of all that were begun; nothing where all are there."""
-    monkeypatch.setattr(kept, "_usual", lambda: tmp_path)
+    monkeypatch.setattr(disk_cache, "_usual_folder", lambda: tmp_path)
     monkeypatch.setattr(kernels, "SILENT_SECONDS", 0.0)
     told, log = list[str](), KernelLog()
 
     def values() -> list[float]:
-        points = Points(1)
+        points = PointStorage(1)
         z = points.field(1)
         z.x.array[:] = 0.5
         begun = [
             point_values(f"{power}", z[0] ** power * ufl.as_vector([1.0]), log)
             for power in (2, 3, 4)
         ]
-        with kernels.reported(told.append):
+        with kernels.reporting_progress_to(told.append):
             return [float(points.evaluate(each, 1)[0, 0]) for each in begun]
 
     assert values() == [0.25, 0.125, 0.0625]

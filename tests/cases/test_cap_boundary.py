@@ -59,7 +59,7 @@ def test_a_region_narrower_than_the_first_step(
     """One wave comes first between 17.411 and 17.621 degrees alone; with two waves beyond, as runs
     say.
     """
-    monkeypatch.setattr("magshell_fenicsx.continuation.critical.ASIDE", 0.5)
+    monkeypatch.setattr("magshell_fenicsx.continuation.critical.DISTANCE_BEYOND_CROSSING", 0.5)
     found = ms.boundary(
         CASES / "cap_boundary.yaml", "shell.polar=17.3:17.8:1", ["shell.polar=17.3"], out=tmp_path
     )

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from solved import result
 
 from magshell_fenicsx import Case, Result, Scene
-from magshell_fenicsx.continuation.control import GivenConjugate
+from magshell_fenicsx.continuation.control import PrescribedConjugate
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
@@ -91,7 +91,7 @@ def test_excluded_mode_that_cannot_be_located_is_told(monkeypatch: pytest.Monkey
     def lost(path: Path, stable: Point, *others: object) -> Point:
         raise PathStopped("the iteration diverged", stable)
 
-    monkeypatch.setattr("magshell_fenicsx.continuation.watch.locate_bifurcation", lost)
+    monkeypatch.setattr("magshell_fenicsx.continuation.stability_monitor.locate_bifurcation", lost)
     found = run(Case.load(CASES / "dimple_drift.yaml"))
     assert found.rows[-1]["label"] == "target"
     assert found.stopped
@@ -149,12 +149,12 @@ def test_dimple_drift_on_the_shell() -> None:
             np.sort(places), record.point.state.u.reshape(-1, 2)[np.argsort(places)]
         )(np.arctan2(rho, z)).T
         guess = State(
-            shell.model.system.held(np.column_stack([U * c, U * s, W]).ravel()),
+            shell.model.system.zero_at_supports(np.column_stack([U * c, U * s, W]).ravel()),
             record.point.state.mu,
         )
         volume = -shell.model.system.potential(guess.u, {}, "pressure")
         there = shell.newton.solve(
-            guess, "pressure", GivenConjugate(shell.newton.system, "pressure", volume)
+            guess, "pressure", PrescribedConjugate(shell.newton.system, "pressure", volume)
         )
         assert there.converged
         assert there.state.mu["pressure"] == pytest.approx(

@@ -7,13 +7,13 @@ import pytest
 from continuation.toys import Toy, pitchfork, snap_back
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.evaluated import Noise
+from magshell_fenicsx.assembly.evaluation import Noise
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, find_bifurcation
+from magshell_fenicsx.continuation.continuation_run import instabilities
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, Weighted
-from magshell_fenicsx.continuation.walk import instabilities
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, WeightedDisplacement
 
 
 class Noisy(Toy):
@@ -24,7 +24,9 @@ class Noisy(Toy):
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         return self.noise.on_vector(self.gradient(u), 0) + mu["load"] * self.load(u, mu, "load")
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> PETSc.Mat:
         K = super().tangent(u, mu)
         self.noise.on_matrix(K)
         return K
@@ -84,7 +86,7 @@ def path_through(toy: Toy) -> list[tuple[float, float]]:
     path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.3, 0.3, 1e-6))
     low = path.start(at([0.0] * toy.size, 0.0))
     found = []
-    for high, _ in path.towards(low, [1.9]):
+    for high, _ in path.continue_to(low, [1.9]):
         found += [
             (event.point.state.mu["load"], event.point.load_error)
             for event in instabilities(path, low, high)

@@ -9,9 +9,9 @@ from continuation.toys import Toy
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.augmented import Kind, Locus
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, Kind
 from magshell_fenicsx.continuation.boundary import Boundary, Label
-from magshell_fenicsx.continuation.critical import critical, first_mode
+from magshell_fenicsx.continuation.critical import critical_boundary, first_mode
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
@@ -25,15 +25,17 @@ class OfToys:
     costly: bool = False
     made: set[float] = field(default_factory=set)
 
-    def at(self, p: float) -> BorderedNewton:
+    def solver_at(self, p: float) -> BorderedNewton:
         self.made.add(p)
         return BorderedNewton(self.toy(p))
 
     def amplitudes(self, p: float) -> dict[str, float]:
         return {}
 
-    def beside(self, p: float, *, rough: bool = False) -> list[tuple[float, float]]:
-        return [(1e4, p + 1e-4), (-1e4, p)] if rough else [(500.0, p + 1e-3), (-500.0, p - 1e-3)]
+    def difference_weights(self, p: float, *, low_order: bool = False) -> list[tuple[float, float]]:
+        return (
+            [(1e4, p + 1e-4), (-1e4, p)] if low_order else [(500.0, p + 1e-3), (-500.0, p - 1e-3)]
+        )
 
 
 def arch(rise: float) -> Toy:
@@ -69,12 +71,12 @@ def followed(
     phi: list[float],
     ends: tuple[float, float],
     toys: OfToys | None = None,
-) -> list[tuple[Label, Locus]]:
+) -> list[tuple[Label, BoundaryPoint]]:
     boundary = Boundary(toys or OfToys(arch), "load", kind, (10.0, ends[1] - ends[0]))
     start = boundary.start(
         rise, State(np.array([rise - a, 0.0]), {"load": load_of(a, rise)}), np.array(phi)
     )
-    return [("start", start), *boundary.followed(start, -1.0, ends, 20)]
+    return [("start", start), *boundary.follow(start, -1.0, ends, 20)]
 
 
 @pytest.mark.parametrize("costly", [False, True])
@@ -132,19 +134,19 @@ class WithoutModes(OfToys):
     It excludes the second one and another, neutral at thrusts of 4 and 2 e - 1.6.
     """
 
-    def factored(self, p: float, state: State, m: int) -> Factorisation:
+    def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
         matrix = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
-        matrix.setValue(0, 0, self.along(p, state, m, np.ones(1)))
+        matrix.setValue(0, 0, self.quadratic_form(p, state, m, np.ones(1)))
         matrix.assemble()
         factors = Factorisation(MPI.COMM_SELF)
         factors.factor(matrix)
         return factors
 
-    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+    def quadratic_form(self, p: float, state: State, m: int, v: np.ndarray) -> float:
         return float(8 * (neutral(m, p) - p**2 + (p - state.u[0]) ** 2) * v @ v)
 
     def counts(self, p: float, state: State) -> list[int]:
-        return [int(self.along(p, state, m, np.ones(1)) < 0) for m in (1, 2)]
+        return [int(self.quadratic_form(p, state, m, np.ones(1)) < 0) for m in (1, 2)]
 
 
 def neutral(m: int, rise: float) -> float:
@@ -171,7 +173,7 @@ def test_two_families_of_excluded_modes_cross(
     start = boundary.start(
         rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.ones(1)
     )
-    found = [*boundary.followed(start, way, (2.42, 3.3), 20)]
+    found = [*boundary.follow(start, way, (2.42, 3.3), 20)]
     for label, locus in found:
         a = np.sqrt(locus.p**2 - neutral(m, locus.p))
         assert locus.state.mu["load"] == pytest.approx(load_of(a, locus.p), rel=1e-7)
@@ -184,22 +186,22 @@ def test_two_families_of_excluded_modes_cross(
 class WithoutPairs(WithoutModes):
     """The same where both modes are of one family, to which they are unlike."""
 
-    def factored(self, p: float, state: State, m: int) -> Factorisation:
+    def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
         matrix = PETSc.Mat().createAIJ([2, 2], nnz=1, comm=MPI.COMM_SELF)
         for i, v in enumerate(np.eye(2)):
-            matrix.setValue(i, i, self.along(p, state, m, v))
+            matrix.setValue(i, i, self.quadratic_form(p, state, m, v))
         matrix.assemble()
         factors = Factorisation(MPI.COMM_SELF)
         factors.factor(matrix)
         return factors
 
-    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+    def quadratic_form(self, p: float, state: State, m: int, v: np.ndarray) -> float:
         return float(
             sum(super(WithoutPairs, self).along(p, state, i, v[i - 1 : i]) for i in (1, 2))
         )
 
     def counts(self, p: float, state: State) -> list[int]:
-        return [sum(self.along(p, state, 1, v) < 0 for v in np.eye(2))]
+        return [sum(self.quadratic_form(p, state, 1, v) < 0 for v in np.eye(2))]
 
 
 @pytest.mark.parametrize(("rise", "way", "first"), [(3.2, -1.0, 1), (2.45, 1.0, 2)])
@@ -222,7 +224,9 @@ def test_two_modes_of_one_family_cross(rise: float, way: float, first: int) -> N
         rise, State(np.array([rise - a]), {"load": load_of(a, rise)}), np.eye(2)[first - 1]
     )
     found = [
-        *critical(lambda *_: mode, lambda at, *_: at.phi[::-1], mode, start, way, (2.42, 3.3), 20)
+        *critical_boundary(
+            lambda *_: mode, lambda at, *_: at.phi[::-1], mode, start, way, (2.42, 3.3), 20
+        )
     ]
     (crossing,) = (locus for label, locus, _ in found if label == "crossing")
     assert (crossing.met, crossing.p) == (1, pytest.approx(2.8, abs=1e-7))
@@ -255,11 +259,11 @@ class WithoutThree(WithoutModes):
     def neutral(self, m: int, rise: float) -> float:
         return neutral(m, rise) if m < 3 else neutral(2, rise) - 0.1 * (rise - 2.8) ** 2 - self.gap
 
-    def along(self, p: float, state: State, m: int, v: np.ndarray) -> float:
+    def quadratic_form(self, p: float, state: State, m: int, v: np.ndarray) -> float:
         return float(8 * (self.neutral(m, p) - p**2 + (p - state.u[0]) ** 2) * v @ v)
 
     def counts(self, p: float, state: State) -> list[int]:
-        return [int(self.along(p, state, m, np.ones(1)) < 0) for m in (1, 2, 3)]
+        return [int(self.quadratic_form(p, state, m, np.ones(1)) < 0) for m in (1, 2, 3)]
 
 
 @pytest.mark.parametrize(
@@ -284,11 +288,11 @@ def test_the_first_of_three_modes_that_meet_is_followed(
     """
 
     toys = WithoutThree(first_sine, gap=gap)
-    meeting = Boundary._meeting
+    meeting = Boundary._locate_meeting
     if missed:
         monkeypatch.setattr(
             Boundary,
-            "_meeting",
+            "_locate_meeting",
             lambda self, *args: None if args[-1] == 3 else meeting(self, *args),
         )
 
@@ -298,7 +302,7 @@ def test_the_first_of_three_modes_that_meet_is_followed(
     a = np.sqrt(3.2**2 - 4)
     mode = curve(1)
     start = mode.start(3.2, State(np.array([3.2 - a]), {"load": load_of(a, 3.2)}), np.ones(1))
-    found = [*critical(curve, lambda *_: np.ones(1), mode, start, -1.0, (2.42, 3.3), 20)]
+    found = [*critical_boundary(curve, lambda *_: np.ones(1), mode, start, -1.0, (2.42, 3.3), 20)]
     assert [locus.p for label, locus, _ in found if label == "end"] == [2.42]
     assert found[-1][2].m == 3
     for label, locus, on in found:

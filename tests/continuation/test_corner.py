@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from continuation.toys import Toy
 
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun, Label
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.snes import NewtonOptions
-from magshell_fenicsx.continuation.stepping import Ahead
+from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.continuation.walk import Goal, Label, Walk
 from magshell_fenicsx.parts.gap import penalty
 
 K, X, STIFF, SOFT, DEEP = 2.0, 0.8, 1e5, 1e-5, 1e-4
@@ -59,20 +59,26 @@ def rows_of_stops(places: list[float]) -> Toy:
     return Toy(gradient, hessian, 2)
 
 
-def way_to_touch(here: State, guess: State) -> Ahead:
+def way_to_touch(here: State, guess: State) -> StepEvent:
     """As shells have it in `simulate.onset`."""
     gap, way = X - here.u[1], guess.u[1] - here.u[1]
     behind = gap < 4 * DEEP
     part = (gap + (DEEP if behind else -DEEP)) / way if way and gap > 0 else 1.0
-    return Ahead(part, behind) if 0 < part < 1 else Ahead()
+    return StepEvent(part, behind) if 0 < part < 1 else StepEvent()
 
 
 def walked(load: float, first: float) -> list[tuple[Label, Point]]:
-    newton = BorderedNewton(stop(), NewtonOptions(fresh=0.0, patience=7, stiffnesses={"stop": 1.0}))
+    newton = BorderedNewton(
+        stop(), NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses={"stop": 1.0})
+    )
     path = Path(
         newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch
     )
-    return list(Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("target", [load])))
+    return list(
+        ContinuationRun(
+            path, path.start(State(np.zeros(2), {"load": 0.0})), ContinuationGoal("target", [load])
+        )
+    )
 
 
 @pytest.mark.parametrize("first", [0.02, 0.1])
@@ -103,10 +109,12 @@ def test_a_path_passes_corners_just_ahead(places: list[float]) -> None:
     first, begin = 0.1, 0.5
     shortest = 1e-3 * first
     at = [begin + part * shortest for part in places]
-    newton = BorderedNewton(rows_of_stops(at), NewtonOptions(fresh=0.0, patience=7, corners=True))
+    newton = BorderedNewton(
+        rows_of_stops(at), NewtonOptions(reuse_distance=0.0, patience=7, allows_kinks=True)
+    )
     path = Path(newton, "load", "arc", StepOptions(first, 4 * first, shortest))
     start = path.start(State(np.array([begin, begin]), {"load": begin}))
-    *_, (label, point) = Walk(path, start, Goal("target", [3.0]))
+    *_, (label, point) = ContinuationRun(path, start, ContinuationGoal("target", [3.0]))
     x = (3.0 + 6 * sum(at)) / (1 + 6 * len(at))
     assert label == "target"
     assert point.state.u == pytest.approx([(3.0 + x) / 2, x], rel=1e-6)

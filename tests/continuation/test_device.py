@@ -17,15 +17,21 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.device import Device, natural_scale
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, Weighted
-from magshell_fenicsx.continuation.walk import Goal, Walk
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    State,
+    System,
+    Vector,
+    WeightedDisplacement,
+)
 
 PLACE = {"f": 0, "p": 1}  # what the forces push
 FORCE, HEIGHT = 0.05, 0.02  # held: -dPi/dd = c (z - d) and y
@@ -72,7 +78,7 @@ class Machine:
         return self.c if name == other == "d" else 0.0
 
     def tangent(
-        self, u: Vector, mu: Amplitudes, stress: list[Weighted] | tuple[()] = ()
+        self, u: Vector, mu: Amplitudes, stress: list[WeightedDisplacement] | tuple[()] = ()
     ) -> PETSc.Mat:
         self.K.setValues(
             range(3), range(3), self.springs() + np.diag([3 * u[0] ** 2 - 6 * u[0] + 2, 0, 0])
@@ -101,7 +107,9 @@ def under(device: str, machine: Machine | None = None) -> tuple[BorderedNewton, 
         return newton, REST
     scale = {name: natural_scale(system, newton.factor_at(REST), REST, name) for name in held}
     whole = Device(system, held, scale)
-    found = (newton := newton.on(whole)).solve(whole.enter(REST), "f", GivenLoad("f", PUSH[device]))
+    found = (newton := newton.for_system(whole)).solve(
+        whole.enter(REST), "f", PrescribedLoad("f", PUSH[device])
+    )
     assert found.converged
     return newton, found.state
 
@@ -112,13 +120,13 @@ def test_fold_under_each_device(device: str) -> None:
     newton, rest = under(device)
     assert rest.u[0] == pytest.approx(0, abs=1e-10)
     path = Path(newton, "f", "arc", StepOptions(0.1, 0.2, 1e-6))
-    *_, (label, located) = Walk(path, path.start(rest), Goal("limit"))
+    *_, (label, located) = ContinuationRun(path, path.start(rest), ContinuationGoal("limit"))
     s = STIFFNESS[device]
     x = 1 - np.sqrt((1 - s) / 3)
     f = x**3 - 3 * x**2 + (2 + s) * x + PUSH[device]
     assert label == "fold"
     assert located.state.mu["f"] == pytest.approx(f, rel=1e-8)
-    fold = find_fold(newton, Guess(located.state), "f")
+    fold = find_fold(newton, FoldGuess(located.state), "f")
     assert fold.value == pytest.approx(f, rel=1e-10)
     assert fold.state.u[0] == pytest.approx(x, abs=1e-8)
     assert fold.unstable == 0
@@ -130,7 +138,7 @@ def test_inertia_under_each_device(device: str) -> None:
     newton, rest = under(device)
     path = Path(newton, "f", "conjugate", StepOptions(0.03, 0.05, 1e-6))
     half = np.sqrt((1 - STIFFNESS[device]) / 3)
-    for point, _ in path.towards(path.start(rest), [2.0]):
+    for point, _ in path.continue_to(path.start(rest), [2.0]):
         assert point.negative_pivots == (abs(point.s - 1) < half)
         assert point.negative_pivots_held == 0  # x itself is held
 
@@ -140,7 +148,7 @@ def test_what_is_held_stays() -> None:
     device = newton.system
     assert isinstance(device, Device)
     path = Path(newton, "f", "conjugate", StepOptions(0.1, 0.1, 1e-6))
-    for point, _ in path.towards(path.start(rest), [1.0]):
+    for point, _ in path.continue_to(path.start(rest), [1.0]):
         state = device.leave(point.state)
         assert state.u[1] == pytest.approx(HEIGHT, abs=1e-9)
         assert 0.4 * (state.u[2] - state.mu["d"]) == pytest.approx(FORCE, abs=1e-9)

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation import factor
 from magshell_fenicsx.continuation.factor import Factorisation, has_cholmod
-from magshell_fenicsx.continuation.system import Skewed
+from magshell_fenicsx.continuation.system import SkewedTangent
 
 
 def matrix(diagonal: list[float]) -> PETSc.Mat:
@@ -59,7 +59,7 @@ def test_inertia_of_a_skewed_tangent(across: float, unstable: int) -> None:
     N.setValue(1, 0, -across)
     N.assemble()
     K = matrix([-0.1, 1.0])
-    factors.factor(Skewed(K, N))
+    factors.factor(SkewedTangent(K, N))
     A = np.array([[-0.1, across], [-across, 1.0]])
     assert factors.negative_pivots == unstable
     assert factors.skewed

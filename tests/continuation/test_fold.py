@@ -8,8 +8,8 @@ from continuation.toys import Toy, pitchfork, snap_back, snap_through
 
 from magshell_fenicsx.continuation.fold import (
     Fold,
+    FoldGuess,
     FoldLost,
-    Guess,
     find_fold,
     fold_ahead,
     predict_fold,
@@ -24,7 +24,7 @@ FOLD = 1 - 1 / np.sqrt(3)  # of load = x^3 - 3 x^2 + 2 x
 
 
 def fold_near(toy: Toy, u: list[float], load: float) -> Fold:
-    return find_fold(BorderedNewton(toy), Guess(State(np.array(u), {"load": load})), "load")
+    return find_fold(BorderedNewton(toy), FoldGuess(State(np.array(u), {"load": load})), "load")
 
 
 @pytest.mark.parametrize("p", [-2.0, 0.0, 0.5, 0.99])
@@ -51,7 +51,7 @@ def test_work_does_not_depend_on_the_unit_of_length() -> None:
 def test_a_found_fold_is_found_again(toy: Toy) -> None:
     """The tangent is singular at the guess itself."""
     first = fold_near(toy, [0.4, 0.2][: toy.size], 0.3)
-    again = find_fold(BorderedNewton(toy), Guess(first.state, first.phi), "load")
+    again = find_fold(BorderedNewton(toy), FoldGuess(first.state, first.phi), "load")
     assert again.value == pytest.approx(first.value, rel=1e-14)
     assert again.state.u == pytest.approx(first.state.u, abs=1e-10)
     assert again.iterations == 1

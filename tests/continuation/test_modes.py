@@ -82,13 +82,13 @@ def test_small_spaces(diagonal: list[float]) -> None:
 
 
 def test_no_answer_is_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modes, "MOST_SOLVES", 3)
+    monkeypatch.setattr(modes, "MAX_SOLVES", 3)
     with pytest.raises(NoEigenpair, match=r"not found in 3 solves: at .* the residual is still"):
         nearest_to_zero(factored(symmetric([1.0, 1.1, 1.2])))
 
 
 def pencil(spectrum: list[float]) -> tuple[PETSc.Mat, PETSc.Mat]:
-    """Dense K and M with the given lowest eigenvalues, the others 10, 11, ...; one unknown is held."""
+    """Dense K and M with the given lowest eigenvalues, then 10, 11, ...; one unknown is held."""
     rng = np.random.default_rng(0)
     wanted = np.concatenate([spectrum, 10.0 + np.arange(N - 1 - len(spectrum))])
     L = np.eye(N - 1) + 0.1 * np.tril(rng.standard_normal((N - 1, N - 1)))
@@ -110,7 +110,7 @@ def pencil(spectrum: list[float]) -> tuple[PETSc.Mat, PETSc.Mat]:
     ],
 )
 def test_spectrum_is_found(spectrum: list[float]) -> None:
-    """The lowest four, or all negative ones; the held unknown's own eigenvalue 1 is not among them."""
+    """The lowest four, or all negative ones, without the eigenvalue 1 of the held unknown."""
     K, M = pencil(spectrum)
     lowest = lowest_modes(K, M, 4)
     expected = sorted(spectrum)[: max(4, sum(value < 0 for value in spectrum))]
@@ -179,7 +179,7 @@ def shared() -> None:
 
 @pytest.mark.slow
 def test_same_on_any_number_of_ranks() -> None:
-    """Value and vector, but for its sign, though the start depends on how the rows are shared out."""
+    """Value and vector, but for its sign, though the start depends on the rows of each rank."""
     found = []
     for ranks in (1, 2):
         command = [*mpirun(ranks), sys.executable, __file__]

@@ -7,9 +7,9 @@ import pytest
 from continuation.toys import Stiffening, Toy, pitchfork
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
-from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
-from magshell_fenicsx.continuation.newton import BorderedNewton, Outcome
+from magshell_fenicsx.continuation.control import PrescribedConjugate, PrescribedLoad
+from magshell_fenicsx.continuation.iterates import Iterates, NewtonStep, Verdict
+from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonResult
 from magshell_fenicsx.continuation.system import State
 
 FULL, CHORD = True, False
@@ -43,7 +43,7 @@ FULL, CHORD = True, False
     ],
 )
 def test_verdicts(steps: list[tuple[float, bool]], rounding: float, verdict: Verdict) -> None:
-    iterates = Iterates(largest=1e4, steps=[Step(size, own) for size, own in steps])
+    iterates = Iterates(largest=1e4, steps=[NewtonStep(size, own) for size, own in steps])
     assert iterates.judge(1e-9, lambda: rounding) == verdict
 
 
@@ -62,9 +62,9 @@ def steep() -> Toy:
     return Toy(np.arctan, lambda u: 1 / (1 + u**2), 1)
 
 
-def from_afar(toy: Toy) -> Outcome:
+def from_afar(toy: Toy) -> NewtonResult:
     return BorderedNewton(toy).solve(
-        State(np.full(1, 3.0), {"load": 0.0}), "load", GivenLoad("load", 0.0)
+        State(np.full(1, 3.0), {"load": 0.0}), "load", PrescribedLoad("load", 0.0)
     )
 
 
@@ -106,7 +106,7 @@ def test_the_linear_solver_serves_others(options: PETSc.Options) -> None:
     """
     start, row = (
         State(np.array([0.1, 0.5]), {"load": 0.0}),
-        GivenConjugate(toy := pitchfork(0.1), "load", 1.3),
+        PrescribedConjugate(toy := pitchfork(0.1), "load", 1.3),
     )
     plain = BorderedNewton(toy).solve(start, "load", row)
     options["ksp_type"], options["snes_linesearch_type"] = "gmres", "nleqerr"
@@ -118,13 +118,13 @@ def test_the_linear_solver_serves_others(options: PETSc.Options) -> None:
 
 
 def test_an_older_part_of_a_tangent_is_made_anew_where_steps_do_not_shrink() -> None:
-    """The dear part at u = 0.01 is 50 times too small at the root u = 1 of u + u^2 = 2: each step
+    """The dense term at u = 0.01 is 50 times too small at the root u = 1 of u + u^2 = 2: each step
     would be doubled."""
     system = Stiffening()
     newton, start = BorderedNewton(system), np.full(system.size, 0.01)
     newton.factor_at(State(start, {"load": 0.0}))
     guess = State(np.where(np.arange(system.size) == 0, 1.01, 0.0), {"load": 2.0})
-    outcome = newton.solve(guess, "load", GivenLoad("load", 2.0))
+    outcome = newton.solve(guess, "load", PrescribedLoad("load", 2.0))
     assert outcome.converged, outcome.reason
     assert outcome.state.u[0] == pytest.approx(1.0, abs=1e-9)
-    assert len(system.made) == 2, "it is dear"
+    assert len(system.made) == 2, "it is has_dense_terms"

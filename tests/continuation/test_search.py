@@ -5,13 +5,18 @@ known.
 import numpy as np
 import pytest
 
-from magshell_fenicsx.continuation.control import GivenLoad, Metric
-from magshell_fenicsx.continuation.deflated import POWER, SHIFT, Deflation, deflated
+from magshell_fenicsx.continuation.control import Metric, PrescribedLoad
+from magshell_fenicsx.continuation.deflation import POWER, SHIFT, Deflation, find_deflated
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.search import OVER, Limits, Settling, further
+from magshell_fenicsx.continuation.search import (
+    TIME_IS_OVER,
+    SearchLimits,
+    Settling,
+    further_solutions,
+)
 from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector
 from tests.continuation.toys import Toy, pitchfork, snap_back, snap_through
 
@@ -22,7 +27,9 @@ def _path(system: System, name: str = "load") -> Path:
 
 def _found(system: System, start: State, **limits: int) -> list[Vector]:
     path = _path(system)
-    points = further(path, start, [], Limits(**{"solutions": 20, "guesses": 40, **limits}))
+    points = further_solutions(
+        path, start, [], SearchLimits(**{"solutions": 20, "guesses": 40, **limits})
+    )
     return [point.state.u for point in points]
 
 
@@ -98,12 +105,14 @@ def test_a_search_ends_when_its_time_is_over_and_its_journal_repeats_it() -> Non
     def run() -> list[Vector]:
         path = _path(snap_back(0.5, 0.3))
         path = Path(path.newton, "load", "load", path.options, journal=journal)
-        points = further(path, State(np.zeros(3), {"load": 0.0}), [], Limits(20, 40, over))
+        points = further_solutions(
+            path, State(np.zeros(3), {"load": 0.0}), [], SearchLimits(20, 40, over)
+        )
         return [p.state.u for p in points]
 
     first = run()
     assert first
-    assert journal.results[-1] == OVER
+    assert journal.results[-1] == TIME_IS_OVER
     journal.read = 0
     assert all(np.array_equal(a, b) for a, b in zip(run(), first, strict=True))
     assert len(asked) == 4
@@ -111,10 +120,10 @@ def test_a_search_ends_when_its_time_is_over_and_its_journal_repeats_it() -> Non
 
 def test_newton_leaves_known_solutions_alone() -> None:
     system = snap_through()
-    newton, at = BorderedNewton(system), GivenLoad("load", 0.0)
+    newton, at = BorderedNewton(system), PrescribedLoad("load", 0.0)
     near = State(np.array([0.1]), {"load": 0.0})
     assert newton.solve(near, "load", at).state.u == pytest.approx([0.0], abs=1e-9)
-    found = deflated(newton, near, "load", at, [np.zeros(1)])
+    found = find_deflated(newton, near, "load", at, [np.zeros(1)])
     assert found is not None
     assert min(abs(found.u[0] - x) for x in (1.0, 2.0)) < 1e-3
 
@@ -149,11 +158,11 @@ def test_solutions_with_a_conjugate_held() -> None:
     path = Path(BorderedNewton(device), "idle", "load", StepOptions(1.0, 1.0, 1.0))
     guess = device.enter(State(np.array([1.0, 1.7, 0.0]), {"load": 0.0, "idle": 0.0}))
     points = list(
-        further(
+        further_solutions(
             path,
             start,
             [lambda: guess],
-            Limits(9, 1),
+            SearchLimits(9, 1),
             lambda v: device.padded(device.displacement(v)),
         )
     )

@@ -178,7 +178,7 @@ def swung(rho: float, steps: int, end: float) -> Motion:
 
 
 def test_a_pendulum() -> None:
-    """Angle and tension of SciPy's solution for the angle: second order; the rod keeps its length."""
+    """Angle and tension as SciPy's for the angle: second order; the rod keeps its length."""
     end, g = 4.0, WEIGHT / BOB[0, 0]
     solved = solve_ivp(
         lambda t, y: [y[1], -g * np.sin(y[0])],

@@ -8,7 +8,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.system import Amplitudes, Beside, Rest, Vector, Weighted
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    CorrectedTangent,
+    DenseCorrection,
+    Vector,
+    WeightedDisplacement,
+)
 
 Array = NDArray[np.float64]
 
@@ -43,7 +49,9 @@ class Toy:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         return 0.0
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
+    ) -> PETSc.Mat:
         self.K.setValues(range(self.size), range(self.size), self.hessian(u))
         self.K.assemble()
         return self.K
@@ -161,7 +169,7 @@ def matrix(entries: np.ndarray) -> PETSc.Mat:
 
 @dataclass
 class Full:
-    """A `Rest` of one rank."""
+    """A `DenseCorrection` of one rank."""
 
     D: Array
 
@@ -171,7 +179,7 @@ class Full:
     def scaled(self, factor: float) -> "Full":
         return Full(factor * self.D)
 
-    def over(self, other: Rest) -> float:
+    def multiple_of(self, other: DenseCorrection) -> float:
         return (
             float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
         )
@@ -192,18 +200,18 @@ def dense(values: Array) -> PETSc.Mat:
 
 
 class Stiffening:
-    """Springs k u + u^2, with a force on the first: the derivative 2 u of the latter is a dear part
-    of the tangent."""
+    """Springs k u + u^2, with a force on the first: the derivative 2 u of the latter is a dense
+    term of the tangent."""
 
     comm = MPI.COMM_SELF
     coordinates = frozenset[str]()
-    size, length, dear = 20, 1.0, True
+    size, length, has_dense_terms = 20, 1.0, True
 
     def __init__(self) -> None:
         self.k = np.geomspace(1.0, 100.0, self.size)
-        self.made = list[Vector]()  # states at which the dear part was computed
+        self.made = list[Vector]()  # states at which the dense term was computed
 
-    def residual(self, u: Vector, mu: Amplitudes, *, rough: bool = False) -> Vector:
+    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
         return np.asarray(self.k * u + u**2 + mu["load"] * self.load(u, mu, "load"))
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
@@ -215,19 +223,24 @@ class Stiffening:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         return 0.0
 
-    def knows_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
+    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
         return True
 
     def tangent(
-        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), *, rough: bool = False
-    ) -> Beside:
-        if not (rough and self.made):
+        self,
+        u: Vector,
+        mu: Amplitudes,
+        stress: Sequence[WeightedDisplacement] = (),
+        *,
+        inexact: bool = False,
+    ) -> CorrectedTangent:
+        if not (inexact and self.made):
             self.made.append(np.array(u))
         D, K = Full(np.diag(2 * self.made[-1])), dense(np.diag(self.k))
-        if not rough:
-            return Beside(K, D)
+        if not inexact:
+            return CorrectedTangent(K, D)
 
         def present(v: Vector) -> Vector:
             return np.asarray(2 * u * v)
 
-        return Beside(K, D, D, present, present)
+        return CorrectedTangent(K, D, D, present, present)

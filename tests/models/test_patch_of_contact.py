@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 
 Array = NDArray[np.float64]
 h, P = 0.02, 4e-3  # thickness, and the pressure over E h/R
@@ -91,13 +91,13 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
     state, (touching,) = scene.unloaded(), scene.model.touchings
     for factor in (0.01, 0.1, 1.0):
         outcome = scene.newton.solve(
-            state.with_(state.u, "load", factor), "load", GivenLoad("load", factor)
+            state.with_(state.u, "load", factor), "load", PrescribedLoad("load", factor)
         )
         assert outcome.converged, outcome.reason
         state = outcome.state
-    at = scene.model.system.at(state)
-    _, _, (_, at_points, _) = at.of(touching._pressed)
-    in_cells = at.of(touching.of_cells)[0]
-    expected = P - SOFT * at.of(touching.penetration) / (2 * h)
+    at = scene.model.system.at_state(state)
+    _, _, (_, at_points, _) = at.evaluate(touching._pressed)
+    in_cells = at.evaluate(touching.of_cells)[0]
+    expected = P - SOFT * at.evaluate(touching.penetration) / (2 * h)
     assert at_points == pytest.approx(np.full(len(at_points), expected), rel=1e-3)
     assert in_cells == pytest.approx(np.full(len(in_cells), expected), rel=1e-3)

@@ -7,14 +7,14 @@ import pytest
 from dolfinx import fem, mesh
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.point import Finding
+from magshell_fenicsx.continuation.point import RecordedValues
 from magshell_fenicsx.output.store.checkpoint import Checkpoint, framed
 from magshell_fenicsx.output.store.durable import Damaged
 
 VECTOR = np.linspace(0, 1, 7) / 3
 
 
-def made_once() -> Finding:
+def made_once() -> RecordedValues:
     values = {
         "counts": [np.int64(2)],
         "size": np.inf,
@@ -22,10 +22,10 @@ def made_once() -> Finding:
         "said": "",
         "part": np.float64(0.1),
     }
-    return Finding(values, VECTOR)
+    return RecordedValues(values, VECTOR)
 
 
-def made_again() -> Finding:
+def made_again() -> RecordedValues:
     raise AssertionError("it is known")
 
 
@@ -37,17 +37,17 @@ def test_a_finding_is_read_back(tmp_path: Path, renumbered: bool) -> None:
     file = tmp_path / "checkpoint"
     file.write_bytes(framed(b"{}") + framed((places[::-1] if renumbered else places).tobytes()))
     first = Checkpoint(file, V, MPI.COMM_SELF)
-    first.noted(made_once)
-    first.noted(lambda: Finding({"raised": {}}))
+    first.recorded_values(made_once)
+    first.recorded_values(lambda: RecordedValues({"raised": {}}))
     first.close()
     second = Checkpoint(file, V, MPI.COMM_SELF)
-    found, without = second.noted(made_again), second.noted(made_again)
+    found, without = second.recorded_values(made_again), second.recorded_values(made_again)
     assert found.values["counts"] == [2]
     assert (found.values["size"], found.values["part"], found.values["said"]) == (np.inf, 0.1, "")
     assert np.isnan(found.values["gap"])
     assert found.vector is None if renumbered else np.array_equal(found.vector, VECTOR)
-    assert without == Finding({"raised": {}})
-    assert second.noted(lambda: Finding({"next": 1})).values == {"next": 1}
+    assert without == RecordedValues({"raised": {}})
+    assert second.recorded_values(lambda: RecordedValues({"next": 1})).values == {"next": 1}
     second.close()
 
 
@@ -57,12 +57,12 @@ def test_a_finding_is_no_result(tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
     file.write_bytes(framed(b"{}") + framed(V.tabulate_dof_coordinates().tobytes()))
     first = Checkpoint(file, V, MPI.COMM_SELF)
-    first.noted(made_once)
+    first.recorded_values(made_once)
     first.record("no convergence")
     first.close()
     second = Checkpoint(file, V, MPI.COMM_SELF)
     with pytest.raises(Damaged, match="its results are in another order"):
         second.replay()
     with pytest.raises(Damaged, match="its results are in another order"):
-        second.noted(made_again)
+        second.recorded_values(made_again)
     second.close()

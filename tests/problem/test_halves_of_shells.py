@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.shells.modes import ShellModes
@@ -190,7 +190,7 @@ def test_pressed_halves_are_the_whole(name: str) -> None:
     assert plane is not None
     assert abs(plane.normal @ ACROSS[across]) == pytest.approx(1)
     places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
-    beyond = plane.beyond(all_places) < -1e-9
+    beyond = plane.signed_distance(all_places) < -1e-9
     far, node = cKDTree(places).query(
         np.where(beyond[:, None], plane.image(all_places), all_places)
     )
@@ -198,8 +198,8 @@ def test_pressed_halves_are_the_whole(name: str) -> None:
     *_, last = follow(half)
     u = half.model.system.with_ghosts(last.point.state.u, last.point.state.mu).reshape(-1, 3)[node]
     u = np.where(beyond[:, None], u @ plane.reflection, u).ravel()
-    state = State(whole.model.system.held(u), last.point.state.mu)
-    outcome = whole.newton.solve(state, "w", GivenLoad("w", 1.0))
+    state = State(whole.model.system.zero_at_supports(u), last.point.state.mu)
+    outcome = whole.newton.solve(state, "w", PrescribedLoad("w", 1.0))
     assert outcome.converged, outcome.reason
     assert np.abs(outcome.state.u - state.u).max() < 1e-7 * np.abs(u).max()
     seen, seen_of_whole = half.observe(last.point.state), whole.observe(outcome.state)

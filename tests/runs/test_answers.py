@@ -68,7 +68,7 @@ def test_path_that_is_lost_beyond_the_first_instability(
     """The same k_d as with until: bifurcation, exit code 0, the reason as a remark, and pictures of
     that point.
     """
-    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 9)
+    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MAX_STEPS", 9)
     (tmp_path / "cap.yaml").write_text(json.dumps(PERFECT), encoding="utf-8")
     done = magshell("run", tmp_path / "cap.yaml", "--out", tmp_path / "limit")
     assert (done.returncode, done.stderr) == (0, "")
@@ -96,7 +96,7 @@ def test_path_that_is_lost_beyond_the_first_instability(
 
 
 def test_python_hears_what_is_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 9)
+    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MAX_STEPS", 9)
     with pytest.warns(UserWarning, match=BEYOND):
         labels = [record.label for record in follow(Scene(Case.from_source(PERFECT)))]
     assert "bifurcation" in labels
@@ -105,7 +105,7 @@ def test_python_hears_what_is_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_path_that_is_lost_before_an_instability_is_no_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MOST_STEPS", 3)
+    monkeypatch.setattr("magshell_fenicsx.simulate.steps.MAX_STEPS", 3)
     found = run(Case.from_source(PERFECT))
     assert found.stopped
     assert (found.remarks, found.knockdown) == ([], None)

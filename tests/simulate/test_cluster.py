@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from continuation.toys import column_of_modes
 
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.walked import words_of_cluster
 
@@ -25,7 +25,7 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
     u = np.zeros(toy.size)
     u[0] = 0.9
     path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.03, 0.03, 1e-6))
-    walk = Walk(path, path.start(State(u, {"load": 0.9})), Goal("target", [1.1]))
+    walk = ContinuationRun(path, path.start(State(u, {"load": 0.9})), ContinuationGoal("target", [1.1]))
     sentences = [
         (point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))
     ]

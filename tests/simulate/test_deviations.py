@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.forms import FieldGradient
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.numbers import on_mesh_of
@@ -89,7 +89,7 @@ def test_new_cases(data: dict[str, Any], way: str, load: str, results: list[str]
     state, values = last.point.state, list[list[float]]()
     for c in (-2, -1, 1, 2):
         other = Scene(on_mesh_of(scene, further(data, way, c * STEP).problem()))
-        solution = other.newton.solve(state, load, GivenLoad(load, state.mu[load]))
+        solution = other.newton.solve(state, load, PrescribedLoad(load, state.mu[load]))
         assert solution.converged
         values.append([functional(other, solution.state, of).value for of in results])
     for of, (a, b, c, d) in zip(results, np.transpose(values), strict=True):

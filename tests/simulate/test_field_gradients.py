@@ -12,10 +12,10 @@ from conftest import CASES
 from numpy.typing import NDArray
 from scipy.optimize import newton
 
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -108,7 +108,7 @@ def state_with(
     """The state at the same loads with another field, by Newton's method from that without."""
     other = changed(scene, name, along, c)
     near = State(last.point.state.u, {"natural_curvature": 1.0, **last.point.state.mu})
-    solution = other.newton.solve(near, "lambda_m", GivenLoad("lambda_m", near.mu["lambda_m"]))
+    solution = other.newton.solve(near, "lambda_m", PrescribedLoad("lambda_m", near.mu["lambda_m"]))
     assert solution.converged
     return other, solution.state
 
@@ -120,7 +120,7 @@ def test_state(tmp_path: Path, symmetry: str) -> None:
     (tmp_path / "strip.yaml").write_text(STRIP)
     scene = Scene(Case.load(tmp_path / "strip.yaml", [f"symmetry={symmetry}"]))
     last = solved(scene)
-    assert scene.problem.half == (symmetry == "auto")
+    assert scene.problem.is_half == (symmetry == "auto")
     found = {of: gradient(scene, last, of=of, by=FIELDS) for of in ("tip_uz", "energy")}
     for seed, name in enumerate(FIELDS):
         along = Direction(seed)
@@ -209,7 +209,7 @@ def test_fold(settings: list[str]) -> None:
         def again(c: float, name: str = name, along: Direction = along) -> float:
             other = changed(scene, name, along, c)
             return find_fold(
-                other.newton, Guess(State(fold.state.u, mu), fold.phi), "pressure"
+                other.newton, FoldGuess(State(fold.state.u, mu), fold.phi), "pressure"
             ).value
 
         expected = by_difference(again, step)
@@ -228,7 +228,7 @@ def neutral(scene: Scene, wave: Record) -> float:
     m, near = int(wave.mode.removeprefix("m = ")), wave.point.state
 
     def stiffness(pressure: float) -> float:
-        solution = scene.newton.solve(near, "pressure", GivenLoad("pressure", pressure))
+        solution = scene.newton.solve(near, "pressure", PrescribedLoad("pressure", pressure))
         assert solution.converged
         return nearest_to_zero(scene.model.waves.factor_at(solution.state, m))[0]
 

@@ -13,7 +13,7 @@ from conftest import CASES
 from many import sweep
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_fold
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.folds import Continuation
@@ -123,7 +123,7 @@ def test_second_call_keeps_what_was_followed(tmp_path: Path) -> None:
 
 def polished(*settings: str) -> tuple[Scene, Fold]:
     result = run(Case.load(DIMPLE, settings))
-    return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
+    return result.scene, find_fold(result.scene.newton, FoldGuess(result.last), "pressure")
 
 
 def test_fold_below_no_pressure_is_refused() -> None:
@@ -176,7 +176,7 @@ def test_shallow_caps_are_similar() -> None:
             "loading": {"kind": "pressure"},
         }
         result = run(Case.from_source(data))
-        return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
+        return result.scene, find_fold(result.scene.newton, FoldGuess(result.last), "pressure")
 
     (source, fold), (target, there) = at(90), at(100)
     rim, stretch = np.radians([[35.0]]), _stretch(source, target)
@@ -201,15 +201,15 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.public import run
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
-from magshell_fenicsx.continuation.fold import Guess, find_fold, predict_fold
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold, predict_fold
 from magshell_fenicsx.simulate.transfer import transfer
 
 file, *settings = sys.argv[1:]
 result = run(Case.load(file, settings))
-fold = find_fold(result.scene.newton, Guess(result.last), "pressure")
+fold = find_fold(result.scene.newton, FoldGuess(result.last), "pressure")
 other = Scene(Case.load(file, [*settings, "shell.radius_to_thickness=95"]))
 u, phi = (transfer(result.scene, other, v) for v in (fold.state.u, fold.phi))
-there = find_fold(other.newton, Guess(other.unloaded().with_(u, "pressure", fold.value), phi), "pressure")
+there = find_fold(other.newton, FoldGuess(other.unloaded().with_(u, "pressure", fold.value), phi), "pressure")
 found = {"there": there.value, "curvature": there.curvature, "k_d": fold.value, **sensitivities(result.scene, fold)}
 if MPI.COMM_WORLD.rank == 0:
     print(json.dumps([found, fold.unstable, fold.factorisations, there.factorisations]))

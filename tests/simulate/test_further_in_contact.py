@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.handover import _mirrored
 from magshell_fenicsx.simulate.numbers import on_mesh_of
@@ -54,7 +54,7 @@ def test_search() -> None:
     _, start, *found = (record.point.state for record in follow(scene))
     stage = plain(scene)
     path, here = stage.begin("load", "arc", start, 1e-5, 1e-4)
-    way = _walk(stage, path, here, Goal("points", [start.mu["load"]], "load", steps=50))
+    way = _walk(stage, path, here, ContinuationGoal("points", [start.mu["load"]], "load", steps=50))
     reached = [
         point.state
         for _, (_, point) in zip(found, (it for it in way if it[0] == "target"), strict=False)
@@ -69,7 +69,7 @@ def test_search() -> None:
     below.u.reshape(-1, 2)[
         np.unique(scene.model.V.dofmap.list[scene.model.meridian.patches["upper"]]), 1
     ] -= 0.3
-    assert passes(stage, start, scene.model.system.placed(below))
+    assert passes(stage, start, scene.model.system.with_moved_supports(below))
 
 
 def fold_of(data: dict[str, Any], base: Scene | None = None) -> tuple[Scene, Record]:
@@ -191,7 +191,7 @@ def test_what_a_larger_model_is_given() -> None:
         "contact": [["upper", "lower"]], "mesh": {"size": 0.12, "degree": 2}, "loading": load,
     }  # fmt: skip
     half, whole = (Scene(Case.from_source(data | {"symmetry": how})) for how in ("auto", "none"))
-    assert half.problem.half
+    assert half.problem.is_half
 
     def smooth(scene: Scene) -> Any:
         x = scene.model.r0.x.array[: scene.model.system.size].reshape(-1, 3)

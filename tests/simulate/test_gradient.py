@@ -12,10 +12,10 @@ from conftest import CASES
 from numpy.typing import NDArray
 from test_field_gradients import neutral
 
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
@@ -78,7 +78,7 @@ def solved(scene: Scene) -> Record:
 
 def at(scene: Scene, near: State) -> State:
     """The equilibrium at the amplitudes of a state near by, to rounding."""
-    solution = scene.newton.solve(near, "lambda_m", GivenLoad("lambda_m", near.mu["lambda_m"]))
+    solution = scene.newton.solve(near, "lambda_m", PrescribedLoad("lambda_m", near.mu["lambda_m"]))
     assert solution.converged
     u, mu = solution.state.u, solution.state.mu
     return State(
@@ -116,7 +116,7 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
         for c in (-step, step)
         for moved in [with_values(scene, c * CHANGE)]
     }
-    assert one.problem.half == scene.problem.half == (symmetry == "auto")
+    assert one.problem.is_half == scene.problem.is_half == (symmetry == "auto")
     for of in ("tip_uz", circle, "energy"):
         found = gradient(scene, last, of=of, by=["remanence"])["remanence"]
 
@@ -180,7 +180,7 @@ def test_fold_by_remanence_and_thickness(tmp_path: Path, settings: list[str]) ->
     change = np.random.default_rng(1).standard_normal((7, 2))
 
     def again(other: Scene) -> float:
-        return find_fold(other.newton, Guess(fold.state, fold.phi), "pressure").value
+        return find_fold(other.newton, FoldGuess(fold.state, fold.phi), "pressure").value
 
     expected = by_difference(lambda c: again(with_values(scene, c * change)), 0.02)
     assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(

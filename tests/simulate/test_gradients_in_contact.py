@@ -15,11 +15,11 @@ from command import magshell
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.forms import FieldGradient
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Place
+from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
 from magshell_fenicsx.parts.touching.expanded import _area
 from magshell_fenicsx.shells.modes import ShellModes
@@ -180,7 +180,7 @@ def test_half_of_two_arches() -> None:
     """
     scene = Scene(case(ARCHES, {}))
     last = solved(scene)
-    assert scene.problem.half
+    assert scene.problem.is_half
     assert scene.observe(last.point.state)["contact_force"] > 0.01
     results = ("lower_top_uy", "energy")
     found = [gradient(scene, last, of=of, by=[THICKNESS, "lambda_m"]) for of in results]
@@ -206,7 +206,7 @@ def thicker(scene: Scene, c: float) -> Scene:
     given = scene.problem.thickness or Thickness(patches={"lower": 1.0, "upper": 1.0})
     assert given.patches
     own = Thickness(lambda x, y, z: 1 + c * even(np.stack([x, y, z], axis=-1)))
-    space = Place(np.eye(3), np.zeros(3), 1.0)
+    space = ShellPose(np.eye(3), np.zeros(3), 1.0)
     patches = {
         name: PlacedFactor(own, space, float(times)) for name, times in given.patches.items()
     }  # type: ignore
@@ -237,7 +237,7 @@ def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     """The equilibrium of another scene, whose points are those of the state of the first one."""
     (one,), (same,), state = scene.model.touchings, other.model.touchings, last.point.state
     number = state.mu.get(one.pair.cuts, 0.0)
-    points, normals = scene.model.system.at(state).of(lambda: one._cuts.points(number, one._now()))
+    points, normals = scene.model.system.at_state(state).evaluate(lambda: one._cuts.points(number, one._now()))
     area, its = (_area(one._cells, each._r0, points) for each in (one, same))
     same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
     return held_at(other, last, "lambda_m")
@@ -325,7 +325,7 @@ def test_by_fields_on_meridians(upper: dict[str, Any]) -> None:
 def held_at(scene: Scene, last: Record, name: str = "w") -> State:
     """The equilibrium of another scene at the same load."""
     state = last.point.state
-    solution = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
+    solution = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
     assert solution.converged
     state = solution.state
     for _ in range(2):  # to rounding, for differences

@@ -13,7 +13,7 @@ import pytest
 from interrupted import check_same_path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
@@ -49,7 +49,7 @@ def test_derivatives_and_the_shell_that_has_it_from_the_start(symmetry: str) -> 
     )
     system, first, second = grown.model.system, "imperfection", "imperfection_2"
     x = grown.model.r0.x.array[: system.size]
-    u = system.held(0.02 * np.sin(7 * x))
+    u = system.zero_at_supports(0.02 * np.sin(7 * x))
     mu = {**grown.unloaded().mu, "pressure": 0.3, "lambda_m": 0.01, first: 0.7, second: -0.4}
     other = {**mu, first: 0.2}
     size = 1e-3
@@ -81,7 +81,7 @@ def test_derivatives_and_the_shell_that_has_it_from_the_start(symmetry: str) -> 
         > 1e-3 * np.abs(column).max()
     )
 
-    v = system.held(np.cos(5 * x))
+    v = system.zero_at_supports(np.cos(5 * x))
 
     def along_v(of: Any) -> Any:
         ahead = [of(u + i * 1e-4 * v) for i in (-2, -1, 1, 2)]
@@ -130,7 +130,7 @@ def test_the_depth_at_which_a_held_pressure_buckles_the_shell() -> None:
         case({"kind": "pressure"}, imperfections=[{**DIMPLE, "amplitude": 1.64 * factor}])
     )
     *_, end = ms.follow(buckled)
-    fold = find_fold(buckled.newton, Guess(end.point.state), "pressure")
+    fold = find_fold(buckled.newton, FoldGuess(end.point.state), "pressure")
     assert fold.value == pytest.approx(0.45, abs=1e-8)
     slope = sensitivities(buckled, fold)["imperfections.0.amplitude"]
     assert grown["pressure"] * slope * 1.64 == pytest.approx(1.0, rel=1e-5)

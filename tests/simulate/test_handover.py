@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from simulate.tube_by_ritz import koiter
 
 from magshell_fenicsx.continuation import bifurcation
-from magshell_fenicsx.continuation.control import GivenConjugate
+from magshell_fenicsx.continuation.control import PrescribedConjugate
 from magshell_fenicsx.continuation.modes import critical_mode, nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Sector
-from magshell_fenicsx.mesh.unfolding import Folding
+from magshell_fenicsx.mesh.unfolding import ChartUnfolding
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.runs.running import run
@@ -95,7 +95,7 @@ def _on_larger(small: ShellModel, u: Array, large: ShellModel) -> Array:
     """
     assert isinstance(small.mirror, Sector)
     folding, chart = (
-        Folding(small.mirror.angle, small.mirror.waves, small.midsurface.patch),
+        ChartUnfolding(small.mirror.angle, small.mirror.waves, small.midsurface.patch),
         large.chart(),
     )
     nodes = small.V.dofmap.list
@@ -103,7 +103,7 @@ def _on_larger(small: ShellModel, u: Array, large: ShellModel) -> Array:
     sides = np.linalg.inv(
         np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
     )
-    local = np.einsum("cij,ncj->nci", sides, folding.back(chart)[:, None] - corners[:, 0])
+    local = np.einsum("cij,ncj->nci", sides, folding.to_sector(chart)[:, None] - corners[:, 0])
     cells = np.minimum(local.min(axis=2), 1 - local.sum(axis=2)).argmax(
         axis=1
     )  # beyond a curved rim the nearest
@@ -136,10 +136,10 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
         assert scene
         assert scene.problem.included[0] == f"sector of {180 / m:g} degrees of the shell"
         assert scene.problem.azimuth == full.problem.azimuth
-        guess = full.model.system.held(_on_larger(scene.model, state.u, full.model).ravel())
+        guess = full.model.system.zero_at_supports(_on_larger(scene.model, state.u, full.model).ravel())
         copies = scene.model.multiplicity / full.model.multiplicity
         volume = copies * scene.model.system.potential(state.u, state.mu, "pressure")
-        row = GivenConjugate(full.model.system, "pressure", -volume)
+        row = PrescribedConjugate(full.model.system, "pressure", -volume)
         found = full.newton.solve(State(guess, {**full.unloaded().mu, **state.mu}), "pressure", row)
         assert found.converged
         assert found.state.mu["pressure"] == pytest.approx(state.mu["pressure"], rel=1e-3)

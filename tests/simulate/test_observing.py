@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.system import Skewed, State
+from magshell_fenicsx.continuation.system import SkewedTangent, State
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shells.meridian import MeridianModel
@@ -151,12 +151,12 @@ def rough_states(scene: Scene, count: int) -> list[State]:
     """States with rough displacements, each with other amplitudes and another history."""
     start, system, states = scene.unloaded(), scene.model.system, list[State]()
     for number in range(count):
-        u = system.held(1e-3 * np.random.default_rng(number).standard_normal(system.size))
+        u = system.zero_at_supports(1e-3 * np.random.default_rng(number).standard_normal(system.size))
         mu = {name: 0.05 * (1 + i) * (number - 1.3) for i, name in enumerate(start.mu)}
         past = {
             name: (1.0 + number) * (value or 3.0) for name, (_, value) in system.history.items()
         }
-        states.append(system.placed(State(u, mu | past)))
+        states.append(system.with_moved_supports(State(u, mu | past)))
     return states
 
 
@@ -169,7 +169,7 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     numbers += [system.curvature(u, mu, name, other) for name in names for other in names]
     columns = [system.load(u, mu, name) for name in names]
     tangent = system.tangent(u, mu)
-    parts = (tangent.K, tangent.N) if isinstance(tangent, Skewed) else (tangent,)
+    parts = (tangent.K, tangent.N) if isinstance(tangent, SkewedTangent) else (tangent,)
     values = [np.array(part.getValuesCSR()[2]) for part in parts]
     if isinstance(scene.model, MeridianModel):
         values.append(

@@ -9,7 +9,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
-from magshell_fenicsx.continuation.stepping import Ahead
+from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
@@ -58,12 +58,12 @@ def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
     """
     here, guess = lifted(stack, upper=-1.001), lifted(stack, lower=2)
     ahead = way_to_touch(stack, lambda state: state, here, guess)
-    assert ahead.lets_go
-    assert not ahead.behind
-    assert ahead.part == pytest.approx(0.499, abs=1e-3)
+    assert ahead.loses_forces
+    assert not ahead.ends_behind
+    assert ahead.fraction == pytest.approx(0.499, abs=1e-3)
     alone = way_to_touch(stack, lambda state: state, lifted(stack), guess)
-    assert (alone.part, alone.lets_go) == (ahead.part, False)
-    assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == Ahead(lets_go=True)
+    assert (alone.fraction, alone.loses_forces) == (ahead.fraction, False)
+    assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == StepEvent(loses_forces=True)
 
 
 def test_a_step_on_which_one_lets_go_ends_before_another_meets(
@@ -72,12 +72,12 @@ def test_a_step_on_which_one_lets_go_ends_before_another_meets(
     """The tangent alone foresees it, and is looked along again."""
     asked = list[State]()
 
-    def ahead(here: State, guess: State) -> Ahead:
+    def ahead(here: State, guess: State) -> StepEvent:
         asked.append(guess)
-        return Ahead(0.5 if len(asked) == 2 else 1.0, lets_go=len(asked) <= 2)
+        return StepEvent(0.5 if len(asked) == 2 else 1.0, loses_forces=len(asked) <= 2)
 
-    stage_path = Path(stack.newton, "w", "load", StepOptions(0.1, 0.1, 1e-4), setting_in=ahead)
-    point, _ = next(stage_path.towards(stage_path.start(stack.unloaded()), [0.1]))
+    stage_path = Path(stack.newton, "w", "load", StepOptions(0.1, 0.1, 1e-4), step_event=ahead)
+    point, _ = next(stage_path.continue_to(stage_path.start(stack.unloaded()), [0.1]))
     assert point.s == pytest.approx(0.05, rel=1e-12)
 
 

@@ -12,7 +12,7 @@ CASES = Path(__file__).parents[2] / "cases"
 SEALED = """
 import json, sys
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedConjugate, PrescribedLoad
 from magshell_fenicsx.continuation.device import Device, natural_scale
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
@@ -22,15 +22,15 @@ case = ms.Case.load(sys.argv[1], settings)
 scene = ms.Scene(case, terms=[ms.OwnTerm("weight", lambda r0, u: u.r[2])])
 newton, system, rest = scene.newton, scene.model.system, scene.unloaded()
 scale = {"pressure": natural_scale(system, newton.factor_at(rest), rest, "pressure")}
-sealed = newton.on(device := Device(system, {"pressure": 0.0}, scale))
+sealed = newton.for_system(device := Device(system, {"pressure": 0.0}, scale))
 load = -4e-4
 path = Path(sealed, "weight", "load", StepOptions(abs(load) / 3, abs(load), 1e-9))
-*_, (end, _) = path.towards(path.start(device.enter(rest)), [load])
+*_, (end, _) = path.continue_to(path.start(device.enter(rest)), [load])
 state = device.leave(end.state)
 
 # the same by another way: the weight first, then the pressure until the volume is that of before
-open_ = newton.solve(rest, "weight", GivenLoad("weight", load))
-volume = GivenConjugate(system, "pressure", 0.0)
+open_ = newton.solve(rest, "weight", PrescribedLoad("weight", load))
+volume = PrescribedConjugate(system, "pressure", 0.0)
 closed = newton.solve(open_.state, "pressure", volume)
 direct = newton.response(closed.state, "pressure", volume, exact=True)
 held = direct.negative_pivots - (direct.softness < 0)

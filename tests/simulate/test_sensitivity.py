@@ -10,7 +10,7 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.models.shell.patterns import WithinRims
 from magshell_fenicsx.public import Scene, run
@@ -37,7 +37,7 @@ def case(*settings: str) -> Case:
 
 def fold_of(*settings: str) -> tuple[Scene, Fold]:
     result = run(case(*settings))
-    return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
+    return result.scene, find_fold(result.scene.newton, FoldGuess(result.last), "pressure")
 
 
 def derivative(f: Callable[[float], float], step: float) -> float:
@@ -58,7 +58,7 @@ def test_field_and_defect(settings: list[str]) -> None:
         def again(d: float, key: str = key, value: float = value) -> float:
             other = Scene(case(*settings, f"{key}={value + d}"))
             state = fold.state.with_(fold.state.u, "lambda_m", other.problem.lambda_m)
-            return find_fold(other.newton, Guess(state, fold.phi), "pressure").value
+            return find_fold(other.newton, FoldGuess(state, fold.phi), "pressure").value
 
         assert found[name] == pytest.approx(derivative(again, step), rel=1e-4), name
 
@@ -91,7 +91,7 @@ def test_remanence_of_the_dimple() -> None:
         )
         other = MeridianModel(model.meridian, model.material, model.degree, model.conditions, loads)
         return find_fold(
-            BorderedNewton(other.system), Guess(fold.state, fold.phi), "pressure"
+            BorderedNewton(other.system), FoldGuess(fold.state, fold.phi), "pressure"
         ).value
 
     expected = derivative(stronger, 0.02)

@@ -4,7 +4,7 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
@@ -36,9 +36,9 @@ def test_of_the_meridian(kind: str) -> None:
 
         def value(change: float, key: str = key, number: str = number) -> float:
             value = getattr(scene.problem.imperfections[key], number) + change
-            other = Scene(scene.problem.again({f"shell.{key}.{number}": value}))
+            other = Scene(scene.problem.with_values({f"shell.{key}.{number}": value}))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-            return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
+            return find_fold(other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure").value
 
         by_folds = (8 * (value(0.005) - value(-0.005)) - (value(0.01) - value(-0.01))) / 0.06
         assert derivative == pytest.approx(by_folds, rel=1e-4), name
@@ -75,7 +75,7 @@ def test_beside_the_pole() -> None:
             sections = changed(scene.problem.imperfections, key, number, change)
             other = reshaped(scene, Along(_deviation(scene, sections, key), old, 1.0))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-            return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
+            return find_fold(other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure").value
 
         ends = [value(n * step) for n in (-2, -1, 1, 2)]
         by_folds = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.point import Finding, Point
+from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.report.verdict import _snaps
 from magshell_fenicsx.runs.rows import columns, rows
@@ -109,7 +109,7 @@ class Kept:
         self.found.append(found)
         self._known.append(found)
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
         return find()
 
     def check(self, known: bool) -> None:

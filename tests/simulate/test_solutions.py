@@ -11,9 +11,9 @@ from conftest import CASES
 from interrupted import check_same_path
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
 from magshell_fenicsx.continuation.path import Quantity
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.runs.summary import solutions
@@ -45,7 +45,7 @@ def crossings(
     the start again.
     """
     path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
-    walk = Walk(path, here, Goal("points", [path.value(quantity, start)], quantity))
+    walk = ContinuationRun(path, here, ContinuationGoal("points", [path.value(quantity, start)], quantity))
     return [
         point.state
         for _, (_, point) in zip(

@@ -19,7 +19,7 @@ from test_field_gradients import (
 )
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.control import Bordered, GivenConjugate
+from magshell_fenicsx.continuation.control import BorderedMatrix, PrescribedConjugate
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shells.modes import ShellModes
@@ -70,13 +70,13 @@ def at_volume(scene: Scene, near: State) -> State:
     """The equilibrium with the volume that the step prescribes, by Newton's method from a state
     near by.
     """
-    volume = GivenConjugate(
+    volume = PrescribedConjugate(
         scene.model.system, "pressure", -0.004 * scene.conjugate_unit("pressure")
     )
     solution = scene.newton.solve(near, "pressure", volume)
     assert solution.converged
     system, state = scene.model.system, solution.state
-    last = Bordered(system, scene.newton.factor_at(state), state, "pressure", volume)  # to rounding
+    last = BorderedMatrix(system, scene.newton.factor_at(state), state, "pressure", volume)  # to rounding
     du, dp = last.solve(-system.residual(state.u, state.mu), -volume.residual(state))
     return state.with_(state.u + du, "pressure", state.mu["pressure"] + dp)
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
@@ -190,10 +190,10 @@ def on(meridian: Scene, other: Scene, record: Record, *, solve: bool) -> State:
     theta = np.arctan2(x[:, 1], x[:, 0])
     u = np.column_stack([U * np.cos(theta), U * np.sin(theta), W]).ravel()
     guess = State(
-        other.model.system.held(u[: other.model.system.size]), {**other.unloaded().mu, **state.mu}
+        other.model.system.zero_at_supports(u[: other.model.system.size]), {**other.unloaded().mu, **state.mu}
     )
     if not solve:
         return guess
-    solved = other.newton.solve(guess, "pressure", GivenLoad("pressure", state.mu["pressure"]))
+    solved = other.newton.solve(guess, "pressure", PrescribedLoad("pressure", state.mu["pressure"]))
     assert solved.converged
     return solved.state

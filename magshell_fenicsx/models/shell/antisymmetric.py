@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.snes import factored_roughly
+from magshell_fenicsx.continuation.snes import factor_with_lag
+from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
@@ -63,7 +63,7 @@ def antisymmetric_edge(
 
 
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a `continuation.watch.Family`.
+    """The tangent of the modes that a half model excludes; a `continuation.stability_monitor.ModeFamily`.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class AntisymmetricModes:
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent of the antisymmetric modes at a symmetric state."""
         if self._factored is not state:
-            if not factored_roughly(self.system, self._factorisation, state):
+            if not factor_with_lag(self.system, self._factorisation, state):
                 self._factorisation.factor(self.system.tangent(state.u, state.mu))
             self._factored = state
         return self._factorisation
@@ -92,8 +92,8 @@ class AntisymmetricModes:
         return self.factor_at(state).negative_pivots > 0
 
     @property
-    def families(self) -> Sequence[Family]:
-        """For a `Watch`: they are one."""
+    def families(self) -> Sequence[ModeFamily]:
+        """For a `StabilityMonitor`: they are one."""
         return [self]
 
     def counts(self, state: State) -> Sequence[int]:

@@ -20,7 +20,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.point import Finding, Point
+from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
@@ -301,7 +301,7 @@ class Checkpoint:
         self._replaying = content is not None
         return content
 
-    def noted(self, find: Callable[[], Finding]) -> Finding:
+    def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
         """The next finding in the file; at its end that of `find`, which is put there."""
         if content := self._next():
             return self._read(content)
@@ -314,7 +314,7 @@ class Checkpoint:
         self._append(b"\n".join([head.encode(), b"".join(part.tobytes() for part in vectors)]))
         return found
 
-    def _read(self, content: bytes) -> Finding:
+    def _read(self, content: bytes) -> RecordedValues:
         """Return a finding, with this rank's part of its vector if the ranks have the nodes that
         they had."""
         text, _, data = content.partition(b"\n")
@@ -322,8 +322,8 @@ class Checkpoint:
         self._refuse_other_kind(is_other="values" not in decoded)
         parts, rank = decoded["parts"], self._comm.rank
         if len(parts) != self._comm.size or not self._ordering.is_present:
-            return Finding(decoded["values"])
-        return Finding(
+            return RecordedValues(decoded["values"])
+        return RecordedValues(
             decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank]
         )
 

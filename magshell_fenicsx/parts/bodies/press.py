@@ -90,7 +90,13 @@ class ContactSection(PathStep):
 
 def finer(options: "StepOptions") -> "StepOptions":
     """Steps of a path along which contact sets in, grows and ceases."""
-    return replace(options, easy=EASY, few=EASY, hard=HARD, smallest=min(options.smallest, SHARP))
+    return replace(
+        options,
+        easy_factorisations=EASY,
+        easy_iterations=EASY,
+        hard_factorisations=HARD,
+        smallest=min(options.smallest, SHARP),
+    )
 
 
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.whole import Blocks, Singles
+from magshell_fenicsx.assembly.dense_tangent import BlockProducts, SinglePrecisionBlocks
 from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
 
 Array = NDArray[np.float64]
@@ -56,13 +56,13 @@ class Foreseen:
     """
 
     def __init__(
-        self, blocks: Blocks, turns: Callable[[Array, Array], Array], *, alone: bool
+        self, blocks: BlockProducts, turns: Callable[[Array, Array], Array], *, alone: bool
     ) -> None:
         self._blocks, self._turns, self._alone = blocks, turns, alone  # on one rank
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
         self._D: ActingOnEachOther | None = None
-        self._stored: Singles | None = None  # of D, turned to `_turned`
+        self._stored: SinglePrecisionBlocks | None = None  # of D, turned to `_turned`
         self._turned: Array | None = None
         self._products = deque[tuple[Array, Array]](maxlen=LAST)  # the last u and D u
         self._model: tuple[Along, list[tuple[Array, Array]]] | None = None
@@ -90,7 +90,7 @@ class Foreseen:
             foreseen = foreseen + (q @ s) * y
         return foreseen
 
-    def knows_along(self, u: Array, step: Array) -> bool:
+    def extrapolation_holds_along(self, u: Array, step: Array) -> bool:
         """Whether the forces at two states near each other and u are known, one from the other
         along a direction.
         """
@@ -117,7 +117,7 @@ class Foreseen:
         if turned is None and before is not None:
             return
         self._D, self._turned = D, u
-        self._stored = Singles.of(D.stored, upper=self._alone) if turned is None else turned
+        self._stored = SinglePrecisionBlocks.from_blocks(D.near_blocks, upper=self._alone) if turned is None else turned
         self._model = None
         self._products.clear()
         self._points = [

@@ -16,8 +16,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, pieces, whole
-from magshell_fenicsx.assembly.whole import Blocks
+from magshell_fenicsx.assembly.dense_tangent import BlockProducts
+from magshell_fenicsx.assembly.global_mesh import (
+    GlobalCells,
+    component_numbers,
+    gather_rows,
+    global_values,
+)
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.by_charges import Weights
 from magshell_fenicsx.parts.magnetism.charged import Shape, unit
@@ -75,7 +80,7 @@ class InteractionTerm:
         self._scale = of.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
-        self._cells = CellsOfAll.of(V)
+        self._cells = GlobalCells.gather(V)
         self._even: InteractionTerm | None = None  # of an antisymmetric one the other
         unknowns = 3 * V.dofmap.index_map.size_global
         if unknowns > LARGEST:
@@ -85,7 +90,7 @@ class InteractionTerm:
             )
         self._given: tuple[Array, ...] = ()
         self._seen = deque[tuple[Array, float, Array]](maxlen=REMEMBERED)
-        self._blocks, self._turning = Blocks(self._comm), Turning(self._comm)
+        self._blocks, self._turning = BlockProducts(self._comm), Turning(self._comm)
         self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
         self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
             None  # beside its nodes and u
@@ -121,7 +126,7 @@ class InteractionTerm:
         near = False
         try:
             nodes = self._nodes()  # first: the charges are made of what it gathers
-            self._charged.rules(nodes, self._cells.own)
+            self._charged.rules(nodes, self._cells.own_range)
         except Touching:
             near = True
         if self._comm.allreduce(near, MPI.LOR):
@@ -136,22 +141,22 @@ class InteractionTerm:
     def add_residual(self, b: Array, factor: float) -> None:
         b += factor * self._evaluated()[1]
 
-    def add_foreseen(self, b: Array, factor: float) -> None:
-        """See `assembly.whole.WholeTerm`."""
+    def add_extrapolated_residual(self, b: Array, factor: float) -> None:
+        """See `assembly.dense_tangent.DenseTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
         foreseen = (
-            self._foreseen.at(whole(self._u).ravel(), self._stiff[1][0], self._stiff[2])
+            self._foreseen.at(global_values(self._u).ravel(), self._stiff[1][0], self._stiff[2])
             if self._stiff
             else None
         )
         b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
 
-    def knows_along(self, step: Array) -> bool:
-        """See `assembly.whole.WholeTerm`."""
+    def extrapolation_holds_along(self, step: Array) -> bool:
+        """See `assembly.dense_tangent.DenseTerm`."""
         self._nodes()
-        there, nodes = whole(self._u), self._u.function_space.dofmap.index_map
+        there, nodes = global_values(self._u), self._u.function_space.dofmap.index_map
         own = step.reshape(-1, 3)[: nodes.size_local]
-        return self._foreseen.knows_along(
+        return self._foreseen.extrapolation_holds_along(
             there.ravel(), np.concatenate(self._comm.allgather(own)).ravel()
         )
 
@@ -161,28 +166,28 @@ class InteractionTerm:
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Nodes far apart act on each other; see `acting`."""
 
-    def acting(self, *, rough: bool = False) -> "ActingOnEachOther":
-        """See `assembly.whole.WholeTerm`; collective."""
-        return self._even.both(rough=rough)[1] if self._even else self.both(rough=rough)[0]
+    def hessian(self, *, inexact: bool = False) -> "ActingOnEachOther":
+        """See `assembly.dense_tangent.DenseTerm`; collective."""
+        return self._even.both(inexact=inexact)[1] if self._even else self.both(inexact=inexact)[0]
 
-    def both(self, *, rough: bool) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
+    def both(self, *, inexact: bool) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
         """The second derivative, and that by additions to u that are opposite in the images;
         collective.
         """
         nodes = self._nodes()
-        if self._stiff is None or not (rough or np.array_equal(nodes, self._stiff[0])):
+        if self._stiff is None or not (inexact or np.array_equal(nodes, self._stiff[0])):
             self._stiff = None  # two are not kept at once
-            self._stiff = nodes, self._acting_at(nodes), whole(self._u).ravel()
+            self._stiff = nodes, self._acting_at(nodes), global_values(self._u).ravel()
         return self._stiff[1]
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Of remanence, thickness and placement; see `assembly.coupled.KnowsFields`; collective."""
+        """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`; collective."""
         own, of_shape = own_field(self._sight), name in ("thickness", "r0")
-        nodes, rates = self._nodes(), whole(direction)[self._cells.nodes]
+        nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         turned = np.concatenate([rates @ image.Q.T for image in self._copies.images])
-        weights, own_cells = Weights(self._scale * energy, self._scale * force), self._cells.own
+        weights, own_cells = Weights(self._scale * energy, self._scale * force), self._cells.own_range
         part = slice(own_cells.start, own_cells.stop)
         if of_shape:
             into = self._charged.by_fields(nodes, turned, own_cells, weights, of_shape=True)
@@ -197,7 +202,7 @@ class InteractionTerm:
             return None
         shape, cells, edges = self._all(may=True)
         near = Near(
-            shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies, may=True
+            shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies, may=True
         )
         charged = Charged(
             shape,
@@ -214,17 +219,17 @@ class InteractionTerm:
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
         """By the nodes of own cells: a placement moves charges as a displacement does; collective."""
-        V, count = self._u.function_space, len(self._cells.own)
-        D, v = self.acting(), whole(direction).ravel()
+        V, count = self._u.function_space, len(self._cells.own_range)
+        D, v = self.hessian(), global_values(direction).ravel()
         of_nodes = energy * self._evaluated()[1] + force * (
-            D.stored @ v + D.times_others(v[:, None]).ravel()
+            D.near_blocks @ v + D.times_far(v[:, None]).ravel()
         )
         nodes = V.dofmap.list[:count]
         shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
         return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
 
     def _acting_at(self, nodes: Array) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
-        own, images, V = self._cells.own, self._copies.images, self._u.function_space
+        own, images, V = self._cells.own_range, self._copies.images, self._u.function_space
         count, several = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
         column_of[len(self._cells.nodes) :] += count  # those of images are apart
@@ -277,32 +282,32 @@ class InteractionTerm:
             if np.array_equal(nodes, seen):
                 return energy, forces
         try:
-            energy, gradient = self._charged.evaluate(nodes, self._cells.own)
+            energy, gradient = self._charged.evaluate(nodes, self._cells.own_range)
         except Touching:  # there is no such equilibrium
             k = self._cells.nodes.shape[1]
-            energy, gradient = np.nan, np.full((len(self._cells.own), k, 3), np.nan)
+            energy, gradient = np.nan, np.full((len(self._cells.own_range), k, 3), np.nan)
         forces = np.zeros_like(self._u.x.array)
         np.add.at(
-            forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own)], self._scale * gradient
+            forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own_range)], self._scale * gradient
         )
         self._seen.appendleft((nodes, self._scale * energy, forces))
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
-            self._foreseen.learn(whole(self._u).ravel(), forces)
+            self._foreseen.learn(global_values(self._u).ravel(), forces)
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
         """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes
         them changed.
         """
-        r0, u = (whole(f) for f in (self._model.r0, self._u))
+        r0, u = (global_values(f) for f in (self._model.r0, self._u))
         own = own_field(self._sight)
         factor, of_nodes = (
             self._model.thickness,
             own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list],
         )
-        given: tuple[Array, ...] = (r0, self._cells.gathered(of_nodes))
+        given: tuple[Array, ...] = (r0, self._cells.gather_values(of_nodes))
         if factor is not None:
-            given += (self._cells.gathered(factor.x.array[factor.function_space.dofmap.list]),)
+            given += (self._cells.gather_values(factor.x.array[factor.function_space.dofmap.list]),)
         if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
             self._given, self._stiff = given, None
             self._seen.clear()
@@ -315,7 +320,7 @@ class InteractionTerm:
         """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar
         last.
         """
-        r0, nodes = whole(self._model.r0), self._cells.nodes
+        r0, nodes = global_values(self._model.r0), self._cells.nodes
         element = self._u.function_space.element.basix_element
         T = element.tabulate(1, element.points)[1:, :, :, 0]
 
@@ -337,7 +342,7 @@ class InteractionTerm:
         shape, cells, edges = self._all()
         if not self._itself:
             return None
-        return Near(shape, self._corners, cells, edges, self._cells.own, self._comm, self._copies)
+        return Near(shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies)
 
     def _all(self, *, may: bool = False) -> tuple[Shape, Ints, Ints]:
         """The cells of all ranks, and their edges that are charged, or `may` be by any remanence;
@@ -348,8 +353,8 @@ class InteractionTerm:
         thick = shape.thick and (shape.thick[0], self._given[2])
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
         everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
-        own_cells, every = np.asarray(cells) + self._cells.own.start, self._comm
-        return everywhere, over_ranks(every, own_cells), over_ranks(every, np.asarray(edges))
+        own_cells, every = np.asarray(cells) + self._cells.own_range.start, self._comm
+        return everywhere, gather_rows(every, own_cells), gather_rows(every, np.asarray(edges))
 
     @cached_property
     def _copies(self) -> Copies:
@@ -365,7 +370,7 @@ class InteractionTerm:
         """(copies * cells, 3) numbers of corners; on a mirror plane an image has that of its
         original; collective.
         """
-        r0, corners = whole(self._model.r0), self._cells.nodes[:, :3]
+        r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]
         places = self._copies.of(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
         for later, x in enumerate(places):
@@ -379,7 +384,7 @@ class InteractionTerm:
         """(copies * cells,) the part of each cell; collective."""
         V, corners = self._u.function_space, self._corners
         if len(self._copies.images) == 1:
-            return np.asarray(self._cells.gathered(pieces(V)[V.dofmap.list[:, 0]]))
+            return np.asarray(self._cells.gather_values(component_numbers(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
         graph = coo_array(
             (ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size)

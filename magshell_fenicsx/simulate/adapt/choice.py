@@ -12,7 +12,7 @@ import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.walk import LOCATED
+from magshell_fenicsx.continuation.continuation_run import LOAD_TOLERANCE
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene
@@ -102,7 +102,7 @@ class Choice:
     def applied(self, asked: Problem) -> Problem:
         """The problem on this mesh."""
         mesh = {"mesh.degree": self.degree, "mesh.refinement": self.refinement}
-        problem = asked.again(mesh | ({"solid.layers": self.layers} if self.layers else {}))
+        problem = asked.with_values(mesh | ({"solid.layers": self.layers} if self.layers else {}))
         return replace(problem, size=self.size) if self.size else problem
 
     def scene(self, asked: Problem, comm: MPI.Comm) -> Scene:
@@ -160,7 +160,7 @@ class Adapted:
             The estimated relative error at the end of the branch, or None.
         """
         best, least = self.best, min(self.rounds, key=lambda each: each.estimate)
-        apart = max(best.estimate, LOCATED) * abs(best.result)
+        apart = max(best.estimate, LOAD_TOLERANCE) * abs(best.result)
         same = result is not None and abs(result - best.result) <= apart
         return {
             "tolerance": self.asked.mesh.tolerance,

@@ -13,8 +13,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
-from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.control import ConstraintRow, PrescribedConjugate, PrescribedLoad
+from magshell_fenicsx.continuation.fold import FoldGuess, FoldLost, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -68,7 +68,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         raise NotCarried(
             f"the place {place} of the chart is {away:.2g} cells beside the other mesh"
         )
-    return target.model.system.held(moved.ravel())
+    return target.model.system.zero_at_supports(moved.ravel())
 
 
 def _chart(scene: Scene) -> Array:
@@ -106,7 +106,7 @@ class CellFields:
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
-            own_nodes = model.midsurface.charted_by_shell(V)[
+            own_nodes = model.midsurface.chart_coordinates_by_shell(V)[
                 : V.mesh.topology.index_map(2).size_local
             ]
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
@@ -369,7 +369,7 @@ def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
     for _ in range(MOST_CHANGED):
         is_fold = near.kind == "fold"
         end = (
-            _fold(scene, Guess(guess, tangent), near.name)
+            _fold(scene, FoldGuess(guess, tangent), near.name)
             if is_fold
             else _equilibrium(scene, guess, near)
         )
@@ -379,7 +379,7 @@ def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
     return None
 
 
-def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
+def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
     try:
         fold = find_fold(scene.newton, guess, name)
     except FoldLost:
@@ -389,8 +389,8 @@ def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
 
 def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
-    row: Row = (
-        GivenLoad(name, guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    row: ConstraintRow = (
+        PrescribedLoad(name, guess.mu[name]) if held is None else PrescribedConjugate(system, name, held)
     )
     outcome = newton.solve(guess, name, row)
     if not outcome.converged:

@@ -23,8 +23,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from magshell_fenicsx.assembly.free_parameters import derived
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameters import derived
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
@@ -203,8 +203,8 @@ def adjoint_of_instability(
     fold = fold or fold_at(scene, record)
     stage = stage_at(scene, record)
     system = stage.newton.system
-    pull = dot(system.comm, fold.left, system.load(fold.state.u, fold.state.mu, fold.name))
-    left = np.asarray(-fold.left / pull)
+    pull = dot(system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name))
+    left = np.asarray(-fold.left_null_vector / pull)
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
     place = Place(stage.leave(fold.state), np.array(w), rows)
@@ -223,7 +223,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         raise CaseError(
             f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half"
         )
-    system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
+    system, waves, state = model.system, model.waves, model.system.with_moved_supports(record.point.state)
     refuse_meeting(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
@@ -257,9 +257,9 @@ def variation(
         by_mu = {
             name: sum((c * term.energy() for term, c in each), 0.0) for name, each in rates.items()
         }
-        return Functional(value, system.held(by_u), by_mu)
+        return Functional(value, system.zero_at_supports(by_u), by_mu)
 
-    return system.at(state).of(present)
+    return system.at_state(state).evaluate(present)
 
 
 def by_amplitude(
@@ -298,7 +298,7 @@ def adjoint(
     CaseError
         If the scene has no such result, or what the step holds has no derivative.
     """
-    state = scene.model.system.placed(record.point.state)
+    state = scene.model.system.with_moved_supports(record.point.state)
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     result = functional(scene, state, column)
     held = held_at(scene, record, state, hold)
@@ -374,7 +374,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                     f"{names}: as they were before {step.key}, in another model: no gradient"
                 )
             break
-        before = system.placed(begin.point.state)
+        before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, before)
         if part and place:
             drawn = {
@@ -431,7 +431,7 @@ def by_load(adjoint: Adjoint, name: str) -> float:
         if name in place.rows or name in place.driven:
             continue
         u, mu = place.state.u, place.state.mu
-        total += dot(system.comm, place.w, system.load(u, mu, name, held=False))
+        total += dot(system.comm, place.w, system.load(u, mu, name, constrained=False))
         total += place.energy and place.energy * system.potential(u, mu, name)
         total += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
     if adjoint.directions:
@@ -441,7 +441,7 @@ def by_load(adjoint: Adjoint, name: str) -> float:
             for term, c in along(scene, adjoint)
             for slope, factor in by_amplitude(scene.model, [term], name, mu)
         ]
-        own = system.at(adjoint.state).of(lambda: sum(c * term.energy() for term, c in terms))
+        own = system.at_state(adjoint.state).evaluate(lambda: sum(c * term.energy() for term, c in terms))
         total += system.comm.allreduce(own)
     return float(total)
 
@@ -466,10 +466,10 @@ def solved(
     system: System = scene.model.system
     device = Device(system, held, dict.fromkeys(held, system.length)) if held else None
     whole = device.enter(state) if device else state
-    factors = (scene.newton.on(device) if device else scene.newton).factor_at(whole)
+    factors = (scene.newton.for_system(device) if device else scene.newton).factor_at(whole)
     slope = of.by_u
     if device:
-        slope = device.joined(
+        slope = device.gradient(
             of.by_u,
             {name: of.by_mu.get(name, 0.0) + mixed(scene, state, of, name) for name in held},
         )
@@ -484,7 +484,7 @@ def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
         c * system.curvature(state.u, state.mu, i, name) for i, c in of.potentials.items()
     )
     if of.reaction is not None:
-        changes += dot(system.comm, of.reaction, system.load(state.u, state.mu, name, held=False))
+        changes += dot(system.comm, of.reaction, system.load(state.u, state.mu, name, constrained=False))
     return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
 
 

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 from conftest import spherical
 
+from magshell_fenicsx.continuation.continuation_run import Instability, instabilities
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Instability, instabilities
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
@@ -67,14 +67,14 @@ def buckle(model: MeridianModel, lambda_m: float) -> Buckling:
             "load",
             StepOptions(abs(lambda_m) / 2, abs(lambda_m), abs(lambda_m) * 1e-4),
         )
-        for point, _ in field.towards(field.start(state), [lambda_m]):
+        for point, _ in field.continue_to(field.start(state), [lambda_m]):
             assert point.negative_pivots == 0
             state = point.state
     path = Path(newton, "pressure", "conjugate", StepOptions(1.0, 1.0, 1.0))
     points = [path.start(state)]
     first = abs(0.1 / points[0].dmu)
     path.options = StepOptions(first, 2 * first, 1e-5 * first)
-    for point, _ in path.towards(points[0], [np.inf]):
+    for point, _ in path.continue_to(points[0], [np.inf]):
         if point.negative_pivots:
             found = next(instabilities(path, points[-1], point))
             return Buckling(path, [*points, found.point], found)
@@ -101,7 +101,7 @@ def indent(model: MeridianModel, depths: list[float]) -> list[float]:
     path = Path(
         BorderedNewton(model.system), "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit)
     )
-    points = path.towards(path.start(unloaded(model)), [unit * depth for depth in depths])
+    points = path.continue_to(path.start(unloaded(model)), [unit * depth for depth in depths])
     return [point.state.mu["force"] for point, reached in points if reached]
 
 

@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.shapes import flat
+from magshell_fenicsx.mesh.shapes import plane_embedding
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.shell.parameters import Force, Material
 from magshell_fenicsx.parts.loads import Loads
@@ -66,7 +66,7 @@ def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
 def test_clamped_plate() -> None:
     """w0 = p R^4/(64 D) (Timoshenko)."""
     h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
-    meridian = make_meridian(flat, graded_vertices(1.0, [], h))
+    meridian = make_meridian(plane_embedding, graded_vertices(1.0, [], h))
     model = MeridianModel(meridian, Material(nu, h), 4, {"rim": "clamped"}, Loads(pressure=True))
     path = Path(
         BorderedNewton(model.system),
@@ -74,7 +74,7 @@ def test_clamped_plate() -> None:
         "load",
         StepOptions(p_over_pc, p_over_pc, p_over_pc),
     )
-    ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
+    ((point, _),) = path.continue_to(path.start(unloaded(model)), [p_over_pc])
     p = p_over_pc * model.material.classical_pressure / h
     w0 = model.deflection(point.state.u, "pole")
     assert w0 == pytest.approx(

@@ -248,7 +248,7 @@ def test_waves_are_those_of_the_half_shell(
     path = Path(half.newton, name, "load", StepOptions(below, below, 1e-3 * below))
     pivots = [
         point.negative_pivots
-        for point, at in path.towards(path.start(half.unloaded()), [below, above])
+        for point, at in path.continue_to(path.start(half.unloaded()), [below, above])
         if at
     ]
     assert pivots == [0, 1]

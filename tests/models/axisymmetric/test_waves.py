@@ -9,8 +9,8 @@ from conftest import hemisphere as triangulated
 from meridian_scenes import E3, Buckling, buckle, buckled, hemisphere
 
 from magshell_fenicsx.continuation.modes import nearest_to_zero
+from magshell_fenicsx.continuation.stability_monitor import Crossing, StabilityMonitor
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.watch import Crossing, Watch
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.parts.loads import Loads
@@ -72,7 +72,7 @@ def on_the_shell(model: ShellModel, waves: tuple[int, ...], mu: dict[str, float]
 
 
 def crossings(model: MeridianModel, found: Buckling) -> list[Crossing]:
-    watch = Watch(model.excluded_modes)
+    watch = StabilityMonitor(model.excluded_modes)
     watch.begin(found.path, found.points[0])
     return [crossing for point in found.points[1:] for crossing in watch.pass_to(point)]
 

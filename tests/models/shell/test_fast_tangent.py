@@ -11,10 +11,10 @@ from conftest import hemisphere, random_displacement
 from dolfinx import fem
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.system import followed
+from magshell_fenicsx.continuation.system import extrapolated_stress
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
@@ -121,7 +121,7 @@ def test_stress_of_other_displacements(shell: Shells) -> None:
     )
     K = csr(system.tangent(u, MU))
     assert abs(csr(system.tangent(u, MU, [(1.0, u)])) - K).max() <= 1e-14 * abs(K).max()
-    changed = csr(system.tangent(u, MU, followed(u - step, step)))
+    changed = csr(system.tangent(u, MU, extrapolated_stress(u - step, step)))
 
     fields = [fem.Function(model.V) for _ in range(2)]
     for field, values in zip(fields, (step, v), strict=True):
@@ -130,7 +130,7 @@ def test_stress_of_other_displacements(shell: Shells) -> None:
     square = kinematics.metric(d)
     E = -ufl.as_vector([square[0, 0], square[0, 1], square[1, 1]]) / 2
     density = densities.prestress(r0, d, w, E, law=model.material.law) * kinematics.area_ratio(r0)
-    free = system.held(np.ones_like(v))
+    free = system.zero_at_supports(np.ones_like(v))
     form = density * ufl.dx(metadata={"quadrature_degree": cell_quadrature(2)})
     fields[1].x.array[:] = v * free
     expected = 2 * fem.assemble_scalar(fem.form(form))
@@ -181,13 +181,13 @@ model, mu = scene.model, dict(pressure=0.3, lambda_m=0.4)
 x = model.r0.x.array[: model.system.size].reshape(-1, 3)  # each node's own place makes the same u on all ranks
 u = (1e-2 * np.sin(40 * x @ np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]]))).ravel()
 for fast in (model.system, model.excluded_modes.system):
-    K, v = fast.tangent(u, mu), fast.held(np.roll(u, 3))
+    K, v = fast.tangent(u, mu), fast.zero_at_supports(np.roll(u, 3))
     given, found = K.createVecs()
     given.array[:] = v
     K.mult(given, found)
-    expected = fast.held(along(fast, u, mu, v))
+    expected = fast.zero_at_supports(along(fast, u, mu, v))
     largest = [
-        scene.comm.allreduce(np.abs(a).max(), MPI.MAX) for a in (fast.held(found.array) - expected, expected)
+        scene.comm.allreduce(np.abs(a).max(), MPI.MAX) for a in (fast.zero_at_supports(found.array) - expected, expected)
     ]
     size = K.norm()
     if scene.comm.rank == 0:

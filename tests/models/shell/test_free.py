@@ -10,7 +10,7 @@ import ufl
 from ufl.core.expr import Expr
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedConjugate, PrescribedLoad
 from magshell_fenicsx.continuation.device import Device, natural_scale
 from magshell_fenicsx.continuation.system import dot
 
@@ -48,7 +48,7 @@ def test_derivatives(file: str, symmetry: str, size: float) -> None:
     """
     system = scene(file, f"symmetry={symmetry}").model.system
     u, v = (
-        system.held(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
     )
     mu = dict.fromkeys(("lambda_m", "pressure"), 0.0) | SHIFTED
 
@@ -84,14 +84,14 @@ def test_floor_by_its_place_and_by_its_force() -> None:
     held = scene("dimple_buckling.yaml", "symmetry=axisymmetric")
     newton, system, rest = held.newton, held.model.system, held.unloaded()
     rest = rest.with_(rest.u, "bed", 0.5)
-    by_place = newton.solve(rest, "place", GivenLoad("place", -1e-3)).state
+    by_place = newton.solve(rest, "place", PrescribedLoad("place", -1e-3)).state
     force = -system.potential(by_place.u, by_place.mu, "place")
-    by_force = newton.solve(rest, "place", GivenConjugate(system, "place", force)).state
+    by_force = newton.solve(rest, "place", PrescribedConjugate(system, "place", force)).state
     assert by_force.mu["place"] == pytest.approx(-1e-3, rel=1e-8)
     scale = {"place": natural_scale(system, newton.factor_at(rest), rest, "place")}
     device = Device(system, {"place": force}, scale)
-    free = newton.on(device)
-    found = free.solve(device.enter(rest), "pressure", GivenLoad("pressure", 0.0)).state
+    free = newton.for_system(device)
+    found = free.solve(device.enter(rest), "pressure", PrescribedLoad("pressure", 0.0)).state
     assert device.leave(found).mu["place"] == pytest.approx(-1e-3, rel=1e-8)
     assert free.factor_at(found).negative_pivots == 0
 

@@ -9,15 +9,19 @@ from along import along, difference
 from conftest import TILTED, random_displacement
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grid import Grid, grid_mesh
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.msh import in_space
+from magshell_fenicsx.mesh.msh import space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.mesh.revolved import Arc, Revolved, Segment
-from magshell_fenicsx.mesh.shapes import flat
+from magshell_fenicsx.mesh.shapes import plane_embedding
+from magshell_fenicsx.mesh.surfaces_of_revolution import (
+    ArcProfile,
+    RevolvedEmbedding,
+    StraightProfile,
+)
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     EdgeForce,
@@ -39,7 +43,7 @@ def panel(size: float = 0.5) -> Midsurface:
     points = {"pole": np.array([0.5, 0.5])}
     grid = Grid((0.0, 0.0), (1.0, 1.0), size)
     return distribute(
-        grid_mesh(grid, points, Revolved(Segment((1.0, 0.0), (1.0, 1.0)), 1.0)), MPI.COMM_SELF
+        grid_mesh(grid, points, RevolvedEmbedding(StraightProfile((1.0, 0.0), (1.0, 1.0)), 1.0)), MPI.COMM_SELF
     )
 
 
@@ -55,12 +59,12 @@ def box(angle: float) -> Midsurface:
             [np.minimum(x, 0) + right * np.cos(angle), y, -right * np.sin(angle)]
         )
 
-    chart = grid_mesh(Grid((-1.0, 0.0), (1.0, 1.0), 0.5), {}, flat)
+    chart = grid_mesh(Grid((-1.0, 0.0), (1.0, 1.0), 0.5), {}, plane_embedding)
     nodes = fold(chart.nodes)
     points = {"pole": fold(np.array([[1.0, 1.0]]))[0]}
     halves = {"left half": chart.nodes[chart.cells].mean(axis=1)[:, 0] < 0}
     return distribute(
-        PatchMesh(nodes, chart.cells, in_space, chart.edges, points, patches=halves), MPI.COMM_SELF
+        PatchMesh(nodes, chart.cells, space_embedding, chart.edges, points, patches=halves), MPI.COMM_SELF
     )
 
 
@@ -111,10 +115,10 @@ def test_tangent(name: str) -> None:
     model = SHELLS[name]()
     u, v = (random_displacement(model, size, seed) for size, seed in ((1e-2, 1), (1.0, 2)))
     assert difference(model.system, u, MU) <= 1e-12
-    u, v = model.system.held(u), model.system.held(v)
+    u, v = model.system.zero_at_supports(u), model.system.zero_at_supports(v)
     step = 1e-6
     R = [model.system.residual(u + s * v, MU) for s in (step, -step)]
-    slope, exact = (R[0] - R[1]) / (2 * step), model.system.held(along(model.system, u, MU, v))
+    slope, exact = (R[0] - R[1]) / (2 * step), model.system.zero_at_supports(along(model.system, u, MU, v))
     assert np.abs(slope - exact).max() < 1e-5 * np.abs(exact).max()
 
 
@@ -122,7 +126,7 @@ def test_tangent(name: str) -> None:
 def test_residual_is_the_derivative_of_the_energy(name: str) -> None:
     model = SHELLS[name]()
     u, v = (
-        model.system.held(random_displacement(model, size, seed))
+        model.system.zero_at_supports(random_displacement(model, size, seed))
         for size, seed in ((1e-3, 1), (1.0, 2))
     )
 
@@ -208,7 +212,7 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
 def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
     """Deflection of a cantilever of length 1 under a small end force, over F/(E h_ref)."""
     surface = distribute(
-        grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, flat),
+        grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, plane_embedding),
         MPI.COMM_SELF,
     )
     force = 1e-9
@@ -217,7 +221,7 @@ def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
         surface, Material(0.0, h), degree, {"left": "clamped"}, loads, thickness=thickness
     )
     found = BorderedNewton(model.system).solve(
-        State(model.zero(), {"load": 0.0}), "load", GivenLoad("load", 1.0)
+        State(model.zero(), {"load": 0.0}), "load", PrescribedLoad("load", 1.0)
     )
     return float(model.displacement(found.state.u, "pole")[2]) / force
 
@@ -239,6 +243,6 @@ def test_uniform_factor_is_a_thickness() -> None:
 
 
 def test_arc_profile() -> None:
-    assert Arc(1.0, 0.0, np.pi / 2)(np.array([np.pi / 2])) == pytest.approx(
+    assert ArcProfile(1.0, 0.0, np.pi / 2)(np.array([np.pi / 2])) == pytest.approx(
         np.array([[0.0, 1.0]]), abs=1e-15
     )

@@ -14,8 +14,8 @@ from petsc4py import PETSc
 from scipy.integrate import solve_bvp
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.system import Skewed, Tangent
-from magshell_fenicsx.mesh.hexahedra import OUTER, face_measure
+from magshell_fenicsx.continuation.system import SkewedTangent, Tangent
+from magshell_fenicsx.mesh.hexahedra import OUTER_FACE, face_measure
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.solid import SolidModel
 
@@ -55,7 +55,7 @@ def cylinder(top: Any, model: str, symmetry: str) -> ms.Scene:
 def displacement(of: ms.Scene, seed: int, size: float = 0.02) -> Array:
     system = of.model.system
     size = size / 10 if of.problem.body else size  # its elements must not turn inside out
-    return system.held(size * np.random.default_rng(seed).standard_normal(system.size))
+    return system.zero_at_supports(size * np.random.default_rng(seed).standard_normal(system.size))
 
 
 def times(tangent: Tangent, v: Array) -> Array:
@@ -66,7 +66,7 @@ def times(tangent: Tangent, v: Array) -> Array:
         return np.array(y.array_r)
 
     return (
-        product(tangent.K) + product(tangent.N) if isinstance(tangent, Skewed) else product(tangent)
+        product(tangent.K) + product(tangent.N) if isinstance(tangent, SkewedTangent) else product(tangent)
     )
 
 
@@ -86,7 +86,7 @@ def work(of: ms.Scene, u: Array, v: Array) -> float:
         U, Us, Ws = r[0], ufl.grad(r)[0, 0], ufl.grad(r)[1, 0]
         return 2 * pi * unit * fem.assemble_scalar(fem.form((w[1] * Us - w[0] * Ws) * U * dx))
     if isinstance(model, SolidModel):
-        F, ds = ufl.Identity(3) + ufl.grad(model.u), face_measure(domain, [model.body.faces[OUTER]])
+        F, ds = ufl.Identity(3) + ufl.grad(model.u), face_measure(domain, [model.body.faces[OUTER_FACE]])
         n = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(domain)
         return unit * fem.assemble_scalar(fem.form(ufl.dot(w, n) * ds(1)))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 10})

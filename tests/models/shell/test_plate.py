@@ -9,7 +9,7 @@ from conftest import disc
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -27,7 +27,7 @@ def solve(size: float, degree: int, w0_over_h: float = 1e-4) -> tuple[float, flo
     p = 64 * D * w0_over_h * h  # over E
     amplitude = p / MATERIAL.classical_pressure
     found = BorderedNewton(model.system).solve(
-        State(model.zero(), {"pressure": 0.0}), "pressure", GivenLoad("pressure", amplitude)
+        State(model.zero(), {"pressure": 0.0}), "pressure", PrescribedLoad("pressure", amplitude)
     )
     assert found.converged
     u = found.state.u
@@ -73,7 +73,7 @@ def test_simply_supported_edge() -> None:
     p = 1e-4 * h * 64 * D * (1 + nu) / (5 + nu)
     start = State(model.zero(), {"pressure": 0.0})
     found = BorderedNewton(model.system).solve(
-        start, "pressure", GivenLoad("pressure", p / MATERIAL.classical_pressure)
+        start, "pressure", PrescribedLoad("pressure", p / MATERIAL.classical_pressure)
     )
     assert model.deflection(found.state.u, "pole") == pytest.approx(1e-4 * h, rel=1e-4)
 

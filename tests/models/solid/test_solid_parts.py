@@ -13,7 +13,7 @@ from dolfinx import fem
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
@@ -297,9 +297,9 @@ def test_a_layered_case_has_elements_for_its_layers() -> None:
     }
     scene = ms.Scene(ms.Case.from_source({**data, "mesh": {"size": 0.5}}))
     assert isinstance(scene.model, SolidModel)
-    assert np.unique(scene.model.body.between).tolist() == pytest.approx([0, 0.3, 0.5, 1])
+    assert np.unique(scene.model.body.layer_bounds).tolist() == pytest.approx([0, 0.3, 0.5, 1])
     vectors = scene.model.loads.magnetic.remanent.vectors  # type: ignore[union-attr]
-    inner = scene.model.body.between[:, 1] < 0.31
+    inner = scene.model.body.layer_bounds[:, 1] < 0.31
     assert np.allclose(vectors[inner], [1, 0, 0])
     assert np.allclose(vectors[~inner], [0, 0, 1])
 
@@ -418,14 +418,14 @@ def test_derivatives_of_a_fold() -> None:
 
     def buckling(other: ms.Scene, lambda_m: float) -> float:
         u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-        guess = Guess(State(u, {**fold.state.mu, "lambda_m": lambda_m}), phi)
+        guess = FoldGuess(State(u, {**fold.state.mu, "lambda_m": lambda_m}), phi)
         return find_fold(other.newton, guess, "pressure").state.mu["pressure"]
 
     by_field = (buckling(scene, 0.00102) - buckling(scene, 0.00098)) / 4e-5
     assert found["lambda_m"] == pytest.approx(by_field, rel=1e-3)
     amplitude = scene.problem.imperfections["defect"].amplitude
     shallow, deep = (
-        ms.Scene(scene.problem.again({"shell.defect.amplitude": amplitude + change}))
+        ms.Scene(scene.problem.with_values({"shell.defect.amplitude": amplitude + change}))
         for change in (-5e-4, 5e-4)
     )
     assert found["defect.amplitude"] == pytest.approx(

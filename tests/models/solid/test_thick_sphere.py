@@ -6,7 +6,7 @@ from bodies import hemisphere
 from dolfinx import fem
 from scipy.integrate import solve_bvp
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
@@ -81,7 +81,7 @@ def test_inflation() -> None:
         model.u, [*model._terms, *factory.pressure(1.0)], held, model._pattern, THICKNESS
     )
     path = Path(BorderedNewton(system), "pressure", "load", StepOptions(0.05, 0.1, 1e-3))
-    *_, (last, _) = path.towards(path.start(State(model.zero(), {"pressure": 0.0})), [pressure])
+    *_, (last, _) = path.continue_to(path.start(State(model.zero(), {"pressure": 0.0})), [pressure])
     X, u = (f.reshape(-1, 3) for f in (model.r0.x.array, last.state.u))
     radius = np.linalg.norm(X, axis=1)
     outwards = np.sum(u * X, axis=1) / radius

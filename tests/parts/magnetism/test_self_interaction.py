@@ -17,7 +17,7 @@ from test_interaction import BR, MU_0, Array, case_of, gradient, meshed, model
 from test_own_field import sphere_of_triangles
 
 from magshell_fenicsx import Scene
-from magshell_fenicsx.assembly.whole import Singles, WholeMatrix
+from magshell_fenicsx.assembly.dense_tangent import DenseTangent, SinglePrecisionBlocks
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.parts.magnetism.coulomb import Charged
@@ -56,7 +56,7 @@ def test_a_prism(model: Any, tmp_path: Path, h: float, polar: float) -> None:
     """The energy of a strip magnetised across or along itself is N/2 Br² V/mu_0, 1e-3."""
     scene = alone(tmp_path / "strip.msh", h, polar)
     (term,) = (each for each in scene.model.system.terms if each.name == "interaction")
-    found = scene.model.system.at(State(scene.model.zero(), {"interaction": 1.0})).of(term.energy)
+    found = scene.model.system.at_state(State(scene.model.zero(), {"interaction": 1.0})).evaluate(term.energy)
     N = demagnetising(2.5, 0.5, h / 2) if polar == 0 else demagnetising(0.5, h / 2, 2.5)
     exact = BR**2 / (MU_0 * 1e6) * N / 2 * 5.0 / 5.0**2  # of E h R²
     assert found == pytest.approx(exact, rel=1e-3)
@@ -89,7 +89,7 @@ def bent(scene: Scene) -> tuple[Vector, Array]:
         [np.cos(2 * y + x), np.sin(2 * x), np.cos(2 * x - 1.5 * y)],
     ]
     u, v = (
-        scene.model.system.held(np.column_stack(each).ravel()[: scene.model.system.size])
+        scene.model.system.zero_at_supports(np.column_stack(each).ravel()[: scene.model.system.size])
         for each in both
     )
     return u, v
@@ -109,7 +109,7 @@ def test_derivatives(model: Any, tmp_path: Path) -> None:
         for k, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     ]
     slope = gradient(scene, u)
-    energies = [(w, system.at(State(each, mu)).of(term.energy)) for w, each in moved]
+    energies = [(w, system.at_state(State(each, mu)).evaluate(term.energy)) for w, each in moved]
     assert sum(w * value for w, value in energies) == pytest.approx(slope @ v, rel=1e-6)
     assert np.abs(slope.reshape(-1, 3).sum(axis=0)).max() < 1e-12 * np.abs(slope).sum()
     rows = rows_of(system, State(u, mu), term)
@@ -221,22 +221,22 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
         (w / step, bend + c * step * v)
         for c, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     ]
-    change = sum(w * system.at(State(each.ravel(), at)).of(term.energy) for w, each in moved)
+    change = sum(w * system.at_state(State(each.ravel(), at)).evaluate(term.energy) for w, each in moved)
     assert change == pytest.approx(gradient(half, bend.ravel()) @ v.ravel(), rel=1e-6)
     slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
     term._u.x.array[:] = 0.0
-    flat = term.both(rough=False)[0]
+    flat = term.both(inexact=False)[0]
     turned, times = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel())), term._blocks.times
-    stored, rest = flat.stored, flat.stored.copy()
+    stored, rest = flat.near_blocks, flat.near_blocks.copy()
     rest.data[flat.beside] = 0.0
     exact, rounding = (
         stored @ v.ravel(),
         np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel())),
     )
     for upper in (True, False):
-        assert (np.abs(times(Singles.of(stored, upper=upper), v.ravel()) - exact) <= rounding).all()
-    others = flat.times_others(v.reshape(-1, 1))[:, 0]
+        assert (np.abs(times(SinglePrecisionBlocks.from_blocks(stored, upper=upper), v.ravel()) - exact) <= rounding).all()
+    others = flat.times_far(v.reshape(-1, 1))[:, 0]
     products = [exact + others, times(turned, v.ravel()) + rest @ v.ravel() + others]
     as_it_was, with_nodes = (np.linalg.norm(each - slope) for each in products)
     assert with_nodes < min(0.3 * as_it_was, 0.02 * np.linalg.norm(slope)), (
@@ -271,10 +271,10 @@ comm, r0 = MPI.COMM_WORLD, scene.model.r0.x.array[: system.size].reshape(-1, 3)
 x, y, _ = r0.T
 bend = np.column_stack([x * y**2, 0 * x, 0.5 - x**2])
 turn = np.column_stack([0.2 - y**2, y * x, x * y**2])
-states = [system.held(each.ravel()) for each in (0 * bend, 1e-2 * bend, 1.3e-2 * bend + 1e-3 * turn)]
+states = [system.zero_at_supports(each.ravel()) for each in (0 * bend, 1e-2 * bend, 1.3e-2 * bend + 1e-3 * turn)]
 exact = [system.residual(u, mu) for u in states[:2]]
-system.tangent(states[1], mu, rough=True)
-foreseen = system.residual(states[2], mu, rough=True)
+system.tangent(states[1], mu, inexact=True)
+foreseen = system.residual(states[2], mu, inexact=True)
 exact.append(system.residual(states[2], mu))
 assert not np.array_equal(foreseen, exact[2])
 rows = [r0, *(each.reshape(-1, 3) for each in (*exact, foreseen))]
@@ -363,5 +363,5 @@ def smooth(x: Array, sign: float) -> Array:
 
 def rows_of(system: Any, state: State, term: Any) -> Array:
     """The interaction's part of the tangent."""
-    matrix = WholeMatrix(system.u.function_space, system.clamped)
-    return np.asarray(system.at(state).of(lambda: matrix.rows(term)))
+    matrix = DenseTangent(system.u.function_space, system.clamped)
+    return np.asarray(system.at_state(state).evaluate(lambda: matrix.rows(term)))

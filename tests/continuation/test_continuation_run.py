@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from continuation.toys import Toy, closed_loop, column_of_modes, pitchfork, snap_back
 
-from magshell_fenicsx.continuation.bifurcation import branching
+from magshell_fenicsx.continuation.bifurcation import switch_branch
+from magshell_fenicsx.continuation.continuation_run import (
+    ContinuationGoal,
+    ContinuationRun,
+    Label,
+    instabilities,
+)
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions, StepTooLong
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Label, Walk, instabilities
 
 K, C = 0.4, 1.9
 FOLDS = 1 - 1 / np.sqrt(3), 1 + 1 / np.sqrt(3)
@@ -30,13 +35,15 @@ def begin(first: float = 0.05, largest: float = 0.2) -> tuple[Path, Point]:
     return path, path.start(State(np.zeros(3), {"load": 0.0}))
 
 
-def walked(goal: Goal, first: float = 0.05, largest: float = 0.2) -> list[tuple[Label, Point]]:
-    return list(Walk(*begin(first, largest), goal))
+def walked(
+    goal: ContinuationGoal, first: float = 0.05, largest: float = 0.2
+) -> list[tuple[Label, Point]]:
+    return list(ContinuationRun(*begin(first, largest), goal))
 
 
 @pytest.mark.parametrize(("first", "largest"), [(0.01, 0.05), (0.05, 0.2), (0.3, 0.6)])
 def test_all_events_of_the_path_are_located(first: float, largest: float) -> None:
-    path = walked(Goal("target", [4.0], "conjugate"), first, largest)
+    path = walked(ContinuationGoal("target", [4.0], "conjugate"), first, largest)
     events = [(label, point) for label, point in path if label in ("fold", "bifurcation")]
     assert [label for label, _ in events] == ["fold", "fold", "bifurcation"]
     assert [point.negative_pivots for _, point in events[:2]] == [0, 1]  # as before each
@@ -49,7 +56,7 @@ def test_all_events_of_the_path_are_located(first: float, largest: float) -> Non
 def test_path_passes_the_snap_back_and_its_stability_is_told() -> None:
     turns = 1 - np.sqrt((1 - K) / 3), 1 + np.sqrt((1 - K) / 3)
     backwards = 0
-    for label, point in walked(Goal("target", [4.0], "conjugate")):
+    for label, point in walked(ContinuationGoal("target", [4.0], "conjugate")):
         if label == "step":
             q, x, _ = point.state.u
             assert point.state.mu["load"] == pytest.approx(f(x), abs=1e-8)
@@ -69,18 +76,18 @@ def test_targets_are_met_on_every_part_of_the_path(below: float) -> None:
     roots = np.sort(np.roots([1, -3, 2, -target]).real)
     loads = [
         p.state.u[1]
-        for label, p in walked(Goal("points", [target], "load", steps=60))
+        for label, p in walked(ContinuationGoal("points", [target], "load", steps=60))
         if label == "target"
     ]
     assert np.sort(loads)[:3] == pytest.approx(roots, abs=1e-9)
-    label, point = walked(Goal("target", [target], "load"))[-1]
+    label, point = walked(ContinuationGoal("target", [target], "load"))[-1]
     assert (label, point.state.u[1]) == ("target", pytest.approx(roots[0], abs=1e-9))
 
 
 @pytest.mark.parametrize("largest", [0.2, 0.6])
 def test_a_walk_ends_close_behind_its_last_target(largest: float) -> None:
     """The factors of the step behind it serve there too, and the state is the toy's own."""
-    label, point = walked(Goal("target", [0.3], "load"), 0.05, largest)[-1]
+    label, point = walked(ContinuationGoal("target", [0.3], "load"), 0.05, largest)[-1]
     assert (label, point.factorisations) == ("target", 0)
     root = np.roots([1, -3, 2, -0.3]).real.min()
     assert point.state.u[1] == pytest.approx(root, abs=1e-9)
@@ -89,29 +96,32 @@ def test_a_walk_ends_close_behind_its_last_target(largest: float) -> None:
 
 @pytest.mark.parametrize(("until", "x"), [("limit", FOLDS[0]), ("bifurcation", C)])
 def test_walk_ends_where_it_shall(until: str, x: float) -> None:
-    label, point = walked(Goal(until))[-1]  # type: ignore[arg-type]
+    label, point = walked(ContinuationGoal(until))[-1]  # type: ignore[arg-type]
     assert label == ("fold" if until == "limit" else "bifurcation")
     assert point.state.mu["load"] == pytest.approx(f(x), rel=1e-8)
 
 
 def test_number_of_steps() -> None:
-    assert [label for label, _ in walked(Goal("points", steps=7))].count("step") == 7
+    assert [label for label, _ in walked(ContinuationGoal("points", steps=7))].count("step") == 7
 
 
 def test_too_long_a_walk_is_stopped() -> None:
     with pytest.raises(PathStopped, match="4 steps have not reached the bifurcation"):
-        walked(Goal("bifurcation", steps=4))
+        walked(ContinuationGoal("bifurcation", steps=4))
 
 
 def test_both_branches_of_the_pitchfork() -> None:
     path, start = begin()
-    *_, (_, point) = Walk(path, start, Goal("bifurcation"))
-    found = branching(path, point)
+    *_, (_, point) = ContinuationRun(path, start, ContinuationGoal("bifurcation"))
+    found = switch_branch(path, point)
     assert found is not None
     assert found.symmetric
     for first, sense in zip(found.starts, (1, -1), strict=True):
         sides = []
-        for _, p in [("step", first), *Walk(path, first, Goal("points", steps=10))]:
+        for _, p in [
+            ("step", first),
+            *ContinuationRun(path, first, ContinuationGoal("points", steps=10)),
+        ]:
             _, x, v = p.state.u
             assert v**2 == pytest.approx(x - C, abs=1e-8)
             assert p.state.mu["load"] == pytest.approx(f(x) - (x - C) / 2, abs=1e-8)
@@ -130,10 +140,12 @@ def test_asymmetric_branch_is_told() -> None:
     toy.hessian = lambda x: base_hessian(x) + np.diag([0.0, 2 * x[1] - 3 * x[1] ** 2])
     toy.length = 0.1
     path = Path(BorderedNewton(toy), "load", "arc", StepOptions(0.3, 0.5, 1e-6))
-    *_, (label, point) = Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("limit"))
+    *_, (label, point) = ContinuationRun(
+        path, path.start(State(np.zeros(2), {"load": 0.0})), ContinuationGoal("limit")
+    )
     assert label == "bifurcation"
     assert point.state.mu["load"] == pytest.approx(1.0, rel=1e-8)
-    found = branching(path, point)
+    found = switch_branch(path, point)
     assert found is not None
     assert not found.symmetric
     for start in found.starts:
@@ -146,8 +158,10 @@ def test_a_closed_loop_is_told() -> None:
     """Four folds on the circle; the walk ends at the first of them, met again."""
     path = Path(BorderedNewton(closed_loop()), "load", "arc", StepOptions(0.05, 0.1, 1e-7))
     walk, folds = (
-        Walk(
-            path, path.start(State(np.array([1.0, 0.0]), {"load": 0.0})), Goal("points", steps=900)
+        ContinuationRun(
+            path,
+            path.start(State(np.array([1.0, 0.0]), {"load": 0.0})),
+            ContinuationGoal("points", steps=900),
         ),
         [],
     )
@@ -171,7 +185,7 @@ def test_a_renewal_that_fails_shortens_the_step() -> None:
         return wild
 
     path, start = begin(0.1, 0.2)
-    walk = Walk(path, start, Goal("points", steps=5), renew)
+    walk = ContinuationRun(path, start, ContinuationGoal("points", steps=5), renew)
     steps = [point for _, point in walk]
     assert len(steps) == 5
     assert refused[:4] == pytest.approx([0.1, 0.1, 0.025, 0.025])  # each is asked for again
@@ -191,8 +205,8 @@ def test_a_renewal_that_need_not_be_leaves_the_steps() -> None:
         asked.append(low.s)
         return wild
 
-    goal = Goal("points", steps=5)
-    steps = [point.s for _, point in Walk(*begin(0.1, 0.2), goal, renew)]
+    goal = ContinuationGoal("points", steps=5)
+    steps = [point.s for _, point in ContinuationRun(*begin(0.1, 0.2), goal, renew)]
     assert len(asked) == 5
     assert steps == pytest.approx([point.s for _, point in walked(goal, 0.1, 0.2)], rel=1e-12)
 
@@ -204,7 +218,7 @@ def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     targets = [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]
     found = [
         p
-        for label, p in walked(Goal("points", targets, "load", steps=14), 0.3, 0.6)
+        for label, p in walked(ContinuationGoal("points", targets, "load", steps=14), 0.3, 0.6)
         if label == "target"
     ]
     x = np.array([p.state.u[1] for p in found])
@@ -214,11 +228,11 @@ def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     assert np.all(np.diff(x) > 0)  # in the order of the path
 
 
-def along_column(toy: Toy, control: str, goal: Goal) -> Walk:
+def along_column(toy: Toy, control: str, goal: ContinuationGoal) -> ContinuationRun:
     path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 1e-6))
     u = np.zeros(toy.size)
     u[0] = 0.7013
-    return Walk(path, path.start(State(u, {"load": u[0]})), goal)
+    return ContinuationRun(path, path.start(State(u, {"load": u[0]})), goal)
 
 
 @pytest.mark.parametrize("control", ["load", "arc"])
@@ -228,7 +242,7 @@ def test_a_cluster_of_modes_is_passed(control: str, count: int) -> None:
     toy, solves = column_of_modes(1e-9, 1e-4, count), list[float]()
     tangent = toy.tangent
     toy.tangent = lambda u, mu, stress=(): (solves.append(u[0]), tangent(u, mu, stress))[1]  # type: ignore[method-assign]
-    walk = along_column(toy, control, Goal("target", [1.5]))
+    walk = along_column(toy, control, ContinuationGoal("target", [1.5]))
     labels = [label for label, _ in walk]
     assert labels[-1] == "target"
     assert labels.count("bifurcation") == 1
@@ -247,7 +261,9 @@ def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> No
     toy, u = column_of_modes(1e-9, 1e-4, 2, 1.005), np.zeros(4)
     u[0] = 0.9913
     path = Path(BorderedNewton(toy), "load", control, StepOptions(0.03, 0.03, 0.02, several=0.03))
-    walk = Walk(path, path.start(State(u, {"load": u[0]})), Goal("points", steps=1))
+    walk = ContinuationRun(
+        path, path.start(State(u, {"load": u[0]})), ContinuationGoal("points", steps=1)
+    )
     events = [point for label, point in walk if label == "bifurcation"]
     assert [point.negative_pivots for point in events] == [0, 2]
     assert events[0] is walk.clusters[0][0]
@@ -257,12 +273,12 @@ def test_a_mode_behind_a_cluster_is_located_in_the_same_step(control: str) -> No
 def test_a_cluster_that_must_not_be_passed_ends_the_walk() -> None:
     """No step over it is allowed once it is known as one: the end of an earlier step is tried once,
     not for ever."""
-    walk = along_column(column_of_modes(1e-9, 1e-4), "load", Goal("target", [1.5]))
+    walk = along_column(column_of_modes(1e-9, 1e-4), "load", ContinuationGoal("target", [1.5]))
     tried = list[float]()
 
     def refused(low: Point, high: Point) -> None:
         tried.append(high.s)
-        if low.state.u[0] < 1 < high.state.u[0] and walk._allowance.clustered:
+        if low.state.u[0] < 1 < high.state.u[0] and walk._budget.clustered:
             raise StepTooLong("too long")
 
     walk._renew = refused
@@ -273,7 +289,7 @@ def test_a_cluster_that_must_not_be_passed_ends_the_walk() -> None:
 
 @pytest.mark.parametrize("control", ["load", "arc"])
 def test_modes_too_close_to_part_count_as_one(control: str) -> None:
-    walk = along_column(column_of_modes(1e-9), control, Goal("limit"))
+    walk = along_column(column_of_modes(1e-9), control, ContinuationGoal("limit"))
     *_, (label, point) = walk
     assert label == "bifurcation"
     assert not walk.clusters

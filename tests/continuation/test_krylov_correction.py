@@ -9,7 +9,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import Beside
+from magshell_fenicsx.continuation.system import CorrectedTangent
 
 Array = NDArray[np.float64]
 SIZE = 60
@@ -45,16 +45,17 @@ def test_inertia_and_solutions(soft: list[float], moved: float) -> None:
     """
     K0, D = beside(soft, moved, 1e-5)
     factors, b = Factorisation(MPI.COMM_SELF), np.cos(np.arange(SIZE))
-    factors.factor(Beside(dense(K0), Full(D)))
+    factors.factor(CorrectedTangent(dense(K0), Full(D)))
     eigenvalues = np.linalg.eigvalsh(K0 + D)
-    assert factors.doubt < np.inf, "K + D was factored itself"
+    assert factors.inertia_uncertainty < np.inf, "K + D was factored itself"
     assert factors.negative_pivots == np.sum(eigenvalues < 0)
     exact = np.linalg.solve(K0 + D, b)
     error = 1e-9 / min(1.0, 1e2 * np.abs(eigenvalues).min())
     assert np.linalg.norm(factors.solve(b) - exact) < error * np.linalg.norm(exact)
     assert np.linalg.norm(factors.times(exact) - b) < 1e-6 * np.linalg.norm(b)
     assert (
-        factors.doubt > 1 or np.sum(np.linalg.eigvalsh(K0 + 2 * D) < 0) == factors.negative_pivots
+        factors.inertia_uncertainty > 1
+        or np.sum(np.linalg.eigvalsh(K0 + 2 * D) < 0) == factors.negative_pivots
     )
 
 
@@ -62,8 +63,8 @@ def test_what_is_not_small() -> None:
     """Where D is as large as K the sum is factored: the inertia is that of all entries."""
     K0, D = beside([], 0.0, 300.0)
     factors = Factorisation(MPI.COMM_SELF)
-    factors.factor(Beside(dense(K0), Full(D)))
-    assert factors.doubt == np.inf
+    factors.factor(CorrectedTangent(dense(K0), Full(D)))
+    assert factors.inertia_uncertainty == np.inf
     assert factors.negative_pivots == np.sum(np.linalg.eigvalsh(K0 + D) < 0) > 0
 
 
@@ -80,10 +81,10 @@ def test_an_older_part_is_corrected_where_the_count_depends_on_it() -> None:
         return present @ v
 
     factors = Factorisation(MPI.COMM_SELF)
-    factors.factor(Beside(dense(K), Full(D), Full(D), times))
+    factors.factor(CorrectedTangent(dense(K), Full(D), Full(D), times))
     of_older, of_present = (int(np.sum(np.linalg.eigvalsh(K + each) < 0)) for each in (D, present))
     assert factors.negative_pivots == of_present != of_older
-    assert factors.doubt < 1.0
+    assert factors.inertia_uncertainty < 1.0
     assert 0 < products <= 2
 
 
@@ -99,7 +100,9 @@ def test_an_older_part_that_was_small_and_is_not_makes_no_count_certain(grown: f
     soft = np.linalg.eigh(K)[1][:, :1]
     present = D if grown == 1.0 else D + grown * soft @ soft.T
     factors = Factorisation(MPI.COMM_SELF)
-    factors.factor(Beside(dense(K), Full(D), Full(D), lambda v: present @ v, lambda v: present @ v))
+    factors.factor(
+        CorrectedTangent(dense(K), Full(D), Full(D), lambda v: present @ v, lambda v: present @ v)
+    )
     of_older, of_present = (int(np.sum(np.linalg.eigvalsh(K + each) < 0)) for each in (D, present))
     assert factors.negative_pivots == of_older == 0
-    assert (factors.doubt <= 1.0) == (of_present == of_older)
+    assert (factors.inertia_uncertainty <= 1.0) == (of_present == of_older)

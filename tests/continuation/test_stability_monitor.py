@@ -11,13 +11,13 @@ from continuation.toys import snap_through
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path
 from magshell_fenicsx.continuation.point import PathStopped, StepOptions
+from magshell_fenicsx.continuation.stability_monitor import Crossing, StabilityMonitor
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Walk
-from magshell_fenicsx.continuation.watch import Crossing, Watch
 
 Eigenvalues = Callable[[float], list[float]]
 
@@ -85,10 +85,13 @@ def watched(
     """All crossings, and the number of unstable directions that was told at every x."""
     toy, load = snap_through(), start**3 - 3 * start**2 + 2 * start
     path = Path(BorderedNewton(toy), "load", control, StepOptions(step, step, 1e-7))
-    watch, first = Watch(Several(families)), path.start(State(np.array([start]), {"load": load}))
+    watch, first = (
+        StabilityMonitor(Several(families)),
+        path.start(State(np.array([start]), {"load": load})),
+    )
     watch.begin(path, first)
     found, told = list[Crossing](), list[tuple[float, int]]()
-    for _, point in Walk(path, first, Goal("points", steps=points)):
+    for _, point in ContinuationRun(path, first, ContinuationGoal("points", steps=points)):
         found += watch.pass_to(point)
         told.append((float(point.state.u[0]), watch.unstable))
     return found + watch.end(), told
@@ -171,11 +174,11 @@ def test_what_was_unstable_before_is_no_crossing() -> None:
     """A path that begins with the instabilities with which another one ended, elsewhere."""
     family = Several([Diagonal("a", lambda x: [0.2 - x]), Diagonal("b", lambda x: [5.0])])
     path = Path(BorderedNewton(snap_through()), "load", "arc", StepOptions(0.05, 0.05, 1e-7))
-    watch, found = Watch(family), list[Crossing]()
+    watch, found = StabilityMonitor(family), list[Crossing]()
     for x in (0.0, 0.4):
         start = path.start(State(np.array([x]), {"load": x**3 - 3 * x**2 + 2 * x}))
         watch.begin(path, start)
-        for _, point in Walk(path, start, Goal("points", steps=20)):
+        for _, point in ContinuationRun(path, start, ContinuationGoal("points", steps=20)):
             found += watch.pass_to(point)
     assert [c.label for c in found] == ["a"]
     assert found[0].point.state.u[0] == pytest.approx(0.2)
@@ -188,15 +191,15 @@ def test_crossing_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch
     def lost(*args: object) -> None:
         raise PathStopped("the iteration diverged", args[1])  # type: ignore[arg-type]
 
-    monkeypatch.setattr("magshell_fenicsx.continuation.watch.locate_bifurcation", lost)
+    monkeypatch.setattr("magshell_fenicsx.continuation.stability_monitor.locate_bifurcation", lost)
     toy = snap_through()
     path = Path(BorderedNewton(toy), "load", "arc", StepOptions(0.05, 0.05, 1e-7))
     watch, first = (
-        Watch(Several([Diagonal("excluded", lambda x: [0.7 - x])])),
+        StabilityMonitor(Several([Diagonal("excluded", lambda x: [0.7 - x])])),
         path.start(State(np.zeros(1), {"load": 0.0})),
     )
     watch.begin(path, first)
-    for _, point in Walk(path, first, Goal("points", steps=20)):
+    for _, point in ContinuationRun(path, first, ContinuationGoal("points", steps=20)):
         assert watch.pass_to(point) == []
     assert watch.unlocated == "the iteration diverged"
     assert watch.unstable == 1

@@ -1,0 +1,444 @@
+"""The dense tangent of terms that couple all unknowns, as a correction of the sparse matrix.
+
+The Hessian of such a term has blocks between nodes that are near each other, which are stored, and
+all other entries, of which only products with vectors are computed. Stored entries that the sparse
+matrix has too are added to it. The remainder is then small compared with it, and a factorisation of
+the sparse matrix mostly serves (`continuation.krylov_correction`). The sum is a matrix of PETSc
+with all entries, whose factorisation, inertia, limit points and modes are those of any system. Its
+memory and the cost of its factorisation grow with the square and the cube of the number of
+unknowns. Theory: docs/theory.md, interaction of the magnetisation with its own field.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from scipy.sparse import bsr_array, csr_array
+
+from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.continuation.system import CorrectedTangent, DenseCorrection, Vector
+from magshell_fenicsx.platform.native import native
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int32]
+PRODUCT_COLUMNS = 128  # vectors that are multiplied at once where all entries are needed
+C_DECLARATIONS = "\n".join(
+    f"void {name}(int64_t, const int32_t *, const int32_t *, const {number} *, const double *,"
+    " double *);"
+    for name, number in (
+        ("multiply_doubles", "double"),
+        ("multiply_floats", "float"),
+        ("multiply_upper", "float"),
+    )
+)
+
+
+class DenseHessian(Protocol):
+    """This rank's part of a second derivative, without supports; it does not change.
+
+    Attributes
+    ----------
+    near_blocks
+        (3 local nodes with ghosts, 3 all nodes) the blocks between nodes near each other, each
+        row's columns in order.
+    """
+
+    @property
+    def near_blocks(self) -> bsr_array: ...
+
+    def times_far(self, v: Array) -> Array:
+        """Return the product of all other entries with vectors; collective.
+
+        Parameters
+        ----------
+        v
+            (3 all nodes, n), the same on every rank.
+
+        Returns
+        -------
+        Array
+            (3 local nodes with ghosts, n), this rank's part.
+        """
+
+
+@runtime_checkable
+class DenseTerm(Term, Protocol):
+    """A term whose tangent couples nodes that share no cell and no edge."""
+
+    def hessian(self, *, inexact: bool = False) -> DenseHessian:
+        """Return d2Pi/du2; if `inexact`, it may be that of an earlier state. Collective."""
+
+    def add_extrapolated_residual(self, b: Array, factor: float) -> None:
+        """Add factor dPi/du to b, extrapolated from forces at earlier states; collective."""
+
+    def extrapolation_holds_along(self, step: Array) -> bool:
+        """Return whether extrapolated forces are accurate along a direction; collective.
+
+        Parameters
+        ----------
+        step
+            A change of all local unknowns, with ghosts.
+        """
+
+
+@dataclass(frozen=True)
+class SinglePrecisionBlocks:
+    """A matrix of (3, 3) blocks in single precision.
+
+    Attributes
+    ----------
+    starts
+        (rows of blocks + 1,) number of the first block of each row.
+    columns
+        (blocks,) each row's in order.
+    values
+        (blocks, 3, 3).
+    upper
+        Whether the matrix is symmetric and blocks below the diagonal are left out.
+    """
+
+    starts: Indices
+    columns: Indices
+    values: NDArray[np.float32]
+    upper: bool
+
+    @classmethod
+    def from_blocks(cls, A: bsr_array, *, upper: bool) -> "SinglePrecisionBlocks":
+        """Return a copy of a matrix; if `upper`, the matrix is symmetric."""
+        if not upper:
+            starts = np.asarray(A.indptr, dtype=np.int32)
+            columns = np.asarray(A.indices, dtype=np.int32)
+            return cls(starts, columns, A.data.astype(np.float32), upper)
+        is_upper = np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr)) <= A.indices
+        starts = np.append(0, np.cumsum(is_upper, dtype=np.int32))[A.indptr].astype(np.int32)
+        columns = A.indices[is_upper].astype(np.int32)
+        return cls(starts, columns, A.data[is_upper].astype(np.float32), upper)
+
+
+class BlockProducts:
+    """Products of matrices of (3, 3) blocks with vectors; the constructor is collective."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        source = Path(__file__).with_name("dense_tangent.c")
+        self._ffi, self._lib = native(source, C_DECLARATIONS, comm)
+
+    def times(self, A: bsr_array | SinglePrecisionBlocks, v: Array) -> Array:
+        """Return A v."""
+        pointer, lib = self._ffi.from_buffer, self._lib
+        if isinstance(A, SinglePrecisionBlocks):
+            starts, columns = A.starts, A.columns
+            values = pointer("float[]", A.values)
+            multiply = lib.multiply_upper if A.upper else lib.multiply_floats
+            x = np.ascontiguousarray(v) if A.upper else _three_times(v)
+        else:
+            starts = np.asarray(A.indptr, dtype=np.int32)
+            columns = np.asarray(A.indices, dtype=np.int32)
+            values = pointer("double[]", np.ascontiguousarray(A.data))
+            multiply, x = lib.multiply_doubles, _three_times(v)
+        product = np.empty(3 * (len(starts) - 1))
+        multiply(
+            len(starts) - 1,
+            pointer("int32_t[]", starts),
+            pointer("int32_t[]", columns),
+            values,
+            pointer("double[]", x),
+            pointer("double[]", product),
+        )
+        return product
+
+
+def _three_times(v: Array) -> Array:
+    """Return (nodes, 9): the three components of each node, three times."""
+    return np.tile(v.reshape(-1, 3), 3)
+
+
+@dataclass(frozen=True)
+class ScaledHessian:
+    """The Hessian of a term times a factor.
+
+    Attributes
+    ----------
+    near_blocks
+        Stored blocks in the rows of this rank's own unknowns.
+    single_blocks
+        The same in single precision, for products that need not be better.
+    hessian
+        The Hessian, for its products.
+    left_out
+        Entries that are not counted, since the sparse matrix has them.
+    """
+
+    factor: float
+    near_blocks: bsr_array
+    single_blocks: SinglePrecisionBlocks
+    hessian: DenseHessian
+    left_out: csr_array | None = None
+
+
+@dataclass(frozen=True)
+class DenseRemainder:
+    """Scaled Hessians without the rows and columns of supports.
+
+    It is a `continuation.system.DenseCorrection`.
+    """
+
+    matrix: "DenseTangent"
+    parts: Sequence[ScaledHessian]
+
+    def times(self, v: Vector) -> Vector:
+        """Return the product with a vector. Collective."""
+        own_fixed, all_fixed = self.matrix.fixed
+        all_entries = np.concatenate(self.matrix.comm.allgather(v))
+        x = np.where(all_fixed, 0.0, all_entries)
+        return np.where(own_fixed, 0.0, self.matrix.product(self.parts, x, single=True))
+
+    def scaled(self, factor: float) -> "DenseRemainder":
+        """Return the correction times a factor."""
+        parts = [replace(part, factor=factor * part.factor) for part in self.parts]
+        return DenseRemainder(self.matrix, parts)
+
+    def multiple_of(self, other: DenseCorrection) -> float:
+        """Return the factor between this correction and another; 0 if it is no known multiple."""
+        if not isinstance(other, DenseRemainder) or len(other.parts) != len(self.parts):
+            return 0.0
+        pairs = list(zip(self.parts, other.parts, strict=True))
+        factors = {mine.factor / theirs.factor for mine, theirs in pairs}
+        same_hessians = all(mine.hessian is theirs.hessian for mine, theirs in pairs)
+        return factors.pop() if len(factors) == 1 and same_hessians else 0.0
+
+    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
+        """Return K plus this correction, with all entries; reused by the next call. Collective."""
+        return self.matrix.sum(K, self.parts)
+
+
+class DenseTangent:
+    """A symmetric matrix with all entries, always the same object.
+
+    Clamped unknowns are treated as in `scatter.BlockMatrix`. The constructor is collective.
+
+    Parameters
+    ----------
+    clamped
+        Homogeneous Dirichlet conditions.
+
+    Attributes
+    ----------
+    fixed
+        Whether unknowns are clamped: the own ones, and all.
+    """
+
+    def __init__(self, V: fem.FunctionSpace, clamped: Sequence[fem.DirichletBC]) -> None:
+        comm, nodes = V.mesh.comm, V.dofmap.index_map
+        self._owned, self._ghosts = nodes.size_local, nodes.num_ghosts
+        self._first, self._count = nodes.local_range[0], nodes.size_global
+        self._ghost_numbers = nodes.local_to_global(
+            np.arange(self._owned, self._owned + self._ghosts, dtype=np.int32)
+        )
+        self._ghost_owners = nodes.owners
+        n = 3 * self._owned
+        is_clamped = np.zeros(n, dtype=bool)
+        for bc in clamped:
+            dofs = bc.dof_indices()[0]
+            is_clamped[dofs[dofs < n]] = True
+        self._products = BlockProducts(comm)
+        self.comm = comm
+        self.fixed = is_clamped, np.concatenate(comm.allgather(is_clamped))
+        self._dense: tuple[Array, Array, PETSc.Mat] | None = None
+        self._blocks_of_terms: dict[str, tuple[DenseHessian, bsr_array, SinglePrecisionBlocks]] = {}
+        self._latest_common: tuple[bsr_array, csr_array] | None = None
+
+    def _create_dense(self) -> tuple[Array, Array, PETSc.Mat]:
+        """Return entries in columns of own unknowns, those in others, and their matrix.
+
+        The matrix shares the memory of both arrays.
+        """
+        n, first, total = 3 * self._owned, 3 * self._first, 3 * self._count
+        kind = PETSc.IntType
+        inner, outer = np.zeros((n, n)), np.zeros((n, total - n))
+        inner_starts = np.arange(0, n * n + 1, n or 1, dtype=kind)[: n + 1]
+        if total > n:
+            outer_starts = np.arange(0, n * (total - n) + 1, total - n, dtype=kind)[: n + 1]
+        else:
+            outer_starts = np.zeros(n + 1, dtype=kind)
+        arrays = [(inner_starts, np.tile(np.arange(n, dtype=kind), n), inner.reshape(-1))]
+        if self.comm.size > 1:
+            others = np.delete(np.arange(total, dtype=kind), np.s_[first : first + n])
+            arrays.append((outer_starts, np.tile(others, n), outer.reshape(-1)))
+        size = ((n, None), (n, None))
+        K = PETSc.Mat().createAIJWithArrays(
+            size, arrays[0] if len(arrays) == 1 else tuple(arrays), comm=self.comm
+        )
+        self._shared_arrays = arrays  # PETSc does not keep them alive
+        for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
+            K.setOption(option, True)
+        return inner, outer, K
+
+    def corrected(
+        self, K: PETSc.Mat, terms: Sequence[tuple[float, DenseTerm]], *, inexact: bool = False
+    ) -> CorrectedTangent:
+        """Return a sparse matrix with terms times factors: their entries in it, and the remainder.
+
+        Entries of the terms that K has are added to it. Collective.
+        """
+        starts, columns, values = K.getValuesCSR()
+        scaled = [self.scaled_hessian(factor, term, inexact=inexact) for factor, term in terms]
+        remainders = list[ScaledHessian]()
+        for part in scaled:
+            common = self._common_entries(starts, columns, part)
+            values += part.factor * common.data
+            remainders.append(replace(part, left_out=common))
+        K.setValuesCSR(starts, columns, values)
+        K.assemble()
+        return CorrectedTangent(K, DenseRemainder(self, remainders), DenseRemainder(self, scaled))
+
+    def _common_entries(
+        self, starts: NDArray[np.intp], columns: NDArray[np.intp], part: ScaledHessian
+    ) -> csr_array:
+        """Return a term's entries, without its factor, in the pattern of a sparse matrix.
+
+        They are computed once for each pattern.
+        """
+        latest = self._latest_common
+        if latest is not None and latest[0] is part.near_blocks:
+            common = latest[1]
+            if np.array_equal(common.indices, columns) and np.array_equal(common.indptr, starts):
+                return common
+        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        own_fixed, all_fixed = self.fixed
+        free = ~(own_fixed[rows] | all_fixed[columns])
+        values = np.where(free, _entries(part.near_blocks, rows, columns), 0.0)
+        common = csr_array((values, columns, starts), part.near_blocks.shape)
+        self._latest_common = part.near_blocks, common
+        return common
+
+    def sum(self, K: PETSc.Mat, parts: Sequence[ScaledHessian]) -> PETSc.Mat:
+        """Return a sparse matrix plus scaled Hessians, with all entries. Collective."""
+        n, first, (own_fixed, all_fixed) = 3 * self._owned, 3 * self._first, self.fixed
+        self._dense = inner, outer, matrix = self._dense or self._create_dense()
+        # On one rank the rows are the matrix's own memory.
+        rows = inner if self.comm.size == 1 else np.empty((n, 3 * self._count))
+        rows[:] = 0.0
+        for part in parts:
+            rows += part.factor * self._all_rows(part)
+        rows[own_fixed], rows[:, all_fixed] = 0.0, 0.0
+        starts, columns, values = K.getValuesCSR()
+        rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
+        if self.comm.size > 1:
+            inner[:] = rows[:, first : first + n]
+            outer[:] = np.delete(rows, np.s_[first : first + n], axis=1)
+        matrix.stateIncrease()
+        return matrix
+
+    def scaled_hessian(
+        self, factor: float, term: DenseTerm, *, inexact: bool = False
+    ) -> ScaledHessian:
+        """Return the Hessian of a term, its stored blocks summed over the ranks. Collective."""
+        hessian = term.hessian(inexact=inexact)
+        blocks = self._blocks_of_terms.get(term.name)
+        if blocks is None or blocks[0] is not hessian:
+            near_blocks = self._sum_blocks(hessian.near_blocks)
+            single = SinglePrecisionBlocks.from_blocks(near_blocks, upper=self.comm.size == 1)
+            blocks = self._blocks_of_terms[term.name] = hessian, near_blocks, single
+        return ScaledHessian(factor, *blocks[1:], hessian)
+
+    def rows(self, term: DenseTerm) -> Array:
+        """Return the rows (own unknowns, all) of a term's Hessian, supports too. Collective."""
+        return self._all_rows(self.scaled_hessian(1.0, term))
+
+    def product(self, parts: Sequence[ScaledHessian], x: Array, *, single: bool = False) -> Array:
+        """Return scaled Hessians times a vector, supports too. Collective.
+
+        Parameters
+        ----------
+        x
+            Of all unknowns.
+        single
+            Whether stored blocks are taken in single precision.
+
+        Returns
+        -------
+        Array
+            Of own unknowns.
+        """
+        product = np.zeros(3 * self._owned)
+        for part in parts:
+            far = part.hessian.times_far(x[:, None]).reshape(-1, 3)
+            near = self._products.times(part.single_blocks if single else part.near_blocks, x)
+            product += part.factor * (near + self._sum_rows(far).ravel())
+            if part.left_out is not None:
+                product -= part.factor * (part.left_out @ x)
+        return product
+
+    def times(self, terms: Sequence[tuple[float, DenseTerm]], v: Array) -> Array:
+        """Return the terms' product with a vector, both with ghosts. Collective.
+
+        Ghosts are zero in the product.
+        """
+        n = 3 * self._owned
+        x, product = np.concatenate(self.comm.allgather(v[:n])), np.zeros_like(v)
+        parts = [self.scaled_hessian(factor, term) for factor, term in terms]
+        product[:n] = self.product(parts, x)
+        return product
+
+    def _all_rows(self, part: ScaledHessian) -> Array:
+        """Return all entries of own rows, without the factor."""
+        left_out = 0.0 if part.left_out is None else part.left_out.toarray()
+        rows = part.near_blocks.toarray() - left_out
+        for first in range(0, 3 * self._count, PRODUCT_COLUMNS):
+            count = min(PRODUCT_COLUMNS, 3 * self._count - first)
+            unit_vectors = np.eye(3 * self._count, count, -first)
+            far = part.hessian.times_far(unit_vectors).reshape(-1, 3, count)
+            rows[:, first : first + PRODUCT_COLUMNS] += self._sum_rows(far).reshape(len(rows), -1)
+        return np.asarray(rows)
+
+    def _sum_rows(self, rows: Array) -> Array:
+        """Return the rows of own nodes, from (local nodes, ...) of all ranks."""
+        if self.comm.size == 1:
+            return rows
+        own, ghosts = rows[: self._owned].copy(), rows[self._owned :]
+        sent = [(self._ghost_numbers[i], ghosts[i]) for i in self._ghosts_of_ranks]
+        for numbers, received in self.comm.alltoall(sent):
+            np.add.at(own, numbers - self._first, received)
+        return own
+
+    def _sum_blocks(self, rows: bsr_array) -> bsr_array:
+        """Return the rows of own unknowns, from those of local unknowns of all ranks."""
+        if self.comm.size == 1:
+            return rows
+        n = 3 * self._owned
+        own, ghosts = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
+        sent = list[tuple[NDArray[np.generic], ...]]()
+        for nodes in self._ghosts_of_ranks:
+            mask = np.isin(ghosts.row // 3, nodes)
+            row = 3 * self._ghost_numbers[ghosts.row[mask] // 3] + ghosts.row[mask] % 3
+            sent.append((row, ghosts.col[mask], ghosts.data[mask]))
+        for row, column, data in self.comm.alltoall(sent):
+            own = own + csr_array((data, (row - 3 * self._first, column)), own.shape)
+        blocks = own.tobsr((3, 3))
+        blocks.sort_indices()
+        return blocks
+
+    @cached_property
+    def _ghosts_of_ranks(self) -> list[NDArray[np.intp]]:
+        """The ghosts that each rank owns, counted from the first ghost."""
+        return [np.flatnonzero(self._ghost_owners == rank) for rank in range(self.comm.size)]
+
+
+def _entries(blocks: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
+    """Return entries of a matrix of blocks whose columns are in order; zero where no block is."""
+    width, count = blocks.shape[1] // 3, len(blocks.indptr) - 1
+    block_rows = np.repeat(np.arange(count, dtype=np.int64), np.diff(blocks.indptr))
+    block_keys = block_rows * width + blocks.indices
+    entry_keys = rows.astype(np.int64) // 3 * width + columns // 3
+    if not len(block_keys):
+        return np.zeros(len(entry_keys))
+    positions = np.minimum(np.searchsorted(block_keys, entry_keys), len(block_keys) - 1)
+    values = blocks.data[positions, rows % 3, columns % 3]
+    return np.where(block_keys[positions] == entry_keys, values, 0.0)

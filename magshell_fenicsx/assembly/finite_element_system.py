@@ -1,0 +1,498 @@
+"""A system of energy terms on a finite-element space, as the solvers see it.
+
+A state is evaluated, never visited: what `FiniteElementSystem.at_state` returns is a function of
+the state alone. History variables stand in the state too; `FiniteElementSystem.advance` updates
+them when a path accepts it. Theory: docs/theory.md, equilibrium and continuation.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from dolfinx.la import InsertMode
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.dense_tangent import DenseTerm
+from magshell_fenicsx.assembly.evaluation import Evaluation, Noise
+from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter, SettableNumber
+from magshell_fenicsx.assembly.nonlocal_terms import added_tangents, dense_terms
+from magshell_fenicsx.assembly.oblique_supports import Constraint, ObliqueSupport, Projection
+from magshell_fenicsx.assembly.prescribed_motion import PrescribedMotion
+from magshell_fenicsx.assembly.terms import (
+    AngleTerm,
+    FormTerm,
+    ResidualAssembler,
+    TangentAssembler,
+    Term,
+    factor_of,
+)
+from magshell_fenicsx.continuation.factor import Stopwatch
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    CorrectedTangent,
+    SkewedTangent,
+    State,
+    Vector,
+    WeightedDisplacement,
+    symmetric_part,
+)
+from magshell_fenicsx.platform import compat
+
+# A number that terms depend on, and its value in a state that does not have it.
+Setting: TypeAlias = tuple[SettableNumber, float]
+
+# Largest displacement of a step for differences of the dense terms' forces, over the length.
+DENSE_DIFFERENCE_STEP = 1e-5
+
+
+class FiniteElementSystem:
+    """Sum of terms for a displacement u with supports.
+
+    Parameters
+    ----------
+    u
+        The displacement in the terms' forms; it is overwritten.
+    supports
+        Constraints where u, or a component of it in any direction, is zero.
+    pattern
+        The term with the widest coupling; it determines the sparsity of the tangent.
+    length
+        See `System`.
+    assembler
+        Computes the tangent with the same supports, instead of the terms' forms.
+    gradients
+        Computes the residual, instead of the terms' forms.
+    parameters
+        Free parameters of terms, by name.
+    moving
+        Prescribed displacement E(mu) of nodes among the supported ones. Increments of u are zero
+        there, and whatever u holds there is replaced by E(mu).
+    history
+        History variables, stored in a state next to its load parameters: name -> the number in the
+        terms, and its value where a state has none.
+
+    Attributes
+    ----------
+    u
+        The displacement in the terms' forms: that of the latest evaluation.
+    history
+        The given ones, and the reference angles of edges under moments.
+    nan_terms
+        Names of the terms that were not numbers at the latest residual that was none.
+    coordinates
+        See `System`.
+    """
+
+    def __init__(
+        self,
+        u: fem.Function,
+        terms: Sequence[Term],
+        supports: Sequence[Constraint],
+        pattern: FormTerm,
+        length: float,
+        assembler: TangentAssembler | None = None,
+        gradients: ResidualAssembler | None = None,
+        parameters: Mapping[str, FreeParameter] | None = None,
+        moving: PrescribedMotion | None = None,
+        history: Mapping[str, Setting] | None = None,
+    ) -> None:
+        V = u.function_space
+        self.u, self.terms, self.length = u, terms, length
+        self.comm = V.mesh.comm
+        self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+        self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+        self._set_supports(V, supports)
+        self.parameters = parameters or {}
+        self.moving, self.edge_pressure = moving, moving.edge_pressure if moving else None
+        self._angle_terms = [t for t in terms if isinstance(t, AngleTerm)]
+        reference_angles = {t.turn: (t, 0.0) for t in self._angle_terms}
+        self.history: dict[str, Setting] = {**(history or {}), **reference_angles}
+        constants = {name: parameter.constant for name, parameter in self.parameters.items()}
+        settings = {name: (number, float(number.value)) for name, number in constants.items()}
+        self._settings = settings | self.history
+        self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
+        self.nan_terms: list[str] = []
+        self.assembly, self.noise = Stopwatch(), Noise.from_environment()
+        self.added_tangents = added_tangents(V, terms, self.clamped)
+        self.dense_terms = dense_terms(V, terms, self.clamped)
+        self._b = fem.Function(V)
+        self._assembler, self.gradients = assembler, gradients
+        self._N: PETSc.Mat | None = None
+        self._terms_with_residual = [
+            t for t in terms if gradients is None or t.name not in gradients.names
+        ]
+        for term in self._terms_with_residual:
+            term.compile_residual()
+        if assembler is None:
+            for term in terms:
+                term.compile_tangent()
+            self._K = fem_petsc.create_matrix(pattern.tangent_form)
+            self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self._K_free = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
+
+    def _set_supports(self, V: fem.FunctionSpace, supports: Sequence[Constraint]) -> None:
+        """Sort the supports into Dirichlet conditions and a projection."""
+        self.clamped = [c for c in supports if isinstance(c, fem.DirichletBC)]
+        oblique = [c for c in supports if isinstance(c, ObliqueSupport)]
+        self.projection = Projection(V, oblique, self.clamped) if oblique else None
+        no_dofs = np.empty(0, dtype=np.int32)
+        fixed = np.unique(np.concatenate([no_dofs, *(bc.dof_indices()[0] for bc in self.clamped)]))
+        self._fixed = fixed[fixed < self.size]
+
+    def with_number(self, name: str, number: SettableNumber, value: float) -> "FiniteElementSystem":
+        """Return the same system with one more number of its terms.
+
+        All states that do not have the number by this name have the given value of it.
+        """
+        other = copy(self)
+        other._settings = {name: (number, value)} | self._settings
+        if self._assembler is None:
+            other._K = self._K.duplicate()
+        return other
+
+    @property
+    def has_dense_terms(self) -> bool:
+        """Whether terms couple all unknowns; see `continuation.system.InexactSystem`."""
+        return self.dense_terms is not None
+
+    def at_state(self, state: State) -> Evaluation:
+        """Return the evaluation of the system at a state."""
+        return Evaluation(self, state.u, state.mu)
+
+    def advance(self, state: State, before: Amplitudes) -> State:
+        """Return an accepted state with its history, from the amplitudes of the state before.
+
+        Edges under moments turn by less than half a turn in a step.
+        """
+        if not self._angle_terms:
+            return state
+        past = {t.turn: before.get(t.turn, 0.0) for t in self._angle_terms}
+        angles = self.at_state(State(state.u, state.mu | past)).evaluate(
+            lambda: {t.turn: t.angle() for t in self._angle_terms}
+        )
+        return State(state.u, state.mu | angles)
+
+    def with_moved_supports(self, state: State) -> State:
+        """Return the state with the displacement of the nodes that move in its u."""
+        if not self.moving:
+            return state
+        return State(self.with_ghosts(state.u, state.mu)[: self.size], state.mu)
+
+    def with_ghosts(self, u: Vector, mu: Amplitudes | None = None) -> NDArray[np.float64]:
+        """Return the displacement of all local nodes, with E(mu) where nodes move if mu is given.
+
+        Collective.
+        """
+        self._b.x.array[: self.size] = u
+        self._b.x.scatter_forward()
+        local = np.array(self._b.x.array)
+        if self.moving and mu is not None:
+            self.moving.put(local, mu)
+        return local
+
+    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
+        """Return dPi/du, see `System` and `InexactSystem`. Collective."""
+        return Evaluation(self, u, mu).residual(inexact=inexact)
+
+    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
+        """Return whether extrapolated forces are accurate along du, see `InexactSystem`."""
+        step = self.with_ghosts(du)
+        terms = self.dense_terms.terms if self.dense_terms else ()
+        evaluation = self.at_state(State(u, dict(mu)))
+        return all(evaluation.evaluate(lambda: [t.extrapolation_holds_along(step) for t in terms]))
+
+    def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
+        """Return dPi/du at all nodes, see `Evaluation.forces`. Collective."""
+        return Evaluation(self, u, mu).forces(name)
+
+    def load(self, u: Vector, mu: Amplitudes, name: str, *, constrained: bool = True) -> Vector:
+        """Return d2Pi/du dmu; zero at supports if `constrained`. Collective."""
+        return Evaluation(self, u, mu).load(name, constrained=constrained)
+
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        """Return dPi/dmu, on every rank. Collective."""
+        return Evaluation(self, u, mu).potential(name)
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        """Return d2Pi/dmu_i dmu_j, on every rank. Collective.
+
+        It is zero between amplitudes that multiply their terms.
+        """
+        if not {name, other} & self.coordinates:
+            return 0.0
+        return Evaluation(self, u, mu).curvature(name, other)
+
+    def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
+        """Return the potential of each term, see `Evaluation.energies`. Collective.
+
+        Supports do not move if no amplitudes are given.
+        """
+        return Evaluation(self, u, mu or {}).energies()
+
+    def stored_energy(self, u: Vector, mu: Amplitudes) -> float:
+        """Return the energy without the potentials of loads. Collective."""
+        return Evaluation(self, u, mu).stored_energy()
+
+    def tangent(
+        self,
+        u: Vector,
+        mu: Amplitudes,
+        stress: Sequence[WeightedDisplacement] = (),
+        times: Mapping[str, float] | None = None,
+        *,
+        inexact: bool = False,
+    ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
+        """Assemble d2Pi/du2, see `System` and `InexactSystem`. Collective.
+
+        Parameters
+        ----------
+        times
+            Factors of the tangents of some terms, by name.
+        inexact
+            Whether the dense terms may have the tangent of an earlier state.
+        """
+        return Evaluation(self, u, mu).tangent(stress, times, inexact=inexact)
+
+    def zero_at_supports(self, u: Vector) -> Vector:
+        """Return the displacement with zeros at the supports."""
+        u = np.array(u)
+        self._constrain(u)
+        return u
+
+    def _constrain(self, u: Vector) -> None:
+        u[self._fixed] = 0
+        if self.projection:
+            self.projection.project(u)
+
+    def _put(self, u: Vector, mu: Amplitudes) -> None:
+        """Set the displacement, the numbers in terms and the nodes that move."""
+        for name, (number, value) in self._settings.items():
+            number.value = mu.get(name, value)
+        self.u.x.array[: self.size] = u
+        self.u.x.scatter_forward()
+        if self.moving:
+            self.moving.turn(mu)
+            if self.moving.names <= mu.keys():
+                self.moving.put(self.u.x.array, mu)
+
+    def _finite(self, value: float) -> bool:
+        """Return whether a number is finite on all ranks."""
+        finite = bool(np.isfinite(value))
+        return finite if self.comm.size == 1 else bool(self.comm.allreduce(finite, MPI.LAND))
+
+    def step_along(self, v: Vector, fraction: float) -> float:
+        """Return the factor of v whose largest entry is a fraction of the system's length.
+
+        Collective.
+        """
+        largest = self.comm.allreduce(float(np.abs(v).max(initial=0.0)), MPI.MAX)
+        return float(fraction * self.length / (largest or 1.0))
+
+    def lid_potential(self, mu: Amplitudes, *names: str) -> float:
+        """Return the derivative of p V by one or two amplitudes, V the volume that lids sweep."""
+        pressure = self.edge_pressure
+        if pressure is None:
+            return 0.0
+        motions = [name for name in names if name != pressure.load]
+        if len(names) - len(motions) > 1:
+            return 0.0
+        by_pressure = len(motions) < len(names)
+        factor = pressure.unit if by_pressure else pressure.unit * mu.get(pressure.load, 0.0)
+        derivatives = pressure.swept_volume, pressure.volume_slope, pressure.volume_curvature
+        return factor * derivatives[len(motions)](mu, *motions)
+
+    def _motion_curvature(
+        self, moving: PrescribedMotion, mu: Amplitudes, other: str, name: str
+    ) -> float:
+        """Return this rank's part of d2Pi/dmu_i dmu_j; `name` is the amplitude of a motion."""
+        curvature = moving.rate(mu, name) @ self._column(mu, other)
+        if other not in moving.names:
+            return float(curvature)
+        residual, u = self._gradient(self._factors(mu)), self.u.x.array
+        curvature += (
+            moving.rate(mu, other) @ self._turning_column(mu, name)
+            + moving.bend(mu, name, other) @ residual
+        )
+        spins = dict(moving.turning(mu, other))
+        for edge, A in moving.turning(mu, name):
+            if edge in spins:
+                spin = moving.spin_displacement(A, u)
+                curvature += spin @ self._turned_column(edge, spins[edge])
+        for edge, B in moving.turning_twice(mu, (name, other)):
+            curvature += moving.spin_displacement(B, u) @ self._gradient({edge: 1.0})
+        return float(curvature)
+
+    def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
+        """Return this rank's part of d2Pi/du dmu at all nodes, at the displacement that is set."""
+        if self.moving and name in self.moving.names:
+            rate = self.moving.rate(mu, name)
+            product = self._tangent_product(rate, self._factors(mu))
+            return product + self._turning_column(mu, name)
+        if name in self.parameters:
+            slopes = [
+                (factor_of(slope.amplitude, mu), slope) for slope in self.parameters[name].slopes
+            ]
+            return self._gradient(self._unit_factors(name), slopes)
+        return self._gradient(self._unit_factors(name))
+
+    def _unit_factors(self, name: str) -> dict[str, float]:
+        """Return the factor 1 of each term that an amplitude multiplies."""
+        return {t.name: 1.0 for t in self.terms if t.amplitude == name}
+
+    def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
+        """Return the part of d2Pi/du dmu from normals of edges, which turn with the motion."""
+        assert self.moving
+        column: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+        for edge, A in self.moving.turning(mu, name):
+            column += self._turned_column(edge, A)
+        return column
+
+    def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the change of an edge's forces where its normal turns, A = Q dQ^T."""
+        assert self.moving
+        spin = self.moving.spin_displacement(A, self.u.x.array)
+        turned_forces = self._tangent_product(spin, {edge: 1.0})
+        return turned_forces + self.moving.transform(A.T, self._gradient({edge: 1.0}))
+
+    def _tangent_product(
+        self, v: NDArray[np.float64], factors: Mapping[str, float]
+    ) -> NDArray[np.float64]:
+        """Return this rank's part of the tangent without supports times v, both with ghosts."""
+        if self._assembler:
+            product = self._assembler.times(v, factors)
+        else:
+            K = self._assemble_forms(self._K_free, factors, [])
+            x, product = K.createVecRight(), np.zeros_like(v)
+            x.array[:] = v[: self.size]
+            product[: self.size] = (K * x).array
+        for nonlocal_tangent in self.added_tangents:
+            product = product + nonlocal_tangent.times(v, factors)
+        if self.dense_terms:
+            product = product + self.dense_terms.times(v, factors)
+        return product
+
+    def _tangent(
+        self,
+        factors: Mapping[str, float],
+        stress: Sequence[tuple[float, NDArray[np.float64]]],
+        *,
+        inexact: bool = False,
+    ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
+        """Assemble the tangent of the terms with these factors; `stress` has ghosts."""
+        if self._assembler:
+            K = self._assembler.tangent(factors, stress)
+        else:
+            K = self._assemble_forms(self._K, factors, self.clamped)
+        for nonlocal_tangent in self.added_tangents:
+            K = nonlocal_tangent.sum(K, factors)
+        N = self._skew(factors)
+        if self.dense_terms:
+            K = self.dense_terms.corrected(K, factors, inexact=inexact)
+            if isinstance(K, CorrectedTangent) and inexact:
+                dense_factors = {t.name: factors[t.name] for t in self.dense_terms.terms}
+                K = replace(
+                    K,
+                    present_product=self._dense_product(dense_factors, inexact=False),
+                    extrapolated_product=self._dense_product(dense_factors, inexact=True),
+                )
+            if N or self.projection or self.noise:
+                K = symmetric_part(K)
+        if self.projection:
+            K = self.projection.tangent(K)
+        if self.noise:
+            self.noise.on_matrix(K)
+        return SkewedTangent(K, N) if N else K
+
+    def _dense_product(
+        self, factors: Mapping[str, float], *, inexact: bool
+    ) -> Callable[[Vector], Vector]:
+        """Return a function that multiplies the dense terms' tangent at the present u with v.
+
+        It takes differences of forces; if `inexact`, of extrapolated forces.
+        """
+        u = np.array(self.u.x.array)
+
+        def times(v: Vector) -> Vector:
+            step, direction = self.step_along(v, DENSE_DIFFERENCE_STEP), self.with_ghosts(v)
+            present, product = np.array(self.u.x.array), np.zeros(self.size)
+            for sign in (1.0, -1.0):
+                self.u.x.array[:] = u + sign * step * direction
+                gradient = self._gradient(factors, inexact=inexact)
+                product += sign / (2 * step) * self._summed(gradient)
+            self.u.x.array[:] = present
+            return product
+
+        return times
+
+    def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
+        """Return the skew part of the tangent, of loads without potential; None without."""
+        forms = [t for t in self.terms if isinstance(t, FormTerm)]
+        loads = [t for t in forms if not t.has_potential and factors[t.name]]
+        if not loads:
+            return None
+        if self._N is None:
+            self._N = fem_petsc.create_matrix(loads[0].skew_form)
+        self._N.zeroEntries()
+        for t in loads:
+            t.add_skew(self._N, factors[t.name], self.clamped)
+        self._N.assemble()
+        return self.projection.project_both_sides(self._N) if self.projection else self._N
+
+    def _assemble_forms(
+        self, K: PETSc.Mat, factors: Mapping[str, float], clamped: list[fem.DirichletBC]
+    ) -> PETSc.Mat:
+        """Assemble the tangent from the terms' own forms."""
+        K.zeroEntries()
+        for t in self.terms:
+            if factor := factors.get(t.name):
+                t.add_tangent(K, factor, clamped)
+        compat.finish_matrix(K, self.u.function_space, clamped)
+        return K
+
+    def _factors(self, mu: Amplitudes) -> dict[str, float]:
+        return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
+
+    def _gradient(
+        self,
+        factors: Mapping[str, float],
+        further: Sequence[tuple[float, Derivative]] = (),
+        *,
+        inexact: bool = False,
+    ) -> NDArray[np.float64]:
+        """Return this rank's part of the gradient of the terms with these factors, by name.
+
+        Parameters
+        ----------
+        further
+            Terms that are added, with their factors.
+        inexact
+            Whether forces of dense terms may be extrapolated.
+        """
+        with self.assembly:
+            b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+            if self.gradients and factors:
+                self.gradients.add(b, factors)
+            weighted = [(factors.get(t.name, 0.0), t) for t in self._terms_with_residual]
+            for factor, term in itertools.chain(weighted, further):
+                if factor and inexact and isinstance(term, DenseTerm):
+                    term.add_extrapolated_residual(b, factor)
+                elif factor:
+                    term.add_residual(b, factor)
+            return b
+
+    def _summed(self, local: NDArray[np.float64], *, constrained: bool = True) -> Vector:
+        """Return the sum of all ranks' vectors; zero at supports if `constrained`."""
+        with self.assembly:
+            b = self._b.x.array
+            b[:] = local
+            self._b.x.scatter_reverse(InsertMode.add)
+            if constrained:
+                self._constrain(b)
+            return np.array(b[: self.size])

@@ -1,0 +1,337 @@
+"""Terms whose tangent has entries outside the sparsity pattern of cells and interior edges.
+
+The entries of contact couple some further unknowns, and change from state to state. The sum with
+the sparse matrix has a pattern of its own, with room for entries that are expected soon. This
+pattern and the symbolic factorisation are reused until an entry falls outside. Where a term couples
+all unknowns, its tangent is dense (`assembly.dense_tangent.DenseTangent`). Theory: docs/theory.md,
+contact between shells and interaction of the magnetisation with its own field.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from scipy.sparse import coo_array, csr_array
+
+from magshell_fenicsx.assembly.dense_tangent import DenseTangent, DenseTerm
+from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.continuation.system import CorrectedTangent
+
+Array = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Entries: TypeAlias = tuple[Longs, Longs, Array]  # global rows and columns, and values
+Factors: TypeAlias = Mapping[str, float]  # of terms, by name
+
+
+class AddedTangent(Protocol):
+    """A matrix that is added to the sparse tangent: the tangents of some terms, times factors."""
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """Return a sparse matrix plus the tangents of these terms. Collective."""
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """Return this rank's part of the tangents' product with v, both with ghosts. Collective."""
+
+
+@runtime_checkable
+class FieldDifferentiable(Protocol):
+    """A term without a form that has derivatives by the fields in it."""
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Return a field and derivatives by its values in own cells. Collective.
+
+        They are those of energy Pi + force v . dPi/du, v the direction. None if the term has no
+        field of that name.
+        """
+
+
+def added_tangents(
+    V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
+) -> list[AddedTangent]:
+    """Return the added tangents of the nonlocal terms among these; collective.
+
+    Parameters
+    ----------
+    clamped
+        Homogeneous Dirichlet conditions.
+    """
+    nonlocal_terms = [t for t in terms if isinstance(t, NonlocalTerm)]
+    return [NonlocalEntries(V, nonlocal_terms, clamped)] if nonlocal_terms else []
+
+
+def dense_terms(
+    V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
+) -> "DenseTerms | None":
+    """Return the terms among these that couple all unknowns; None without. Collective."""
+    coupling_all = [t for t in terms if isinstance(t, DenseTerm)]
+    return DenseTerms(DenseTangent(V, clamped), coupling_all) if coupling_all else None
+
+
+@dataclass(frozen=True)
+class DenseTerms:
+    """Terms that couple all unknowns: their tangent is a dense correction of the sparse one."""
+
+    matrix: DenseTangent
+    terms: Sequence[DenseTerm]
+
+    def corrected(
+        self, K: PETSc.Mat, factors: Factors, *, inexact: bool
+    ) -> PETSc.Mat | CorrectedTangent:
+        """Return a sparse matrix corrected by these terms. Collective.
+
+        If `inexact`, their tangents may be those of an earlier state.
+        """
+        terms = self._weighted(factors)
+        return self.matrix.corrected(K, terms, inexact=inexact) if terms else K
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """Return the terms' product with v, see `AddedTangent`. Collective."""
+        return self.matrix.times(self._weighted(factors), v)
+
+    def _weighted(self, factors: Factors) -> list[tuple[float, DenseTerm]]:
+        return [(factor, t) for t in self.terms if (factor := factors.get(t.name, 0.0))]
+
+
+@runtime_checkable
+class NonlocalTerm(Protocol):
+    """A term whose tangent has entries outside the sparsity pattern of the others."""
+
+    name: str
+
+    def entries(self) -> Entries:
+        """Return this rank's part of d2Pi/du2, in any order. Collective.
+
+        Entries at the same place are summed.
+        """
+
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """Return pairs of global nodes between which this rank may have entries. Collective.
+
+        They are a function of `pattern_key`, and of nothing that was evaluated before: a resumed
+        run has the same pattern.
+        """
+
+    @property
+    def pattern_key(self) -> float:
+        """A number of the present state that changes where `coupled_pairs` does."""
+
+
+class NonlocalEntries:
+    """Tangents of nonlocal terms, whose entries change from state to state.
+
+    The constructor is collective.
+    """
+
+    def __init__(
+        self,
+        V: fem.FunctionSpace,
+        terms: Sequence[NonlocalTerm],
+        clamped: Sequence[fem.DirichletBC],
+    ) -> None:
+        self._terms, self._comm = terms, V.mesh.comm
+        sizes = self._comm.allgather(V.dofmap.index_map.size_local)
+        self._block_size = V.dofmap.index_map_bs
+        self._ranges = self._block_size * np.array([0, *np.cumsum(sizes)])
+        self._own = slice(*self._ranges[self._comm.rank : self._comm.rank + 2])
+        is_clamped = np.zeros(self._own.stop - self._own.start, dtype=bool)
+        for bc in clamped:
+            dofs = bc.dof_indices()[0]
+            is_clamped[dofs[dofs < len(is_clamped)]] = True
+        self._fixed = np.concatenate(self._comm.allgather(is_clamped))
+        self._sum: _MatrixSum | None = None
+        self._pattern_keys: tuple[tuple[str, float], ...] = ()
+
+    def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
+        """Return a sparse matrix plus the tangents of these terms. Collective.
+
+        It is K itself if there are no entries, else mostly the same object.
+        """
+        entries = self._entries(factors)
+        if not entries:
+            return K
+        rows = np.concatenate([term_rows for _, (term_rows, _, _) in entries])
+        columns = np.concatenate([term_columns for _, (_, term_columns, _) in entries])
+        values = np.concatenate([factor * term_values for factor, (_, _, term_values) in entries])
+        added = _owned_rows(self._comm, self._ranges, self._fixed, (rows, columns, values))
+        if not self._comm.allreduce(added.nnz):
+            return K
+        keys = tuple((t.name, t.pattern_key) for t in self._terms if factors.get(t.name, 0.0))
+        if self._sum is None or self._pattern_keys != keys or self._sum.sparse.handle != K.handle:
+            self._sum = _MatrixSum(K, self._expected_pattern(factors), self._own.start)
+            self._pattern_keys = keys
+        if self._comm.allreduce(self._sum.has_room_for(added), MPI.MIN):
+            return self._sum.update(added)
+        return _MatrixSum(K, _pattern_of(added), self._own.start).update(added)
+
+    def times(self, v: Array, factors: Factors) -> Array:
+        """Return the terms' product with v, see `AddedTangent`. Collective."""
+        product, size = np.zeros_like(v), self._own.stop - self._own.start
+        if entries := self._entries(factors):
+            local = times(entries, np.concatenate(self._comm.allgather(v[:size])))
+            product[:size] = self._comm.allreduce(local)[self._own]
+        return product
+
+    def _entries(self, factors: Factors) -> list[tuple[float, Entries]]:
+        return [(factor, t.entries()) for t in self._terms if (factor := factors.get(t.name, 0.0))]
+
+    def _expected_pattern(self, factors: Factors) -> csr_array:
+        """Return the pattern of entries that are or may come; collective."""
+        pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
+        rows, columns = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
+        count = len(self._fixed) // self._block_size
+        rows, columns = np.divmod(np.unique(rows * count + columns), count)
+        i, j = (
+            self._block_size * nodes[:, None, None] + np.arange(self._block_size)
+            for nodes in (rows, columns)
+        )
+        i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
+        entries = i.ravel(), j.ravel(), np.ones(i.size, dtype=np.int8)
+        return _pattern_of(_owned_rows(self._comm, self._ranges, self._fixed, entries))
+
+
+class _MatrixSum:
+    """A sparse matrix plus changing entries, in a fixed pattern; the constructor is collective.
+
+    Parameters
+    ----------
+    sparse
+        The sparse matrix, which is always the same object.
+    room
+        (own unknowns, all) ones where entries can be.
+    first
+        Number of the first own unknown.
+    """
+
+    def __init__(self, sparse: PETSc.Mat, room: csr_array, first: int) -> None:
+        self.sparse, self.room = sparse, room
+        starts, columns, _ = sparse.getValuesCSR()
+        ones = np.ones(len(columns), dtype=np.int8)
+        # Bit 1 marks the entries of the sparse matrix, bit 2 those of the room.
+        union = csr_array((ones, columns, starts), room.shape) + 2 * room
+        self._at_sparse, self._at_room = (np.flatnonzero(union.data & bit) for bit in (1, 2))
+        self._room_keys = _entry_keys(room)
+        self._is_own = (union.indices >= first) & (union.indices < first + room.shape[0])
+        self._values = np.zeros(union.nnz)
+        kind = PETSc.IntType
+        # PETSc shares these arrays.
+        self._arrays = [(union.indptr.astype(kind), union.indices.astype(kind), self._values)]
+        if sparse.comm.size > 1:
+            self._arrays = [
+                _selected_columns(union, self._is_own, first),
+                _selected_columns(union, ~self._is_own, 0),
+            ]
+        self._matrix = PETSc.Mat().createAIJWithArrays(
+            sparse.getSizes(),
+            self._arrays[0] if len(self._arrays) == 1 else tuple(self._arrays),
+            comm=sparse.comm,
+        )
+        for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
+            self._matrix.setOption(option, True)
+
+    def has_room_for(self, added: csr_array) -> bool:
+        """Return whether the pattern has these entries of this rank."""
+        keys = _entry_keys(added)
+        positions = np.searchsorted(self._room_keys, keys)
+        if positions.max(initial=0) >= len(self._room_keys):
+            return False
+        return bool((self._room_keys[positions] == keys).all())
+
+    def update(self, added: csr_array) -> PETSc.Mat:
+        """Return the sum with the present values of both."""
+        self._values[:] = 0.0
+        self._values[self._at_sparse] = self.sparse.getValuesCSR()[2]
+        positions = np.searchsorted(self._room_keys, _entry_keys(added))
+        self._values[self._at_room[positions]] += added.data
+        if self.sparse.comm.size > 1:
+            masks = self._is_own, ~self._is_own
+            for (_, _, values), mask in zip(self._arrays, masks, strict=True):
+                values[:] = self._values[mask]
+        self._matrix.stateIncrease()
+        return self._matrix
+
+
+def with_entries(K: PETSc.Mat, entries: Entries, fixed: NDArray[np.bool_]) -> PETSc.Mat:
+    """Return a new matrix with further entries, except those of `fixed` unknowns. Collective.
+
+    It is K itself if there are none.
+    """
+    ranges = np.asarray(K.getOwnershipRanges())
+    added = _owned_rows(K.comm.tompi4py(), ranges, fixed, entries)
+    if not K.comm.tompi4py().allreduce(added.nnz):
+        return K
+    return _MatrixSum(K, _pattern_of(added), int(ranges[K.comm.rank])).update(added)
+
+
+def _owned_rows(
+    comm: MPI.Comm, ranges: Longs, fixed: NDArray[np.bool_], entries: tuple[Longs, Longs, Any]
+) -> csr_array:
+    """Return the rows of own unknowns of entries that ranks have, summed. Collective.
+
+    Entries of fixed unknowns are left out.
+    """
+    rows, columns, values = entries
+    free = ~(fixed[rows] | fixed[columns])
+    owned = rows[free], columns[free], values[free]
+    if comm.size > 1:
+        owner = np.searchsorted(ranges, owned[0], side="right") - 1
+        sent = [tuple(array[owner == rank] for array in owned) for rank in range(comm.size)]
+        received = comm.alltoall(sent)
+        owned = tuple(np.concatenate(arrays) for arrays in zip(*received, strict=True))
+    first, last = ranges[comm.rank : comm.rank + 2]
+    return coo_array((owned[2], (owned[0] - first, owned[1])), (last - first, len(fixed))).tocsr()
+
+
+def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
+    """Return this rank's part of the product of entries with a vector of all unknowns.
+
+    Parameters
+    ----------
+    entries
+        With a factor each.
+
+    Returns
+    -------
+    Array
+        As long as v.
+    """
+    product = np.zeros_like(v)
+    for factor, (rows, columns, values) in entries:
+        product += np.bincount(rows, factor * values * v[columns], len(v))
+    return product
+
+
+def pairs_of(nodes: Longs) -> tuple[Longs, Longs]:
+    """Return all pairs of nodes within each row of (n, k)."""
+    i, j = np.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
+    return i.ravel(), j.ravel()
+
+
+def _pattern_of(matrix: csr_array) -> csr_array:
+    """Return a matrix with ones in place of all entries."""
+    ones = np.ones(matrix.nnz, dtype=np.int8)
+    return csr_array((ones, matrix.indices, matrix.indptr), matrix.shape)
+
+
+def _entry_keys(matrix: csr_array) -> Longs:
+    """Return a number for the place of each entry, ascending."""
+    rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int64), np.diff(matrix.indptr))
+    return np.asarray(rows * matrix.shape[1] + matrix.indices)
+
+
+def _selected_columns(
+    matrix: csr_array, mask: NDArray[np.bool_], first: int
+) -> tuple[Any, Any, Array]:
+    """Return starts, columns counted from `first`, and zeros of the entries in a mask."""
+    starts = np.concatenate([[0], np.cumsum(mask)])[matrix.indptr]
+    columns = matrix.indices[mask] - first
+    return starts.astype(PETSc.IntType), columns.astype(PETSc.IntType), np.zeros(len(columns))

@@ -1,0 +1,746 @@
+"""A continuation run from a start to a goal: locates instabilities, and solves at targets.
+
+Between two successive points of a path the change of inertia and the sign of dmu/ds show
+instabilities. Folds (limit points) are located by interpolation of mu(s), bifurcations (branch
+points) as solutions of a regular system or by bisection. Instabilities that cannot be separated
+count as one cluster. Theory: docs/theory.md.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from magshell_fenicsx.continuation.bifurcation import (
+    LOAD_ERROR_FACTOR,
+    BifurcationLost,
+    find_bifurcation,
+)
+from magshell_fenicsx.continuation.control import nearest_combination
+from magshell_fenicsx.continuation.interpolation import kink, stationary
+from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
+from magshell_fenicsx.continuation.path import ZERO_DISPLACEMENT, Path, Quantity
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
+from magshell_fenicsx.continuation.system import (
+    Direction,
+    State,
+    Vector,
+    WeightedDisplacement,
+    max_abs,
+)
+from magshell_fenicsx.continuation.targets import (
+    TargetMissed,
+    end_near_last_target,
+    targets_between,
+)
+
+MAX_TRIALS = 60  # so many bisections reduce any bracket to rounding
+# a smaller slope of the amplitude, over the slope at the step's start, means a fold
+FOLD_SLOPE_RATIO = 0.01
+# places in a bracket, tried in turn, for a point between its ends
+MIDDLE_FRACTIONS = (0.5, 0.35, 0.65, 0.2, 0.8)
+MAX_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
+MAX_SOLVES = 60  # in the search for one instability, with its repetitions in shorter steps
+MAX_REPEATED_SEARCHES = 3  # in shorter steps, before several instabilities count as a cluster
+# in lengths: near a neutral mode rounding moves a state by less
+ROUNDING_NEAR_NEUTRAL_MODE = 1e-4
+# of the distance of two points: what deviates more from their cubic lies on another branch
+MAX_DEVIATION_FROM_CUBIC = 0.5
+Label = Literal["step", "target", "fold", "bifurcation"]
+Until = Literal["limit", "bifurcation", "target", "points"]
+MAX_STEPS = 1000
+LOAD_TOLERANCE = 1e-8  # relative: of the amplitude at an instability
+# distance in the path's metric below which two folds are one
+SAME_FOLD_DISTANCE = 1e-2
+
+
+@dataclass(frozen=True)
+class Instability:
+    """A point at which the tangent is singular.
+
+    Attributes
+    ----------
+    kind
+        "fold": the amplitude is stationary; "bifurcation": it is not.
+    """
+
+    point: Point
+    kind: Literal["fold", "bifurcation"]
+
+
+class UnseparatedInstabilities(PathStopped):
+    """No solution was found between several instabilities, so they cannot be separated.
+
+    Attributes
+    ----------
+    point, high
+        Points before and behind them.
+    """
+
+    def __init__(self, point: Point, high: Point) -> None:
+        super().__init__("several instabilities lie too close to each other", point)
+        self.high = high
+
+
+@dataclass
+class LocationBudget:
+    """The work on the next instability, over all searches in shorter and shorter steps.
+
+    Attributes
+    ----------
+    solves
+        Number of solves that were tried.
+    repeated
+        Number of searches that ended between instabilities which they could not separate.
+    end
+        End of the step in which the last search failed.
+    clustered
+        Whether that search failed between instabilities.
+    """
+
+    solves: int = 0
+    repeated: int = 0
+    end: Point | None = None
+    clustered: bool = False
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no further solve is allowed."""
+        return self.solves >= MAX_SOLVES
+
+    def renew(self) -> None:
+        """Begin with the next instability."""
+        self.solves, self.repeated, self.end, self.clustered = 0, 0, None, False
+
+
+def instabilities(
+    path: Path,
+    low: Point,
+    high: Point,
+    tolerance: float = LOAD_TOLERANCE,
+    budget: LocationBudget | None = None,
+) -> Iterator[Instability]:
+    """Yield the singular points between two successive points, in order.
+
+    They are those that inertia and tangents reveal.
+
+    Parameters
+    ----------
+    tolerance
+        Relative error of the amplitude.
+    budget
+        Work on this search and earlier ones for the same instability; None: there were none.
+
+    Raises
+    ------
+    PathStopped
+        If Newton's method fails between the two points.
+    UnseparatedInstabilities
+        If no point is found between several instabilities.
+    """
+    locator = _InstabilityLocator(path, low, tolerance, budget or LocationBudget())
+    yield from locator.locate(low, path.relative_to(low, high), MAX_HALVINGS)
+
+
+@dataclass
+class _InstabilityLocator:
+    """Locates the instabilities between two points.
+
+    Attributes
+    ----------
+    base
+        The first point, from which arc length is measured.
+    iterations, factorisations
+        Work since the last located instability.
+    """
+
+    path: Path
+    base: Point
+    tolerance: float
+    budget: LocationBudget = field(default_factory=LocationBudget)
+    iterations: int = 0
+    factorisations: int = 0
+
+    def locate(self, low: Point, high: Point, halvings: int) -> Iterator[Instability]:
+        """Yield the instabilities between two points, after at most so many halvings."""
+        change = abs(high.negative_pivots - low.negative_pivots)
+        turns_back = low.dmu * high.dmu < 0
+        if change == 0 and not turns_back:
+            return
+        self.path.progress.doing("locating an instability")
+        single = change == 1 or not halvings
+        if single and turns_back:
+            fold = self.locate_fold(low, high)
+            point = self.with_work(fold) if change == 1 else self.with_own_inertia(fold)
+            # rounding decides what its own matrix counts
+            point = replace(
+                point,
+                negative_pivots=low.negative_pivots,
+                negative_pivots_held=low.negative_pivots_held,
+            )
+            yield Instability(point, "fold")
+        elif single:
+            point = self.solve_bifurcation(low, high) or self.bisect_bifurcation(low, high)
+            if abs(point.dmu) < FOLD_SLOPE_RATIO * abs(low.dmu):
+                raise PathStopped("the step passed a fold and left the branch", low)
+            yield Instability(point, "bifurcation")
+        else:
+            middle = self.middle(low, high)
+            if middle is None:
+                self.refuse_apart(low, high)
+                raise UnseparatedInstabilities(low, high)
+            yield from self.locate(low, middle, halvings - 1)
+            yield from self.locate(middle, high, halvings - 1)
+
+    def solve(self, s: float, low: Point, high: Point) -> Point:
+        """Return the point at s, whose number of unstable directions is not needed.
+
+        Raises
+        ------
+        PathStopped
+            If the solve fails.
+        """
+        point = self.try_solve(s, low, high, needs_inertia=False)
+        if isinstance(point, str):
+            raise PathStopped(f"locating an instability: {point}", low)
+        return point
+
+    def try_solve(
+        self, s: float, low: Point, high: Point, *, needs_inertia: bool = True
+    ) -> Point | str:
+        """Return the point at s on the branch between two points, or why there is none."""
+        point = self.path.correct_between(s, low, high, self.base, needs_inertia=needs_inertia)
+        if isinstance(point, str):
+            return point
+        self.iterations += point.iterations
+        self.factorisations += point.factorisations
+        if self.is_on_another_branch(point, low, high):
+            return "the iteration has left the branch"
+        return point
+
+    def is_on_another_branch(self, point: Point, low: Point, high: Point) -> bool:
+        """Return whether a point is far from the cubic between two points."""
+        if self.base.across:  # no cubic goes around a kink
+            return False
+        system, cubic = self.path.system, self.path.interpolated_state(point.s, low, high)
+        deviation = max_abs(system.comm, point.state.u - cubic.u)
+        chord = max_abs(system.comm, high.state.u - low.state.u)
+        return deviation > max(MAX_DEVIATION_FROM_CUBIC * chord, ZERO_DISPLACEMENT * system.length)
+
+    def middle(self, low: Point, high: Point) -> Point | None:
+        """Return a point somewhere between two others, with its own inertia; None if none is found.
+
+        Several places are tried: rounding may hide some.
+        """
+        for fraction in MIDDLE_FRACTIONS:
+            if self.budget.exhausted:
+                return None
+            self.budget.solves += 1
+            point = self.try_solve(low.s + fraction * (high.s - low.s), low, high)
+            if not isinstance(point, str):
+                return self.path.with_own_inertia(point, self.base)
+        return None
+
+    def solve_bifurcation(self, low: Point, high: Point) -> Point | None:
+        """Return the bifurcation between two points as a solution of a regular system.
+
+        None if there is no solution.
+        """
+        path = self.path
+        if path.newton.factorisation.skewed:
+            return None  # the regular system needs a symmetric tangent
+        try:
+            modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        except NoEigenpair:
+            return None
+        a, b = (mode.eigenvalue for mode in modes)
+        t = a / (a - b) if a * b < 0 else 0.5
+        guess = path.interpolated_state(low.s + t * (high.s - low.s), low, high)
+        stress = [(1 - t, low.state.u), (t, high.state.u)]
+        least_pivots, most_pivots = sorted(end.negative_pivots for end in (low, high))
+        for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
+            solve = partial(self._regular_solution, guess, mode.vector, stress, low, high)
+            point = path.recorded(solve)
+            if isinstance(point, str):
+                continue
+            if not min(low.s, high.s) <= point.s <= max(low.s, high.s):
+                continue
+            if not least_pivots <= point.negative_pivots < most_pivots:
+                continue
+            if not self.is_on_another_branch(point, low, high):
+                return self.with_work(point)
+        return None
+
+    def _regular_solution(
+        self,
+        guess: State,
+        phi: Vector,
+        stress: Sequence[WeightedDisplacement],
+        low: Point,
+        high: Point,
+    ) -> Point | str:
+        path = self.path
+        try:
+            bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress)
+        except BifurcationLost:
+            return "no bifurcation was found"
+        self.iterations += bifurcation.iterations
+        self.factorisations += bifurcation.factorisations
+        # the null vector and the response span the tangents of both branches; this one continues
+        # the path
+        state, tangent = bifurcation.state, self._interpolated_tangent(bifurcation.state, low, high)
+        direction = nearest_combination(
+            path.metric, tangent, [(bifurcation.phi, 0.0), (-bifurcation.response, 1.0)]
+        )
+        point = path.point_at_state(state, direction, self.base, bifurcation.unstable)
+        return replace(point, error=bifurcation.error, load_error=bifurcation.load_error)
+
+    def _interpolated_tangent(self, state: State, low: Point, high: Point) -> Direction:
+        """Return the path's tangent near a state between two points, interpolated in mu."""
+        name = self.path.name
+        t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
+        t = min(max(t, 0.0), 1.0)
+        return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
+
+    def bisect_bifurcation(self, low: Point, high: Point) -> Point:
+        """Return the last point before an instability, by bisection.
+
+        It ends where rounding spoils the inertia.
+        """
+        name = self.path.name
+        for _ in range(MAX_TRIALS):
+            width = abs(high.state.mu[name] - low.state.mu[name])
+            if not width > self.tolerance * abs(low.state.mu[name]):
+                break
+            middle = self.middle(low, high)
+            if middle is None:
+                break
+            if middle.negative_pivots == low.negative_pivots:
+                low = middle
+            else:
+                high = middle
+            self.refuse_apart(low, high)
+        width = abs(high.state.mu[name] - low.state.mu[name])
+        return replace(self.with_work(low), load_error=width)
+
+    def refuse_apart(self, low: Point, high: Point) -> None:
+        """Refuse two points that are not on one path.
+
+        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket
+        with an end on each shrinks to nothing in s and contains no instability.
+
+        Raises
+        ------
+        PathStopped
+            If they are not.
+        """
+        if self.path.are_apart(low, high, ROUNDING_NEAR_NEUTRAL_MODE):
+            raise PathStopped("the step jumped to another branch", low)
+
+    def with_work(self, point: Point) -> Point:
+        """Return the point with the work since the last located one, and reset the counts."""
+        located = replace(point, iterations=self.iterations, factorisations=self.factorisations)
+        self.iterations = self.factorisations = 0
+        self.budget.renew()
+        return located
+
+    def with_own_inertia(self, point: Point) -> Point:
+        """Return the point with its own tangent and inertia, and with the work."""
+        self.factorisations += 1
+        located = self.with_work(self.path.with_own_inertia(point, self.base))
+        return replace(located, load_error=point.load_error)
+
+    def locate_fold(self, low: Point, high: Point) -> Point:
+        """Return the zero of dmu/ds, by repeated interpolation with the cubic of both ends."""
+        name = self.path.name
+        for _ in range(MAX_TRIALS):
+            s = _stationary_place(low, high, name, kink if self.base.across else stationary)
+            point = self.solve(s, low, high)
+            mu = point.state.mu[name]
+            is_before = point.dmu * low.dmu > 0
+            other = high if is_before else low
+            curvature = (other.dmu - point.dmu) / (other.s - point.s)
+            load_error = abs(point.dmu**2 / (2 * curvature))
+            if load_error <= self.tolerance * abs(mu):
+                return replace(point, load_error=load_error)
+            low, high = (point, high) if is_before else (low, point)
+        return point
+
+    def distance_to_zero(
+        self, point: Point, stability: Stability, slope: float, upper_bound: float
+    ) -> float:
+        """Return how far the load is from the zero of the eigenvalue, with the tangent's rounding.
+
+        Parameters
+        ----------
+        slope
+            Derivative of the eigenvalue by the load; zero if it is unknown.
+        upper_bound
+            Upper bound, which is returned if the slope is unknown.
+        """
+        u = point.state.u
+        random = np.random.default_rng(self.path.system.comm.rank)
+        rounded = [u + signs * np.spacing(u) for signs in random.choice([-1.0, 1.0], (2, u.size))]
+        eigenvalues = [
+            critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in [u, *rounded]
+        ]
+        if not slope:
+            return upper_bound
+        error = abs(eigenvalues[0]) + LOAD_ERROR_FACTOR * np.ptp(eigenvalues)
+        return float(error / abs(slope))
+
+    def locate_zero_eigenvalue(self, low: Point, high: Point, stability: Stability) -> Point:
+        """Return the zero of the eigenvalue that changes sign, by Illinois' regula falsi.
+
+        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue shows a
+        larger error, it goes on until that is no longer halved. The method's order is 1.44, and
+        close to zero the eigenvalue is only rounding.
+        """
+        name, last_side, last_s, best = self.path.name, 0, np.inf, None
+        first = critical_mode(stability, low.state)
+        a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
+        ends = (low.state.mu[name], a), (high.state.mu[name], b)  # loads and eigenvalues
+        for _ in range(MAX_TRIALS):
+            # the eigenvalue nearest to zero need not be the one that changes sign
+            t = a / (a - b) if a * b < 0 else 0.5
+            result = self.try_solve(low.s + t * (high.s - low.s), low, high)
+            point = self.middle(low, high) if isinstance(result, str) else result
+            if point is None:  # the path's own tangent is singular there as well
+                break
+            mu = point.state.mu[name]
+            change = abs(point.s - last_s) * abs(point.dmu)
+            width = abs(high.s - low.s) * abs(point.dmu)
+            if change <= self.tolerance**0.75 * abs(mu) and a * b < 0:
+                load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
+                zero = replace(point, load_error=load_error)
+                stalled = best and load_error > best.load_error / 2
+                if stalled or load_error <= self.tolerance * abs(mu):
+                    return min(best or zero, zero, key=lambda point: point.load_error)
+                best = zero  # the next guess, from the other side, may be nearer
+            if width <= self.tolerance * abs(mu) and not best:
+                load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
+                return replace(point, load_error=max(width, load_error))
+            last_s, mode = point.s, critical_mode(stability, point.state)
+            if mode.negative_pivots != first.negative_pivots:
+                high, b = point, mode.eigenvalue
+                ends = ends[0], (mu, b)
+                a = a / 2 if last_side == 1 else a
+                last_side = 1
+            else:
+                low, a = point, mode.eigenvalue
+                ends = (mu, a), ends[1]
+                b = b / 2 if last_side == -1 else b
+                last_side = -1
+        return best or replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+
+def _slope(low: tuple[float, float], high: tuple[float, float]) -> float:
+    """Return the slope between two loads with their eigenvalues.
+
+    Zero if the eigenvalues have one sign: then they do not belong to one mode.
+    """
+    (a, first), (b, last) = low, high
+    return (last - first) / (b - a) if first * last < 0 and a != b else 0.0
+
+
+def _stationary_place(
+    low: Point, high: Point, name: str, find: Callable[[float, float, float], float]
+) -> float:
+    """Return s between two points where `find` places the stationary value of mu(s).
+
+    `find` gets the mean slope and the slopes at both ends.
+    """
+    L = high.s - low.s
+    return low.s + L * find((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
+
+
+def locate_bifurcation(
+    path: Path,
+    stable: Point,
+    unstable: Point,
+    stability: Stability,
+    tolerance: float = LOAD_TOLERANCE,
+) -> Point:
+    """Locate where another tangent than the path's own is singular, between two successive points.
+
+    Parameters
+    ----------
+    stability
+        The tangent of symmetry-breaking modes.
+    tolerance
+        Relative error of the amplitude.
+
+    Raises
+    ------
+    PathStopped
+        If Newton's method fails between the two points, or no eigenpair is found.
+    """
+    locator = _InstabilityLocator(path, stable, tolerance)
+    try:
+        zero = locator.locate_zero_eigenvalue(stable, path.relative_to(stable, unstable), stability)
+        return locator.with_own_inertia(zero)
+    except NoEigenpair as e:
+        raise PathStopped(f"locating an instability: {e}", stable) from None
+
+
+@dataclass(frozen=True)
+class ContinuationGoal:
+    """The end of a continuation run, and the points that are requested before it.
+
+    Attributes
+    ----------
+    until
+        "limit": at the first instability, or at the last target; "bifurcation": at the first
+        bifurcation, through folds; "target": at the last target; "points": after `steps` steps.
+    targets
+        Requested points: values of s or, on a path by arc length, of `quantity`.
+    quantity
+        "load": the amplitude; "conjugate": the displacement conjugate to it.
+    steps
+        With every other `until`, the largest number of steps.
+    sense
+        Direction of s if there is no target.
+    """
+
+    until: Until
+    targets: Sequence[float] = ()
+    quantity: Quantity = "load"
+    steps: int = MAX_STEPS
+    sense: float = 1.0
+
+
+class ContinuationRun:
+    """A run along a path to its goal; iterate over it once.
+
+    Parameters
+    ----------
+    renew
+        Called with two successive points. It returns the state of the first with other values of
+        the amplitudes that the path does not vary, from which the run continues in place of the
+        second; None if the second is accepted. It raises `StepTooLong` if the second must not be
+        accepted. Where no solution is found with the other values it is called again, and may
+        accept the second point then.
+
+    Attributes
+    ----------
+    points
+        The start, the steps so far, and the instability or target that ended the run.
+    done
+        Whether the last point ends the run.
+    clusters
+        The first points before, and behind, instabilities that were not separated. Such a cluster
+        counts as one instability, at the first of both points; its width is the error of the
+        amplitude.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        start: Point,
+        goal: ContinuationGoal,
+        renew: Callable[[Point, Point], State | None] | None = None,
+    ) -> None:
+        self.path, self.goal, self.points, self._renew = path, goal, [start], renew
+        self.done = False
+        self.clusters: list[tuple[Point, Point]] = []
+        self._folds: list[Point] = []
+        self._budget = LocationBudget()
+
+    def __iter__(self) -> Iterator[tuple[Label, Point]]:
+        """Yield labels and points, in the order of the path.
+
+        Raises
+        ------
+        PathStopped
+            If the path is lost, returns to a fold that it has passed, or needs more steps than
+            allowed.
+        """
+        options, shorter_step, reason = self.path.options, None, ""
+        while True:
+            for point, is_target in self._steps():
+                low, shorter_step = self.path.base_before(self.points[-1], point), None
+                renewal = self._renewed_step(low, point)
+                if renewal:
+                    shorter_step, reason = renewal[0], renewal[1] or reason
+                    break
+                try:
+                    events = self._events_between(low, point)
+                except PathStopped as e:  # the step had left the branch: approach in shorter steps
+                    shorter_step = abs(point.s - low.s) / 4
+                    is_missed = isinstance(e, TargetMissed)
+                    reason = str(e) if is_missed else "an instability cannot be located"
+                    break
+                for label, event, self.done in events:
+                    yield label, event
+                    if label == "fold":
+                        self._refuse_loop(event)
+                    if self.done:
+                        self.points.append(event)
+                        return
+                self.points.append(point)
+                has_all_points = self.goal.until == "points" and len(self.points) > self.goal.steps
+                self.done = not self._remaining_targets() or has_all_points
+                yield ("target" if is_target else "step"), point
+                if len(self.points) > self.goal.steps:
+                    if self.goal.until == "points":
+                        return
+                    raise PathStopped(
+                        f"{self.goal.steps} steps have not reached the {self.goal.until}",
+                        point,
+                        final=True,
+                    )
+            if shorter_step is None:
+                return
+            if shorter_step < options.smallest:
+                raise PathStopped(reason, self.points[-1])
+            # a step must still reach behind instabilities between which there are no points
+            several = options.max_step_past_several if self._budget.clustered else 0.0
+            self.path = self.path.with_step_options(
+                replace(options, first=shorter_step, several=several)
+            )
+
+    def _renewed_step(self, low: Point, point: Point) -> tuple[float, str] | None:
+        """Renew the amplitudes between two points, if `renew` asks for it.
+
+        Returns
+        -------
+        The length of the next step from the first point, and the reason if the second was refused;
+        None if the second is accepted.
+        """
+        length = abs(point.s - low.s)
+        try:
+            state = self._renew(low, point) if self._renew else None
+        except StepTooLong as e:
+            return length / 4, str(e)
+        if not state:
+            return None
+        try:
+            self.points[-1] = self.path.recorrected(low, state)
+        except PathStopped as e:
+            # nearer to the first point the change is smaller
+            if self._renew and self._renew(low, point):
+                return length / 4, str(e)
+            return None
+        self._budget.end = None  # it has the previous amplitudes
+        return length, ""
+
+    def _steps(self) -> Iterator[tuple[Point, bool]]:
+        """Yield the next points, as `Path.continue_to` does.
+
+        Where none is found before a cluster, the end of an earlier step is tried.
+        """
+        try:
+            targets = self._remaining_targets()
+            yield from self.path.continue_to(self.points[-1], targets, self._step_end)
+        except PathStopped:
+            current, budget = self.points[-1], self._budget
+            if not (budget.end and budget.clustered):
+                raise
+            end = self.path.as_base(self.path.measured_from(current, budget.end))
+            budget.repeated, budget.end = MAX_REPEATED_SEARCHES, None  # it is tried once
+            yield end, end.s in self._remaining_targets()
+            yield from self._steps()
+
+    def _refuse_loop(self, fold: Point) -> None:
+        """Stop at a fold that was passed before.
+
+        Two successive folds may be close, so the last one is not compared.
+
+        Raises
+        ------
+        PathStopped
+            If it was passed before.
+        """
+        name, u = self.path.name, fold.state.u
+        mu = fold.state.mu[name]
+        for passed in self._folds[:-1]:
+            distance = self.path.metric.norm(u - passed.state.u, mu - passed.state.mu[name])
+            if distance < SAME_FOLD_DISTANCE:
+                message = (
+                    "the path has come back to this fold: a closed loop, which leads nowhere else"
+                )
+                raise PathStopped(message, fold, final=True)
+        self._folds.append(fold)
+
+    @property
+    def _by_arc(self) -> bool:
+        return self.path.control == "arc"
+
+    def _remaining_targets(self) -> list[float]:
+        """Return the values of s that are still to be reached."""
+        goal, s = self.goal, self.points[-1].s
+        if self._by_arc:
+            return [np.inf]
+        if not goal.targets:
+            return [float(np.copysign(np.inf, goal.sense))]
+        sense = goal.targets[-1] - self.points[0].s
+        return [t for t in goal.targets if (t - s) * sense > 0]
+
+    def _step_end(self, s: float, predictors: Sequence[Point]) -> float:
+        """Return the end of a step; by arc length it is close behind the last target."""
+        goal = self.goal
+        if self._by_arc and goal.targets and goal.until in ("target", "limit"):
+            return end_near_last_target(self.path, goal.quantity, goal.targets[-1], s, predictors)
+        return s
+
+    def _events_between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
+        """Return the instabilities and, with arc length, targets between two points.
+
+        The flag marks the end of the run.
+        """
+        events: list[tuple[Label, Point, bool]] = []
+        for event in self._located(low, high):
+            ends_run = self.goal.until in ("limit", event.kind)
+            events.append((event.kind, event.point, ends_run))
+            if ends_run:
+                break
+        if self._by_arc and self.goal.targets:
+            until, targets = self.goal.until in ("target", "limit"), self.goal.targets
+            predictors = [*self.points[-2:-1], low]
+            folds = (point for label, point, _ in events if label == "fold" and point.s != low.s)
+            for end in (*(self.path.as_base(fold) for fold in folds), high):
+                # a target just below a fold is passed on both sides of it
+                predictors = [*predictors[-2:], end]
+                for target, point in targets_between(
+                    self.path, self.goal.quantity, targets, self.goal.sense, predictors
+                ):
+                    events.append(("target", point, until and target == targets[-1]))
+        return sorted(events, key=lambda event: abs(event[1].s - low.s))
+
+    def _located(self, low: Point, high: Point) -> Iterator[Instability]:
+        """Yield the instabilities between two points.
+
+        Several that shorter steps do not separate count as one.
+        """
+        budget, step = self._budget, high.s - low.s
+        is_beyond = budget.end is not None and (high.s - budget.end.s) * step > 0
+        if is_beyond and not high.has_instability_since(low):
+            budget.renew()  # shorter steps have passed the place: there was nothing on this path
+        try:
+            yield from instabilities(self.path, low, high, budget=budget)
+        except UnseparatedInstabilities as e:
+            budget.end, budget.clustered = high, True
+            budget.repeated += 1
+            is_shortest = abs(step) / 4 < self.path.options.smallest
+            may_repeat = budget.repeated <= MAX_REPEATED_SEARCHES and not budget.exhausted
+            if may_repeat and not is_shortest:
+                raise
+            budget.renew()
+            yield self._cluster(e.point, e.high)
+            base_behind = self.path.as_base(e.high)
+            yield from self._located(base_behind, self.path.measured_from(base_behind, high))
+        except PathStopped:
+            budget.end, budget.clustered = high, False
+            raise
+
+    def _cluster(self, low: Point, high: Point) -> Instability:
+        """Return the instabilities between two points as one.
+
+        It is a fold if the amplitude turns back between them.
+        """
+        name = self.path.name
+        point = replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
+        self.clusters.append((point, high))
+        return Instability(point, "fold" if low.dmu * high.dmu < 0 else "bifurcation")

@@ -1,0 +1,403 @@
+"""Inertia and solutions of a sparse matrix with a dense correction, from sparse factors.
+
+A tangent K = K0 + D has a sparse part K0, which is factored, and a dense part D, mostly small
+compared with it, of which only products are computed. The matrix A = K0^-1 D has an eigenvalue -1
+where K is singular. On the way K0 + t D, t from 0 to 1, an eigenvalue nu < -1 of A makes it
+singular once, at t = -1/nu, with the vector x of nu: one more negative eigenvalue where
+x . D x < 0, else one less. So the inertia of K is that of K0 plus what the few eigenvalues of A
+below -1 contribute. Arnoldi's method finds them; generalised conjugate residuals solve with K.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import CorrectedTangent, DenseCorrection, Vector, dot
+
+SMALL_EIGENVALUE = 0.1  # eigenvalues of A within this magnitude are not computed one by one
+# products with A per Arnoldi run: at least as many as show that no other large eigenvalue exists,
+# and at most so many before it is given up
+MIN_PRODUCTS, MAX_PRODUCTS = 4, 30
+# Arnoldi runs, each without the vectors found before: eigenvalues may be multiple
+MAX_RUNS = 6
+EIGENVALUE_TOLERANCE = 0.1  # error of an eigenvalue over its distance from -1
+TOLERANCE = 1e-12  # of a solution's residual, over that of zero
+ACCEPTED_TOLERANCE = 1e-7  # the same where rounding prevents more
+LOOSE_TOLERANCE = 3e-2  # the same for a step of Newton's method
+# of the tangent: extrapolated changes below it alter no sign, even if their error is as large
+MAX_MISSING_PART = 0.5
+# a larger uncertainty is reduced: the lagged part is corrected along vectors of large eigenvalues,
+MAX_UNCERTAINTY = 1.0
+MAX_CORRECTED_VECTORS = 3  # if there are no more than this many
+MAX_STORED_PRODUCTS = 40  # products with D that are stored
+DEPENDENCE_TOLERANCE = 1e-12  # square of the part of a vector that is independent of others
+Array = NDArray[np.float64]
+LinearMap = Callable[[Vector], Vector]
+
+
+class ArnoldiBasis:
+    """An orthonormal basis of a Krylov space and the matrix H in it (Arnoldi's method).
+
+    Parameters
+    ----------
+    times
+        Product of the matrix with a vector.
+    first
+        The vector that the space begins with.
+    max_size
+        Largest number of columns of H.
+    """
+
+    def __init__(self, times: LinearMap, first: Vector, comm: MPI.Comm, max_size: int) -> None:
+        self._times, self._comm = times, comm
+        self.norm = float(np.sqrt(dot(comm, first, first)))
+        self.basis: list[Vector] = [np.array(first / (self.norm or 1.0), dtype=np.float64)]
+        self.H = np.zeros((max_size + 1, max_size))
+
+    def grow(self) -> int:
+        """Add a vector, which is zero in an invariant space; return the number of columns of H.
+
+        Collective.
+        """
+        j, w = len(self.basis) - 1, np.array(self._times(self.basis[-1]))
+        for _ in range(2):
+            for i, q in enumerate(self.basis):
+                component = dot(self._comm, q, w)
+                self.H[i, j] += component
+                w -= component * q
+        self.H[j + 1, j] = np.sqrt(dot(self._comm, w, w))
+        self.basis.append(w / (self.H[j + 1, j] or 1.0))
+        return j + 1
+
+    def combination(self, coefficients: Array) -> Vector:
+        """Return the linear combination of the first basis vectors."""
+        return np.asarray(sum(c * q for c, q in zip(coefficients, self.basis, strict=False)))
+
+
+class ProductCache:
+    """A dense correction D with its first products, which serve solutions with any K0.
+
+    Attributes
+    ----------
+    pairs
+        Vectors v with D v.
+    """
+
+    def __init__(self, D: DenseCorrection) -> None:
+        self.D, self.pairs = D, list[tuple[Vector, Vector]]()
+
+    def times(self, v: Vector) -> Vector:
+        """Return D v. Collective."""
+        product = self.D.times(v)
+        if len(self.pairs) < MAX_STORED_PRODUCTS:
+            self.pairs.append((np.array(v), product))
+        return product
+
+    def cache_for(self, D: DenseCorrection) -> "ProductCache":
+        """Return a cache for a matrix, with scaled products if it is a multiple of this one."""
+        factor = D.multiple_of(self.D)
+        if factor == 1.0:
+            return self
+        other = ProductCache(D)
+        if factor:
+            other.pairs = [(v, factor * product) for v, product in self.pairs]
+        return other
+
+
+class CorrectionSolver:
+    """Solves (I + A) x = b, A = K0^-1 D, by generalised conjugate residuals.
+
+    The iteration begins with all earlier products. So a solution needs few new ones, or none: A has
+    few large eigenvalues, and earlier vectors hold their directions (M. L. Parks, E. de Sturler,
+    G. Mackey, D. D. Johnson, S. Maiti, SIAM J. Sci. Comput. 28, 2006, 1651).
+
+    Parameters
+    ----------
+    solve_sparse, solve_columns
+        K0^-1 times a vector, and times the columns of a matrix.
+    products
+        D with earlier products.
+    size
+        Number of unknowns on this rank.
+    """
+
+    def __init__(
+        self,
+        solve_sparse: LinearMap,
+        solve_columns: LinearMap,
+        products: ProductCache,
+        comm: MPI.Comm,
+        size: int,
+    ) -> None:
+        self._solve_sparse, self._products, self._comm = solve_sparse, products, comm
+        # columns u, and c = (I + A) u, orthonormal; the first `_count` are in use
+        shape = (size, MAX_STORED_PRODUCTS + MAX_PRODUCTS)
+        self._U, self._C = (np.empty(shape, order="F") for _ in range(2))
+        self._count = 0
+        if products.pairs:
+            U, DU = (np.column_stack(vectors) for vectors in zip(*products.pairs, strict=True))
+            C = U + solve_columns(DU)
+            for _ in range(2):
+                squares, Q = np.linalg.eigh(comm.allreduce(C.T @ C))
+                independent = squares > DEPENDENCE_TOLERANCE * squares[-1]
+                scale = np.sqrt(squares[independent])
+                U, C = (columns @ Q[:, independent] / scale for columns in (U, C))
+            self._count = C.shape[1]
+            self._U[:, : self._count], self._C[:, : self._count] = U, C
+
+    def solve(self, b: Vector, tolerance: float) -> Vector:
+        """Return the solution to a relative residual; NaN if the tolerance is not reached.
+
+        Collective.
+        """
+        size = np.sqrt(dot(self._comm, b, b))
+        if not 0.0 < size < np.inf:
+            return b
+        x, r = self._project_out(np.zeros_like(b), np.array(b), -1.0)
+        residual, m = np.sqrt(dot(self._comm, r, r)) / size, self._count
+        while residual > tolerance and m < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
+            u, c = self._project_out(r, r + self._solve_sparse(self._products.times(r)), 1.0, m)
+            norm = np.sqrt(dot(self._comm, c, c))
+            self._U[:, m], self._C[:, m] = u / norm, c / norm
+            component = dot(self._comm, self._C[:, m], r)
+            x, r = x + component * self._U[:, m], r - component * self._C[:, m]
+            m, previous = m + 1, residual
+            residual = np.sqrt(dot(self._comm, r, r)) / size
+            if previous < ACCEPTED_TOLERANCE and residual > previous / 2:
+                break
+        self._count = min(m, MAX_STORED_PRODUCTS)
+        if not residual <= max(ACCEPTED_TOLERANCE, tolerance):
+            return np.full_like(b, np.nan)
+        return x + r if residual <= tolerance else x
+
+    def _project_out(
+        self, u: Vector, c: Vector, sign: float, count: int | None = None
+    ) -> tuple[Vector, Vector]:
+        """Remove from c its components along the columns C, and from u those of U times the sign.
+
+        With the sign -1 the columns of U are added to u.
+        """
+        m = self._count if count is None else count
+        for _ in range(2):  # the second time for what rounding has left
+            components = self._comm.allreduce(self._C[:, :m].T @ c)
+            u, c = u - sign * (self._U[:, :m] @ components), c - self._C[:, :m] @ components
+        return u, c
+
+
+@dataclass(frozen=True)
+class EigenvalueCrossings:
+    """The change of the number of negative eigenvalues from K0 to K0 + D.
+
+    Attributes
+    ----------
+    added
+        How many more negative eigenvalues K0 + D has.
+    uncertainty
+        The largest |nu|/|1 + nu|: errors of D below its inverse, relative to D, do not change the
+        number.
+    large_vectors
+        Vectors of the eigenvalues beyond `SMALL_EIGENVALUE`.
+    """
+
+    added: int
+    uncertainty: float
+    large_vectors: list[Vector]
+
+
+class ConjugateComplement:
+    """The complement, in the inner product of K, of the space of some vectors X.
+
+    Parameters
+    ----------
+    X, KX
+        Vectors, which may be none, and K times each.
+    """
+
+    def __init__(self, X: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm) -> None:
+        self._comm, self._is_proper = comm, bool(X)
+        if X:
+            self.X, self.KX = (np.column_stack(vectors) for vectors in (X, KX))
+            self.M = comm.allreduce(self.X.T @ self.KX)
+
+    def components(self, v: Vector) -> Array:
+        """Return the components of v along X in the inner product of K. Collective."""
+        return np.asarray(np.linalg.solve(self.M, self._comm.allreduce(self.KX.T @ v)))
+
+    def project(self, v: Vector) -> Vector:
+        """Return the part of v that is K-conjugate to X. Collective."""
+        return np.asarray(v - self.X @ self.components(v)) if self._is_proper else v
+
+
+class SymmetricUpdate:
+    """A lagged D with a symmetric update F that gives the present product along some vectors X.
+
+    With F X = Y, Powell's symmetric update for several vectors is F = Y C + C^T Y^T - C^T X^T Y C
+    with C X = 1, here C = (X^T K X)^-1 X^T K: nothing is added between vectors that are K-conjugate
+    to X.
+
+    Parameters
+    ----------
+    missing
+        Y, the products of what D lacks with X.
+    """
+
+    def __init__(
+        self,
+        D: DenseCorrection,
+        X: Sequence[Vector],
+        missing: Sequence[Vector],
+        KX: Sequence[Vector],
+        comm: MPI.Comm,
+    ) -> None:
+        self._D, self._comm = D, comm
+        self._complement, self._Y = ConjugateComplement(X, KX, comm), np.column_stack(missing)
+        XY = comm.allreduce(self._complement.X.T @ self._Y)
+        self._XY = (XY + XY.T) / 2
+
+    def times(self, v: Vector) -> Vector:
+        """Return (D + F) v. Collective."""
+        c, y = self._complement.components(v), self._comm.allreduce(self._Y.T @ v)
+        transposed = np.linalg.solve(self._complement.M.T, y - self._XY @ c)
+        return np.asarray(self._D.times(v) + self._Y @ c + self._complement.KX @ transposed)
+
+
+def count_crossings(
+    D: LinearMap, solve_sparse: LinearMap, first: Vector, comm: MPI.Comm
+) -> EigenvalueCrossings | None:
+    """Count how many more negative eigenvalues K0 + D has than K0. Collective.
+
+    Parameters
+    ----------
+    D, solve_sparse
+        D and K0^-1 times a vector.
+    first
+        Start vector of the iteration.
+
+    Returns
+    -------
+    The count; None if A has too many large eigenvalues.
+    """
+    added, uncertainty, found_vectors = 0, 0.0, list[Vector]()
+
+    def orthogonal_to_found(v: Vector) -> Vector:
+        for q in found_vectors:
+            v = v - dot(comm, q, v) * q
+        return v
+
+    def deflated_product(v: Vector) -> Vector:
+        return orthogonal_to_found(solve_sparse(D(v)))
+
+    for _ in range(MAX_RUNS):
+        krylov = ArnoldiBasis(deflated_product, orthogonal_to_found(first), comm, MAX_PRODUCTS)
+        eigenpairs = _converged_eigenpairs(krylov)
+        if eigenpairs is None:
+            return None
+        values, vectors = eigenpairs
+        uncertainty = max(uncertainty, float((np.abs(values) / np.abs(1 + values)).max()))
+        large_indices = np.flatnonzero(np.abs(values) > SMALL_EIGENVALUE)
+        if not len(large_indices):
+            return EigenvalueCrossings(added, uncertainty, found_vectors)
+        for i in large_indices[values[large_indices].imag >= 0]:  # of a conjugate pair one
+            coefficients = [vectors[:, i].real]
+            if values[i].imag > 0:
+                coefficients.append(vectors[:, i].imag)
+            vectors_of_value = [krylov.combination(c) for c in coefficients]
+            if values[i].imag == 0 and values[i].real < -1:
+                x = vectors_of_value[0]
+                added += 1 if dot(comm, x, D(x)) < 0 else -1
+            for x in vectors_of_value:
+                x = orthogonal_to_found(x)
+                found_vectors.append(x / np.sqrt(dot(comm, x, x)))
+    return None
+
+
+def _converged_eigenpairs(krylov: ArnoldiBasis) -> tuple[Array, Array] | None:
+    """Grow a Krylov space until its large eigenvalues are accurate. Collective.
+
+    Returns
+    -------
+    Eigenvalues of H and their vectors in the basis, as columns; None if they do not converge.
+    """
+    while (size := krylov.grow()) <= MAX_PRODUCTS:
+        H = krylov.H[:size, :size]
+        if not np.isfinite(H).all():
+            return None
+        values, vectors = np.linalg.eig(H)
+        errors = abs(krylov.H[size, size - 1] * vectors[-1])
+        large_indices = np.flatnonzero(np.abs(values) > SMALL_EIGENVALUE)
+        distances = np.minimum(abs(1 + values[large_indices]), abs(values[large_indices]))
+        if size >= MIN_PRODUCTS and np.all(
+            errors[large_indices] < EIGENVALUE_TOLERANCE * distances
+        ):
+            return values, vectors
+        if size == MAX_PRODUCTS:
+            break
+    return None
+
+
+def crossings_with_lag(
+    tangent: CorrectedTangent,
+    crossings: EigenvalueCrossings,
+    solve_sparse: LinearMap,
+    K: LinearMap,
+    first: Vector,
+    comm: MPI.Comm,
+) -> EigenvalueCrossings:
+    """Return a count with the uncertainty that the lagged part of a tangent adds. Collective.
+
+    The lagged part L, with an error as large as itself, changes the sign along a vector x where
+    x . L x is larger than x . (K + D) x. Among vectors that are K-conjugate to those of large
+    eigenvalues, only the largest is computed. Where the uncertainty is large, a few vectors are
+    corrected with the present product.
+    """
+    lagged = tangent.lagged
+    if lagged is None:
+        return crossings
+    X, smallest = crossings.large_vectors, SMALL_EIGENVALUE / (1 - SMALL_EIGENVALUE)
+    KX = [K(x) for x in X]
+    uncertainties = list[float]()
+    for x, y in zip(X, KX, strict=True):
+        change = dot(comm, x, lagged.times(x))
+        stiffness = dot(comm, x, y) + dot(comm, x, tangent.D.times(x))
+        uncertainties.append(abs(change / stiffness))
+    complement = ConjugateComplement(X, KX, comm)
+    project = complement.project
+
+    def spectral_radius_in_complement(times: LinearMap) -> float:
+        def product(v: Vector) -> Vector:
+            return project(solve_sparse(times(project(v))))
+
+        return spectral_radius(product, project(first), comm)
+
+    others = max(smallest, spectral_radius_in_complement(lagged.times))
+    if tangent.extrapolated_product:  # the lagged part may be small where the present one is not
+        missing = spectral_radius_in_complement(tangent.missing_product)
+        others = max(others, missing / MAX_MISSING_PART)
+    large_indices = [i for i, value in enumerate(uncertainties) if not value <= MAX_UNCERTAINTY]
+    present = tangent.present_product
+    if present and others <= MAX_UNCERTAINTY and 0 < len(large_indices) <= MAX_CORRECTED_VECTORS:
+        X, KX = ([vectors[i] for i in large_indices] for vectors in (X, KX))
+        missing_products = [present(x) - lagged.times(x) for x in X]
+        D = SymmetricUpdate(tangent.D, X, missing_products, KX, comm)
+        if corrected := count_crossings(D.times, solve_sparse, first, comm):
+            small_uncertainties = [value for value in uncertainties if value <= MAX_UNCERTAINTY]
+            return replace(corrected, uncertainty=max([others, *small_uncertainties]))
+    return replace(crossings, uncertainty=max([others, *uncertainties]))
+
+
+def spectral_radius(times: LinearMap, first: Vector, comm: MPI.Comm) -> float:
+    """Return the largest magnitude of an eigenvalue, to `EIGENVALUE_TOLERANCE`. Collective.
+
+    It is infinite if Arnoldi's method does not converge.
+    """
+    krylov = ArnoldiBasis(times, first, comm, MAX_PRODUCTS)
+    while (size := krylov.grow()) < MAX_PRODUCTS:
+        values, vectors = np.linalg.eig(krylov.H[:size, :size])
+        i = int(np.argmax(np.abs(values)))
+        error = abs(krylov.H[size, size - 1] * vectors[-1, i])
+        if size >= MIN_PRODUCTS and error <= EIGENVALUE_TOLERANCE * abs(values[i]):
+            return float(abs(values[i]))
+    return np.inf

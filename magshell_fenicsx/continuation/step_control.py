@@ -1,0 +1,173 @@
+"""Step control along a path: the planned step, and the length of the next one after its outcome."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions
+from magshell_fenicsx.continuation.snes import HIDDEN_BY_ROUNDING
+
+MAX_LEAPS = 3  # number of longer steps that are tried where rounding hides a point
+# number of accepted points from which a rejected one is retried; a third one before it would mean
+# that it is on another branch
+MAX_RETRIES = 2
+MIN_FRACTION_BEFORE_FOLD = 0.25  # of a step: the least to which it is shortened before a fold
+BELOW_ONE = 1 - 1e-9  # rounding must not decide whether one step reaches a target
+PREDICTOR_POINTS = 4  # three points extrapolate the next one, a fourth estimates their error
+
+
+@dataclass(frozen=True)
+class StepEvent:
+    """Onset and loss of contact forces on the straight segment from a point to a predicted state.
+
+    Attributes
+    ----------
+    fraction
+        Fraction of the segment at which new forces begin: a step ends there. 1 if none begin.
+    ends_behind
+        Whether the step ends just behind the onset; else just before.
+    loses_forces
+        Whether forces of the point are lost at the prediction: then only the tangent at the point
+        predicts the next one.
+    """
+
+    fraction: float = 1.0
+    ends_behind: bool = False
+    loses_forces: bool = False
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """A planned step.
+
+    Attributes
+    ----------
+    s
+        The controlled quantity at its end.
+    predictors
+        Points from which the end is extrapolated.
+    length
+        Length without an onset of forces.
+    event
+        Onset and loss of forces on the step.
+    """
+
+    s: float
+    predictors: list[Point]
+    length: float
+    event: StepEvent
+
+
+@dataclass
+class RejectedPoint:
+    """A solution that is too far from the point where its step began.
+
+    Attributes
+    ----------
+    reason
+        Why it was rejected.
+    exact
+        Whether its inertia is that of its own tangent.
+    retries
+        How many later points it was compared with.
+    """
+
+    point: Point
+    reason: str
+    exact: bool
+    retries: int = 0
+
+
+@dataclass
+class StepController:
+    """The recent points of a path and the length of its next step.
+
+    Attributes
+    ----------
+    points
+        The last points, from which the next one is extrapolated.
+    step
+        The length of the next step, unless something shortens it.
+    leaps
+        The number of failed steps since the last point.
+    rejected
+        A solution that a step rejected as too far.
+    onset_without_solution
+        The last point before an onset of forces, if no solution was found behind the onset.
+    """
+
+    points: list[Point]
+    step: float
+    leaps: int = 0
+    rejected: RejectedPoint | None = None
+    onset_without_solution: Point | None = None
+
+    @property
+    def current(self) -> Point:
+        """The last point."""
+        return self.points[-1]
+
+    def length(self, distance: float) -> float:
+        """Return the length of the next step towards a target at a distance in s.
+
+        The last steps before a target have equal lengths, so that none of them is tiny.
+        """
+        steps = np.inf
+        if np.isfinite(distance):
+            steps = max(1.0, np.ceil(BELOW_ONE * abs(distance) / self.step))
+        return abs(distance) / steps if steps < 3 else self.step
+
+    def reject_step(self, plan: StepPlan, reason: str, smallest: float) -> None:
+        """Choose another step after one that failed.
+
+        Raises
+        ------
+        PathStopped
+            If it would be shorter than the smallest.
+        """
+        if plan.event.fraction < 1 and plan.event.ends_behind:
+            self.onset_without_solution, self.rejected = self.current, None
+            return
+        self.leaps += 1
+        # a longer step may pass a singular tangent
+        leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
+        self.step = 2 * plan.length if leaps_over else plan.length / 2
+        if not self.step >= smallest:
+            raise PathStopped(reason, self.current)
+
+    def accept_step(
+        self, point: Point, plan: StepPlan, options: StepOptions, *, straight: bool, kink: bool
+    ) -> None:
+        """Append the end of a step, and adapt the step length.
+
+        Parameters
+        ----------
+        straight
+            Whether the path is straight enough for a longer step.
+        kink
+            Whether the path has a kink in the step: then no earlier point predicts the next one.
+        """
+        length = plan.length
+        easy = (
+            point.factorisations <= options.easy_factorisations
+            or point.iterations <= options.easy_iterations
+        )
+        if straight and easy:
+            longer = min(self.step + length / 2, 2 * length)
+            self.step = min(max(self.step, longer), options.largest)  # a target may have cut it
+        elif point.factorisations >= options.hard_factorisations and plan.event.fraction == 1:
+            self.step = 0.6 * length
+        smooth = plan.event.fraction == 1 and not kink
+        earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
+        self.points, self.leaps = [*earlier_points, point], 0
+
+    def accept_rejected(self, point: Point, length: float) -> None:
+        """Append the rejected solution, which lies one step of a length from the last point."""
+        self.points, self.step = [*self.points[1 - PREDICTOR_POINTS :], point], length
+        self.rejected = None
+
+    def keep_rejected(self, rejected: RejectedPoint, length: float) -> None:
+        """Keep a solution that is still too far, at a length ahead; behind if it is negative."""
+        if length > 0:
+            self.step = min(self.step, max(length / 2, MIN_FRACTION_BEFORE_FOLD * self.step))
+        self.rejected = rejected if rejected.retries < MAX_RETRIES else None

@@ -1,0 +1,158 @@
+"""Boundaries of symmetry-breaking bifurcations: their equations with a second parameter p.
+
+Modes of a family m (waves of a meridian) have a tangent K_m of their own at a state of the model,
+and the path before them is regular: R(u, mu, p) = 0 and g(u, mu, p) = 0, with K_m v + g b = 0 and b
+. v = 1, so that dg = -v . dK_m v. Families do not couple. So where two of them are neutral at once
+both equations are regular, and each goes on alone.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.augmented import CurveRow, CurveVector, SystemFamily
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.fold import difference_step
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
+
+MAX_INVERSE_ITERATIONS = 40  # for an eigenvalue
+EIGENVALUE_TOLERANCE = 1e-9  # relative change of the eigenvalue that ends the iteration
+DIFFERENCE_STEP = 1e-4  # relative, of an amplitude
+
+
+class SymmetryBreakingSystems(SystemFamily, Protocol):
+    """Systems that differ by a parameter p, with the tangents of their symmetry-breaking modes."""
+
+    def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
+        """Factor the tangent K_m of a family at a state; the next call may overwrite it."""
+
+    def quadratic_form(self, p: float, state: State, m: int, v: Vector) -> float:
+        """Return v . K_m v."""
+
+    def counts(self, p: float, state: State) -> Sequence[int]:
+        """Return the numbers of unstable directions of the families 1, 2, ..."""
+
+
+class SymmetryBreakingRows:
+    """The rows of Newton's step at a state of a boundary: du = -w_R - dmu w_mu - dp w_p.
+
+    Parameters
+    ----------
+    difference
+        Weights and values of p of a difference by p.
+
+    Attributes
+    ----------
+    v, g
+        Null vector and residual of K_m v + g b = 0.
+    pull, bend
+        `BoundaryPoint.pull` and `cubic`; both are zero, since v does no work on the model.
+    """
+
+    def __init__(
+        self,
+        newton: BorderedNewton,
+        state: State,
+        name: str,
+        b: Vector,
+        m: int,
+        family: SymmetryBreakingSystems,
+        p: float,
+        difference: Sequence[tuple[float, float]],
+    ) -> None:
+        self._system, self._family, self._m = newton.system, family, m
+        self.pull = self.bend = 0.0
+        self._p, self._state, self._b = p, state, b
+        system, u, mu, value = newton.system, state.u, state.mu, state.mu[name]
+        self._factors = newton.factor_at(state)
+        self._comm = comm = system.comm
+        family_factors = family.factored_tangent(p, state, m)
+        y = family_factors.solve(b)
+        compliance = dot(comm, b, y)
+        self.v: Vector = np.asarray(y / compliance)
+        self.g = -1 / compliance
+        self._other_unstable = family_factors.negative_pivots - (compliance < 0)
+        R_p, K_p = 0.0 * u, 0.0
+        for weight, q in difference:
+            state_at_q = State(u, {**family.amplitudes(q), name: value})
+            R_p = R_p + weight * family.solver_at(q).system.residual(u, state_at_q.mu)
+            K_p += weight * family.quadratic_form(q, state_at_q, m, self.v)
+        self._w_mu = self._factors.solve(system.load(u, mu, name))
+        self._w_p = self._factors.solve(R_p)
+        d = DIFFERENCE_STEP * (abs(value) or 1.0)
+        forward, backward = (
+            family.quadratic_form(p, State(u, {**mu, name: value + step}), m, self.v)
+            for step in (d, -d)
+        )
+        self._g_mu = -(forward - backward) / (2 * d) - self._derivative_of_g(self._w_mu)
+        self._g_p = -K_p - self._derivative_of_g(self._w_p)
+        self.set_residual(system.residual(u, mu))
+
+    def counts(self) -> list[int]:
+        """Return the numbers of unstable directions other than v, of the model and each family."""
+        m, counts = self._m, list(self._family.counts(self._p, self._state))
+        counts += [0] * (m - len(counts))
+        counts[m - 1] = self._other_unstable
+        return [self._factors.negative_pivots, *counts]
+
+    def set_residual(self, residual: Vector) -> None:
+        """Use the residual at a nearby state, with the same factors."""
+        self._w_R = self._factors.solve(residual)
+
+    def step(self, row: CurveRow, value: float | None, *, settled: bool = False) -> CurveVector:
+        """Return Newton's step, or the tangent of the curve; see `augmented.AugmentedRows.step`."""
+        comm, w_mu, w_p = self._comm, self._w_mu, self._w_p
+        is_tangent = value is None
+        w_R = 0.0 * w_mu if is_tangent else self._w_R
+        g = 0.0 if is_tangent or settled else self.g - self._derivative_of_g(w_R)
+        c = [-dot(comm, row.du, w) for w in (w_mu, w_p, w_R)] if row.du is not None else [0.0] * 3
+        rows = np.array([[self._g_mu, self._g_p], [c[0] + row.dmu, c[1] + row.dp]])
+        right_side = np.array([g, c[2] + value if value is not None else -1.0])
+        size = np.abs(rows).max(axis=1)
+        dmu, dp = np.linalg.solve(rows / size[:, None], -right_side / size)
+        return CurveVector(-w_R - dmu * w_mu - dp * w_p, float(dmu), float(dp))
+
+    def eigenvalue(self, m: int, p: float, state: State) -> float:
+        """Return the eigenvalue nearest to zero of a family's tangent; of the model's for m = 0.
+
+        Of the family of v it is that of the space orthogonal to b.
+        """
+        factors = self._family.factored_tangent(p, state, m) if m else self._factors
+        return nearest_eigenvalue(factors, self._comm, self._b if m == self._m else None)
+
+    def _derivative_of_g(self, w: Vector) -> float:
+        """Return the derivative of g along a displacement."""
+        if not max_abs(self._comm, w):
+            return 0.0
+        d, state = difference_step(self._system, w), self._state
+        forward, backward = (
+            self._family.quadratic_form(
+                self._p, State(state.u + step * w, state.mu), self._m, self.v
+            )
+            for step in (d, -d)
+        )
+        return -(forward - backward) / (2 * d)
+
+
+def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None = None) -> float:
+    """Return the eigenvalue nearest to zero of a factored matrix. Collective.
+
+    Parameters
+    ----------
+    b
+        A vector by which the matrix is bordered: only the space orthogonal to it counts.
+    """
+    solution_for_b = None if b is None else factors.solve(b)
+    x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf
+    for _ in range(MAX_INVERSE_ITERATIONS):
+        y = factors.solve(x)
+        if b is not None and solution_for_b is not None:  # the bordered tangent is regular
+            y = y - dot(comm, b, y) / dot(comm, b, solution_for_b) * solution_for_b
+        last, value = value, float(dot(comm, x, x) / dot(comm, x, y))
+        if abs(value - last) <= EIGENVALUE_TOLERANCE * abs(value):
+            break
+        x = y / np.sqrt(dot(comm, y, y))
+    return value
