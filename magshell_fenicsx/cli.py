@@ -25,7 +25,7 @@ from magshell_fenicsx.command import (
     result_option,
     typer,
 )
-from magshell_fenicsx.platform.packages import Unusable, missing
+from magshell_fenicsx.platform.packages import Unusable, install_hint
 from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams
 
@@ -84,7 +84,7 @@ def main() -> None:
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception as e:
-        if isinstance(e, ImportError) and (advice := missing(e)):
+        if isinstance(e, ImportError) and (advice := install_hint(e)):
             print(advice, file=sys.stderr)
             sys.exit(INVALID)
         if isinstance(e, Unusable):

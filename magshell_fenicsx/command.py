@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import terminal
-from magshell_fenicsx.platform.kept import UnsafeCache
+from magshell_fenicsx.platform.disk_cache import UnsafeCache
 from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
@@ -231,8 +231,8 @@ def _all_fail(comm: Any) -> bool:
 
 def refuse_lost() -> None:
     """End a command whose only result is what it prints, if that was not written."""
-    if terminal.lost:
-        raise failure(f"stopped early: {terminal.lost[0]}", STOPPED)
+    if terminal.output_failures:
+        raise failure(f"stopped early: {terminal.output_failures[0]}", STOPPED)
 
 
 @contextmanager

@@ -202,12 +202,12 @@ def info(
     ] = False,
 ) -> None:
     """Print versions, the BLAS in use and the folder of the kernel cache."""
+    from magshell_fenicsx.platform.disk_cache import cache_folder
     from magshell_fenicsx.platform.environment import fast_blas, versions
-    from magshell_fenicsx.platform.kept import kernel_cache
     from magshell_fenicsx.simulate.precompile import precompile
 
     with exit_codes():
-        kernels = kernel_cache()
+        kernels = cache_folder()
     for name, number in versions().items():
         print_line(f"{name:18} {number}")
     print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")

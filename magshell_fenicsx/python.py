@@ -19,13 +19,13 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.messages import refuse_unknown, unknown
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.mesh.given import Home, Part
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
+from magshell_fenicsx.mesh.user_mesh import MeshPart, UserMesh
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.registered import STEPS
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
-from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
@@ -82,8 +82,8 @@ class Shell:
         self,
         surface: mesh.Mesh | str,
         *,
-        edges: Mapping[str, Part] | None = None,
-        patches: Mapping[str, Part] | None = None,
+        edges: Mapping[str, MeshPart] | None = None,
+        patches: Mapping[str, MeshPart] | None = None,
         facet_tags: mesh.MeshTags | None = None,
         cell_tags: mesh.MeshTags | None = None,
         radius: float | str | None = None,
@@ -95,7 +95,7 @@ class Shell:
         remanent: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> None:
-        self.home: Home | None = None
+        self.home: UserMesh | None = None
         self.name, self._own = (
             name,
             {"place": place, "points": points, "mesh": mesh, "remanent": remanent},
@@ -123,7 +123,7 @@ class Shell:
             return
         if strange := next((key for key in ("geometry", "file") if key in keys), None):
             raise CaseError(f"{NAME}: shell.{strange}: the surface is the mesh; leave it out")
-        self.home = Home(surface)
+        self.home = UserMesh(surface)
         triangles = self.home.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
         self.files.given[Path(MESH).absolute()] = triangles
         self._keys |= {"geometry": "mesh", "file": MESH}
@@ -164,7 +164,7 @@ class Shell:
             return [self.plain(each, key) for each in value]
         return value
 
-    def given(self, function: fem.Function, key: str) -> GivenField:
+    def given(self, function: fem.Function, key: str) -> UserField:
         """A function on the mesh.
 
         Raises

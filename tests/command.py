@@ -45,7 +45,7 @@ def mpirun(ranks: int) -> list[str]:
     Ranks poll while they wait for each other: beside another test they take several times as long
     if not first.
     """
-    return [*FIRST, *processes.mpirun(ranks)]
+    return [*FIRST, *processes.mpirun_command(ranks)]
 
 
 def started(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Record, Scene
-from magshell_fenicsx.assembly.evaluated import VARIABLE
+from magshell_fenicsx.assembly.evaluation import VARIABLE
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 

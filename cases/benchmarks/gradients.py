@@ -17,7 +17,7 @@ from benchmarks.gradients_cases import CASES, Compared
 from pydantic import BaseModel
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.section import number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, override
 from magshell_fenicsx.problem.problem import Problem

@@ -22,7 +22,7 @@ from magshell_fenicsx.simulate.follow import follow
 CASE = Path(__file__).parents[1] / "own_field.yaml"
 
 
-class Counted:
+class AngleTerm:
     """Stands for `Charged.evaluate`, and counts its calls."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Counted:
         return evaluate
 
 
-def seconds(case: dict[str, Any], points: int, counted: Counted) -> list[float]:
+def seconds(case: dict[str, Any], points: int, counted: AngleTerm) -> list[float]:
     """Of each point under pressure."""
     found, history = list[float](), follow(Scene(case))
     while len(found) < points:
@@ -57,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--refinement", type=float, default=0.56)
     parser.add_argument("--points", type=int, default=6)
-    given, counted = parser.parse_args(), Counted()
+    given, counted = parser.parse_args(), AngleTerm()
     Charged.evaluate = counted  # type: ignore[method-assign,assignment]
     case = yaml.safe_load(CASE.read_text(encoding="utf-8"))
     case |= {"symmetry": "none", "mesh": case["mesh"] | {"refinement": given.refinement}}

@@ -16,7 +16,7 @@ from speed.measure import BenchFailed, measure_item
 from speed.report import compare, derived, table
 
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.platform.environment import fingerprint
+from magshell_fenicsx.platform.environment import machine_fingerprint
 
 OUT = Path("results") / "bench.json"
 
@@ -30,7 +30,7 @@ def bench(items: Mapping[str, Item], file: Path) -> dict[str, Any]:
     BenchFailed
         At the first that fails; those before it are in the file.
     """
-    found: dict[str, Any] = {"machine": fingerprint(), "items": {}}
+    found: dict[str, Any] = {"machine": machine_fingerprint(), "items": {}}
     for name, item in items.items():
         print(f"{name} ...", flush=True)
         numbers = measure_item(item)

@@ -8,7 +8,7 @@ from typing import Any
 
 from speed.items import ITERATIONS, K_D_20_000, ONE_RANK, TWO_RANKS
 
-from magshell_fenicsx.platform.environment import described
+from magshell_fenicsx.platform.environment import describe_machine
 
 MARKED = 1.2  # ratios beyond it, up or down
 PIECES = ("tangent", "factor", "back_solves", "residual")

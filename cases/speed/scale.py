@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from speed.items import WITH_CAMPAIGNS
 
-from magshell_fenicsx.platform.environment import described, fingerprint
+from magshell_fenicsx.platform.environment import describe_machine, machine_fingerprint
 from magshell_fenicsx.platform.processes import measure
 
 PIECES = ("tangent", "factor", "back_solves", "residual")
@@ -109,7 +109,7 @@ def main(words: Sequence[str]) -> None:
                 print(json.dumps(rows[-1]), flush=True)
     except ScaleFailed as e:
         sys.exit(f"scale: {e}")
-    print(described(fingerprint()), *table(rows), sep="\n")
+    print(describe_machine(machine_fingerprint()), *table(rows), sep="\n")
     for ranks in given.ranks:
         those = [r for r in rows if r["ranks"] == ranks]
         if len({r["dofs"] for r in those}) > 1:

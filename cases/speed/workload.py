@@ -49,7 +49,7 @@ def measured(scene: Scene, repeats: int) -> dict[str, float]:
     model, factorisation, comm = scene.model, scene.newton.factorisation, scene.comm
     system = model.system
     r0 = model.r0.x.array[: system.size].reshape(-1, 3)
-    u = system.held((HEIGHT * system.length * np.sin(r0 @ WAVES)).ravel())
+    u = system.zero_at_supports((HEIGHT * system.length * np.sin(r0 @ WAVES)).ravel())
     rhs = system.load(u, MU, "pressure")
     first = timed(comm, lambda: factorisation.factor(system.tangent(u, MU)))
     K = system.tangent(u, MU)

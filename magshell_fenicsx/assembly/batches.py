@@ -1,7 +1,8 @@
-"""Cells and edges in batches that share their reference tables, and the matrices of cells and of
-pairs of cells.
+"""Batches of cells and of edges that share reference tables, and element matrices from Hessians.
 
-The matrices are made of Hessians at points, and multiply vectors.
+Element matrices of cells and of pairs of cells are contractions of Hessians at points with shape
+functions. They multiply vectors here, or are scattered into a sparse matrix (`scatter`). Theory:
+docs/tangent.md.
 """
 
 from collections.abc import Iterator
@@ -12,36 +13,42 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.point_kernels import COMPONENTS, SKEW, Pair, Pairs
-from magshell_fenicsx.assembly.shape_tables import EDGES, Table, cell_rule, edge_covector, edge_rule
+from magshell_fenicsx.assembly.point_kernels import COMPONENTS, SKEW, BlockPairs, IndexPair
+from magshell_fenicsx.assembly.shape_tables import (
+    EDGES,
+    ShapeTable,
+    cell_rule,
+    edge_covector,
+    edge_rule,
+)
 from magshell_fenicsx.platform import compat
 
-POINTS = 2048  # most points of a batch; its Hessians take a few megabytes
+MAX_BATCH_POINTS = 2048  # in a batch, whose Hessians then take a few megabytes
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Rule:
-    """Quadrature points on the reference cell.
+class EntityRule:
+    """A quadrature on the reference cell, of a cell or of an edge with one or two sides.
 
     Attributes
     ----------
     points
         (q, 2) for each side: the same points in space.
     tables
-        Shape functions there, for each side.
+        Shape functions at these points, for each side.
     weights
         (q,) of the quadrature.
     """
 
     points: tuple[NDArray[np.float64], ...]
-    tables: tuple[Table, ...]
+    tables: tuple[ShapeTable, ...]
     weights: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Entities with the same rule.
+class EntityBatch:
+    """Cells or edges with the same rule.
 
     Attributes
     ----------
@@ -53,56 +60,61 @@ class Batch:
     """
 
     cells: tuple[NDArray[np.int32], ...]
-    rule: Rule
+    rule: EntityRule
     geometry: NDArray[np.float64]
 
     @property
     def size(self) -> int:
-        """Number of points of all entities."""
+        """Number of quadrature points of all entities."""
         return len(self.cells[0]) * len(self.rule.weights)
 
 
-Chosen: TypeAlias = (
-    NDArray[np.bool_] | None
-)  # local cells that count, None for all; an edge counts with one of them
+# (local cells,) which cells count, None for all; an edge counts with one of its cells.
+CellMask: TypeAlias = NDArray[np.bool_] | None
 
 
-def cell_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
-    """Batches of the owned cells."""
+def cell_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
+    """Return batches of the owned cells."""
     X, w = cell_rule(degree)
-    rule = Rule((X,), (Table.tabulate(V.element.basix_element, X),), w)
+    rule = EntityRule((X,), (ShapeTable.tabulate(V.element.basix_element, X),), w)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-    counted = cells if chosen is None else cells[chosen[cells]]
-    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(counted, len(w))]
+    counted = cells if mask is None else cells[mask[cells]]
+    chunks = _chunks(counted, len(w))
+    return [EntityBatch((chunk,), rule, np.empty((len(chunk), 0))) for chunk in chunks]
 
 
-def interior_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
-    """Batches of the owned interior edges."""
-    cells, edges, backwards = interior_edges(V)
-    return list(
-        _edge_batches(V, degree, *_counted(cells, np.column_stack([edges, backwards]), chosen))
-    )
+def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
+    """Return batches of the owned interior edges."""
+    cells, edges, reversed_edges = interior_edges(V)
+    kinds = np.column_stack([edges, reversed_edges])
+    return list(_edge_batches(V, degree, *_masked(cells, kinds, mask)))
 
 
 def boundary_batches(
-    V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32], chosen: Chosen = None
-) -> list[Batch]:
-    """Batches of those boundary edges that this rank owns."""
-    return list(_edge_batches(V, degree, *_counted(*boundary_edges(V, facets), chosen)))
+    V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32], mask: CellMask = None
+) -> list[EntityBatch]:
+    """Return batches of those boundary edges that this rank owns."""
+    return list(_edge_batches(V, degree, *_masked(*boundary_edges(V, facets), mask)))
 
 
-def _counted(
-    cells: NDArray[np.int32], kinds: NDArray[np.int32], chosen: Chosen
+def _masked(
+    cells: NDArray[np.int32], kinds: NDArray[np.int32], mask: CellMask
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    which = slice(None) if chosen is None else chosen[cells].any(axis=1)
-    return cells[which], kinds[which]
+    """Return the rows of edges that count."""
+    rows = slice(None) if mask is None else mask[cells].any(axis=1)
+    return cells[rows], kinds[rows]
 
 
 def interior_edges(
     V: fem.FunctionSpace,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells'
-    orientations differ.
+    """Return the owned interior edges.
+
+    Returns
+    -------
+    tuple
+        Cells (n, 2), local numbers of the edge in each cell (n, 2), and (n,) whether the cells run
+        along it in opposite directions.
     """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
@@ -119,7 +131,7 @@ def interior_edges(
 def boundary_edges(
     V: fem.FunctionSpace, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The owned ones of some boundary edges: cells (n, 1), number in the cell (n, 1)."""
+    """Return the owned ones of some boundary edges: cells and numbers in the cell, both (n, 1)."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
@@ -130,36 +142,46 @@ def boundary_edges(
 
 def _edge_batches(
     V: fem.FunctionSpace, degree: int, cells: NDArray[np.int32], kinds: NDArray[np.int32]
-) -> Iterator[Batch]:
-    """Group edges by their number in the cell of each side and, with two sides, by relative
-    orientation.
+) -> Iterator[EntityBatch]:
+    """Iterate over batches of edges of the same kind.
+
+    Parameters
+    ----------
+    cells
+        (n, sides).
+    kinds
+        (n, ...): local numbers of the edge in the cell of each side and, with two sides, whether
+        the cells run along it in opposite directions.
     """
     sides = cells.shape[1]
     for kind in np.unique(kinds, axis=0):
-        backwards = (False, bool(kind[-1]))[:sides]
+        reversed_sides = (False, bool(kind[-1]))[:sides]
         rules = [
-            edge_rule(degree, int(edge), back)
-            for edge, back in zip(kind[:sides], backwards, strict=True)
+            edge_rule(degree, int(edge), is_reversed)
+            for edge, is_reversed in zip(kind[:sides], reversed_sides, strict=True)
         ]
         X, w = tuple(points for points, _ in rules), rules[0][1]
-        rule = Rule(X, tuple(Table.tabulate(V.element.basix_element, x) for x in X), w)
+        tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in X)
+        rule = EntityRule(X, tables, w)
         covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
-        for part in _chunks(np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32), len(w)):
-            both = tuple(np.ascontiguousarray(side) for side in cells[part].T)
-            width = edge_width(V, both, np.full(len(part), kind[0]))
-            geometry = np.column_stack([np.tile(covectors, (len(part), 1)), width])
-            yield Batch(both, rule, geometry)
+        edges = np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32)
+        for chunk in _chunks(edges, len(w)):
+            cells_of_sides = tuple(np.ascontiguousarray(side) for side in cells[chunk].T)
+            width = edge_width(V, cells_of_sides, np.full(len(chunk), kind[0]))
+            geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), width])
+            yield EntityBatch(cells_of_sides, rule, geometry)
 
 
 def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]:
-    size = max(POINTS // points, 1)
+    """Return entities, with this number of points each, in parts of at most `MAX_BATCH_POINTS`."""
+    size = max(MAX_BATCH_POINTS // points, 1)
     return [entities[i : i + size] for i in range(0, len(entities), size)]
 
 
 def _local_edges(
     V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Number of each facet in its cell."""
+    """Return the local number of each facet in its cell."""
     V.mesh.topology.create_connectivity(2, 1)
     edges = V.mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells]
     return np.asarray(np.argmax(edges == facets[:, None], axis=1), dtype=np.int32)
@@ -168,18 +190,24 @@ def _local_edges(
 def _corner(
     V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """The vertex at which an edge starts in a cell."""
+    """Return the vertex at which an edge starts in a cell."""
     first = np.array(EDGES)[:, 0][edges]
-    return np.asarray(compat.corner_numbers(V.mesh)[cells, first])
+    return np.asarray(compat.geometry_dofs(V.mesh)[cells, first])
 
 
 def edge_width(
     V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Flat area of the cells, averaged over the sides, over the flat length of their edge (its
-    number on side 0).
+    """Return the width of cells over their edge in the flat mesh: mean area over edge length.
+
+    Parameters
+    ----------
+    cells
+        (n,) for each side.
+    edges
+        (n,) local numbers of the edge on side 0.
     """
-    corners = [V.mesh.geometry.x[compat.corner_numbers(V.mesh)[side]] for side in cells]
+    corners = [V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[side]] for side in cells]
     areas = [
         np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners
     ]
@@ -188,20 +216,27 @@ def edge_width(
 
 
 class Contraction:
-    """K[ac, bd] = sum over points and parts of w D_i[a] D_j[b] H[ic, jd].
+    """The contraction K[ac, bd] = sum over points and pairs i, j of w D_i[a] D_j[b] H[ic, jd].
 
-    The products of the shape functions' derivatives are the same for all entities of a rule. For a
-    symmetric (skew) block they are symmetric (skew) in a, b, so only a <= b is computed.
+    D_i are the shape functions' derivatives, H the Hessians at points. Products of two D are the
+    same for all entities of a rule. For a symmetric (skew) block they are symmetric (skew) in a, b,
+    so only a <= b is computed.
     """
 
-    def __init__(self, rule: Rule, pairs: Pairs) -> None:
+    def __init__(self, rule: EntityRule, pairs: BlockPairs) -> None:
         w, tables = rule.weights, rule.tables
-        self._symmetric = [table.symmetric(w, pairs.same) for table in tables]
+        self._symmetric = [table.symmetric(w, pairs.within_side) for table in tables]
         self._skew = [table.skew(w, pairs.skew) for table in tables] if pairs.skew else []
         self._cross = tables[0].cross(w, tables[1], pairs.cross) if pairs.cross else None
 
-    def same(self, blocks: "Blocks", side: int) -> Array:
-        """(entities, 9, pairs a <= b) of one side: the symmetric parts, then the skew parts."""
+    def within_side(self, blocks: "HessianBlocks", side: int) -> Array:
+        """Return the element matrices of one side.
+
+        Returns
+        -------
+        Array
+            (entities, 9, pairs a <= b): six symmetric components, then three skew ones.
+        """
         symmetric = self._symmetric[side]
         K = np.zeros((len(blocks.skew[side]), 9, symmetric.shape[1]))
         K[:, :6] = _product(blocks.symmetric[side], symmetric)
@@ -209,64 +244,89 @@ class Contraction:
             K[:, 6:] = _product(blocks.skew[side], self._skew[side])
         return K
 
-    def cross(self, blocks: "Blocks") -> Array:
-        """(entities, 9, functions^2)."""
+    def cross(self, blocks: "HessianBlocks") -> Array:
+        """Return the blocks (entities, 9, functions^2) that couple the two sides."""
         assert self._cross is not None
         return _product(blocks.cross, self._cross)
 
 
-class Blocks:
-    """Hessians at the points of a batch, sorted for the contraction: (entities, components, points,
-    pairs).
+class HessianBlocks:
+    """Hessians at the points of a batch, ordered for the contraction.
+
+    Attributes
+    ----------
+    symmetric, skew
+        (entities, 6 or 3 components, points, pairs) for each side.
+    cross
+        (entities, 9, points, pairs).
     """
 
-    def __init__(self, batch: Batch, pairs: Pairs) -> None:
+    def __init__(self, batch: EntityBatch, pairs: BlockPairs) -> None:
         entities, points = len(batch.cells[0]), len(batch.rule.weights)
         self._pairs = pairs
-        self.symmetric = [np.zeros((entities, 6, points, len(pairs.same))) for _ in batch.cells]
+        self.symmetric = [
+            np.zeros((entities, 6, points, len(pairs.within_side))) for _ in batch.cells
+        ]
         self.skew = [np.zeros((entities, 3, points, len(pairs.skew))) for _ in batch.cells]
         self.cross = np.zeros((entities, 9, points, len(pairs.cross)))
 
-    def add(self, values: Array, factor: float, pairs: Pairs) -> None:
-        """Add the Hessians of one term, as they come from `point_hessian`; `values` is overwritten."""
+    def add(self, values: Array, factor: float, pairs: BlockPairs) -> None:
+        """Add the Hessians of one term times a factor.
+
+        Parameters
+        ----------
+        values
+            As `point_hessian` returns them; they are overwritten.
+        """
         values *= factor
         first = 0
-        for target, rows, columns in self._targets(pairs):
+        for target, all_pairs, term_pairs in self._targets(pairs):
             entities, components, points, _ = target.shape
-            last = first + components * len(columns)
-            part = values[:, first:last].reshape(entities, points, components, len(columns))
-            target[..., _places(rows, columns)] += part.transpose(0, 2, 1, 3)
+            last = first + components * len(term_pairs)
+            block = values[:, first:last].reshape(entities, points, components, len(term_pairs))
+            target[..., _positions(all_pairs, term_pairs)] += block.transpose(0, 2, 1, 3)
             first = last
 
-    def _targets(self, pairs: Pairs) -> Iterator[tuple[Array, tuple[Pair, ...], tuple[Pair, ...]]]:
-        """The arrays, their pairs and the pairs of a term, in the order of `point_hessian`."""
+    def _targets(
+        self, pairs: BlockPairs
+    ) -> Iterator[tuple[Array, tuple[IndexPair, ...], tuple[IndexPair, ...]]]:
+        """Iterate over arrays, their pairs and a term's pairs, in the order of `point_hessian`."""
         for symmetric, skew in zip(self.symmetric, self.skew, strict=True):
-            yield symmetric, self._pairs.same, pairs.same
+            yield symmetric, self._pairs.within_side, pairs.within_side
             yield skew, self._pairs.skew, pairs.skew
         yield self.cross, self._pairs.cross, pairs.cross
 
 
 def _product(H: Array, products: Array) -> Array:
     entities, components = H.shape[:2]
-    return np.asarray(H.reshape(entities * components, -1) @ products).reshape(
-        entities, components, -1
-    )
+    flat = np.asarray(H.reshape(entities * components, -1) @ products)
+    return flat.reshape(entities, components, -1)
 
 
-def _places(all_pairs: tuple[Pair, ...], some: tuple[Pair, ...]) -> slice | list[int]:
-    """The indices of some pairs among all, as a slice if they are contiguous."""
-    places = [all_pairs.index(pair) for pair in some]
-    if places and places == list(range(places[0], places[-1] + 1)):
-        return slice(places[0], places[-1] + 1)
-    return places
+def _positions(
+    all_pairs: tuple[IndexPair, ...], term_pairs: tuple[IndexPair, ...]
+) -> slice | list[int]:
+    """Return the indices of a term's pairs among all, as a slice if they are contiguous."""
+    positions = [all_pairs.index(pair) for pair in term_pairs]
+    if positions and positions == list(range(positions[0], positions[-1] + 1)):
+        return slice(positions[0], positions[-1] + 1)
+    return positions
 
 
 Ints = NDArray[np.int32]
 
 
-def add_own(y: Array, K: Array, nodes: Ints, x: Array) -> None:
-    """Add the matrices (cells, 9, pairs a <= b) of cells times x (nodes, 3) to y; see
-    `BlockMatrix.add_cells`.
+def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
+    """Add the products of element matrices with a vector.
+
+    Parameters
+    ----------
+    y, x
+        (nodes, 3): the result and the vector.
+    K
+        (cells, 9, pairs a <= b), see `BlockMatrix.add_cells`.
+    nodes
+        (cells, functions).
     """
     a, b = np.triu_indices(nodes.shape[1])
     blocks = np.empty((len(K), len(a), 3, 3))
@@ -276,17 +336,23 @@ def add_own(y: Array, K: Array, nodes: Ints, x: Array) -> None:
         blocks[:, :, c, d] += K[:, number]
         blocks[:, :, d, c] -= K[:, number]
     np.add.at(y, nodes[:, a], np.einsum("epcd,epd->epc", blocks, x[nodes[:, b]]))
-    beside = a < b
-    np.add.at(
-        y,
-        nodes[:, b[beside]],
-        np.einsum("epdc,epd->epc", blocks[:, beside], x[nodes[:, a[beside]]]),
-    )
+    # Blocks below the diagonal are transposes of those above.
+    upper = a < b
+    transposed = np.einsum("epdc,epd->epc", blocks[:, upper], x[nodes[:, a[upper]]])
+    np.add.at(y, nodes[:, b[upper]], transposed)
 
 
-def add_coupled(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
-    """Add the blocks (pairs of cells, 9, functions^2) and their transposes; see
-    `BlockMatrix.add_coupling`.
+def add_coupling_products(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
+    """Add the products of blocks that couple two cells, and of their transposes, with a vector.
+
+    Parameters
+    ----------
+    y, x
+        (nodes, 3): the result and the vector.
+    K
+        (pairs of cells, 9, functions^2), see `BlockMatrix.add_coupling`.
+    rows, columns
+        (pairs of cells, functions): nodes of the first and the second cell.
     """
     n = rows.shape[1]
     blocks = K.reshape(len(K), 3, 3, n, n)

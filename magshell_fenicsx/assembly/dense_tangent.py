@@ -24,7 +24,7 @@ from scipy.sparse import bsr_array, csr_array
 
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.continuation.system import CorrectedTangent, DenseCorrection, Vector
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
@@ -127,7 +127,7 @@ class BlockProducts:
 
     def __init__(self, comm: MPI.Comm) -> None:
         source = Path(__file__).with_name("dense_tangent.c")
-        self._ffi, self._lib = native(source, C_DECLARATIONS, comm)
+        self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
 
     def times(self, A: bsr_array | SinglePrecisionBlocks, v: Array) -> Array:
         """Return A v."""

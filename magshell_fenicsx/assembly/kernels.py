@@ -1,7 +1,7 @@
-"""Compilation: forms by FFCx, functions at points by ours, and the time that both take.
+"""Compilation of kernels: forms by FFCx, functions at points by ours, and the time that both take.
 
-Kernels are begun where they are declared, and compiled side by side when the first of them is asked
-for: then it is known how many there are, and the largest, on which the others would wait at the
+Kernels are requested where they are declared, and compiled in parallel when the first of them is
+needed: then it is known how many there are, and the largest, on which the others would wait at the
 end, are compiled first.
 
 Two scenes that differ only in numbers have the same forms. A process compiles each form once and
@@ -26,8 +26,8 @@ from ufl.algorithms.analysis import has_type
 from ufl.variable import Label
 
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.platform.compiler import RENEWED, Library, side_by_side
-from magshell_fenicsx.platform.processes import raised_by_all, world
+from magshell_fenicsx.platform.compiler import PROGRESS_SECONDS, Library, compile_libraries
+from magshell_fenicsx.platform.processes import raise_on_all_ranks, world
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the
 # run time. No -march: the cache may be shared by unlike machines, and it gains nothing here.
@@ -38,109 +38,131 @@ FORM_OPTIONS = (
     "-O1",
     "-g0",
     "-ffast-math",
-    f"-I{compat.form_include()}",
+    f"-I{compat.form_include_folder()}",
 )
-SILENT_SECONDS = 1.0  # of compilation that nobody need be told of
+SILENT_SECONDS = 1.0  # of compilation without a message
 REPEAT_SECONDS = 30.0  # between two lines on standard error
 
-Key = tuple[str, str, int]
+FormKey = tuple[str, str, int]
 
 
 @dataclass(frozen=True)
-class _Shared:
-    """A compiled form apart from its mesh: the places of its fields and numbers among those of what
-    it is made from.
-    """
-
-    kernels: compat.Kernels
-    fields: list[int]
-    numbers: list[int]
-    rank: int
-
-
-_compiled_forms: dict[Key, _Shared] = {}
-
-
-@dataclass(frozen=True)
-class Derived:
-    """A form that is made from another one.
+class _MeshlessForm:
+    """A compiled form apart from its mesh, for all forms with the same key.
 
     Attributes
     ----------
-    of
-        The other form.
-    how
-        What is made of it: with the signature of `of` and the place of `u` this determines the
-        form.
-    make
-        Makes it.
-    u
-        The field that it is derived by, whose space its arguments have; None for `of` itself.
-    factor
-        A number that `of` has not.
+    fields, constants
+        Positions of the kernels' fields and constants among those of the form's origin.
+    rank
+        Number of its arguments.
     """
 
-    of: ufl.Form
-    how: str
+    kernels: compat.FormKernels
+    fields: list[int]
+    constants: list[int]
+    rank: int
+
+
+_compiled_forms: dict[FormKey, _MeshlessForm] = {}
+
+
+@dataclass(frozen=True)
+class DerivedForm:
+    """A form that is derived from another one, its origin.
+
+    Attributes
+    ----------
+    origin
+        The other form.
+    derivation
+        Says how: with the signature of the origin and the position of `u` it determines the form.
+    make
+        Returns the form.
+    u
+        The field that it is differentiated by, whose space its arguments have; None for the origin
+        itself.
+    factor
+        A constant that the origin does not have.
+    """
+
+    origin: ufl.Form
+    derivation: str
     make: Callable[[], ufl.Form]
     u: fem.Function | None = None
     factor: tuple[fem.Constant, ...] = ()
 
     @property
-    def key(self) -> Key | None:
-        """None if it cannot be shared: it is empty, has several meshes, or does not depend on `u`."""
-        if not isinstance(self.of, ufl.Form) or self.of.empty() or len(self.of.ufl_domains()) != 1:
+    def key(self) -> FormKey | None:
+        """Key under which the compiled form is kept.
+
+        None if it cannot be: it is empty, has several meshes, or does not depend on `u`.
+        """
+        origin = self.origin
+        if not isinstance(origin, ufl.Form) or origin.empty() or len(origin.ufl_domains()) != 1:
             return None
         if self.u is None:
-            return self.of.signature(), self.how, -1
-        place = _place(self.u, self.of.coefficients())
-        return None if place is None else (self.of.signature(), self.how, place)
+            return origin.signature(), self.derivation, -1
+        position = _position(self.u, origin.coefficients())
+        return None if position is None else (origin.signature(), self.derivation, position)
 
     @property
-    def numbers(self) -> list[fem.Constant]:
-        return [*self.of.constants(), *self.factor]
+    def constants(self) -> list[fem.Constant]:
+        """Constants of the origin, and the factor."""
+        return [*self.origin.constants(), *self.factor]
 
-    def bound(self, shared: _Shared) -> fem.Form:
-        """The compiled form on the mesh, with the fields and numbers of this one."""
-        fields, numbers = self.of.coefficients(), self.numbers
-        spaces = [each.ufl_function_space() for each in self.of.arguments()]
-        if self.u is not None:
-            spaces = [self.u.function_space] * shared.rank
-        given = [fields[i] for i in shared.fields], [numbers[i] for i in shared.numbers]
-        return _bound(self.of, shared.kernels, spaces, *given)
+    def bind(self, meshless: _MeshlessForm) -> fem.Form:
+        """Return a compiled form on the mesh, with the fields and constants of this one."""
+        fields, constants = self.origin.coefficients(), self.constants
+        if self.u is None:
+            spaces = [argument.ufl_function_space() for argument in self.origin.arguments()]
+        else:
+            spaces = [self.u.function_space] * meshless.rank
+        return _bind(
+            self.origin,
+            meshless.kernels,
+            spaces,
+            [fields[i] for i in meshless.fields],
+            [constants[i] for i in meshless.constants],
+        )
 
-    def shared(self, made: ufl.Form, kernels: compat.Kernels) -> _Shared | None:
-        """What is kept of the compiled form; None if it has other fields or numbers, or labels,
-        which no other has.
+    def without_mesh(self, form: ufl.Form, kernels: compat.FormKernels) -> _MeshlessForm | None:
+        """Return the compiled form apart from its mesh.
+
+        None if it has fields or constants that its origin does not have, or labels, which no other
+        form has.
         """
-        if has_type(self.of, Label):
+        if has_type(self.origin, Label):
             return None
-        fields = [
-            _place(each, self.of.coefficients()) for each in kernels.in_order(made.coefficients())
-        ]
-        numbers = [_place(each, self.numbers) for each in made.constants()]
-        if None in fields or None in numbers:
+        origin_fields, origin_constants = self.origin.coefficients(), self.constants
+        ordered_fields = kernels.order_fields(form.coefficients())
+        fields = [_position(f, origin_fields) for f in ordered_fields]
+        constants = [_position(c, origin_constants) for c in form.constants()]
+        if None in fields or None in constants:
             return None
-        return _Shared(kernels, fields, numbers, len(made.arguments()))  # type: ignore[arg-type]
+        rank = len(form.arguments())
+        return _MeshlessForm(kernels, fields, constants, rank)  # type: ignore[arg-type]
 
 
-def _place(one: Any, among: Iterable[Any]) -> int | None:
-    return next((i for i, each in enumerate(among) if each is one), None)
+def _position(item: Any, items: Iterable[Any]) -> int | None:
+    """Return the position of an object among others; None if it is not there."""
+    return next((i for i, candidate in enumerate(items) if candidate is item), None)
 
 
-def _bound(
-    of: ufl.Form,
-    kernels: compat.Kernels,
+def _bind(
+    form: ufl.Form,
+    kernels: compat.FormKernels,
     spaces: Sequence[fem.FunctionSpace],
     fields: Sequence[fem.Function],
-    numbers: Sequence[fem.Constant],
+    constants: Sequence[fem.Constant],
 ) -> fem.Form:
-    """The kernels on the mesh of a form, and on the parts of it that this is over."""
-    domain = _domain_of(of)
-    of_mesh = of.subdomain_data()[domain]
-    assert all(tags is data[0] for data in of_mesh.values() for tags in data)  # as dolfinx asks
-    marks = {kind: data[0] for kind, data in of_mesh.items()}
-    return compat.bound(kernels, spaces, fields, numbers, marks, domain.ufl_cargo())
+    """Return the compiled form of kernels on the mesh and the subdomains of a form."""
+    domain = _domain_of(form)
+    subdomain_data = form.subdomain_data()[domain]
+    # dolfinx demands that integrals of a kind share their tags.
+    assert all(tags is data[0] for data in subdomain_data.values() for tags in data)
+    tags = {kind: data[0] for kind, data in subdomain_data.items()}
+    return compat.bind_form(kernels, spaces, fields, constants, tags, domain.ufl_cargo())
 
 
 def _domain_of(form: ufl.Form) -> ufl.Mesh:
@@ -149,18 +171,16 @@ def _domain_of(form: ufl.Form) -> ufl.Mesh:
     return domain
 
 
-def itself(form: ufl.Form) -> Derived:
-    """A form as it is."""
-    return Derived(form, "", lambda: form)
+def underived(form: ufl.Form) -> DerivedForm:
+    """Return a form as its own origin."""
+    return DerivedForm(form, "", lambda: form)
 
 
-def _entries(form: ufl.Form) -> int:
-    """The size of the element tensor of a form, for a rough order of the times that kernels take to
-    compile.
-    """
-    layouts = [each.ufl_function_space().dofmap for each in form.arguments()]
+def _tensor_size(form: ufl.Form) -> int:
+    """Return the size of the element tensor of a form, by which compilations are ordered."""
+    dofmaps = [argument.ufl_function_space().dofmap for argument in form.arguments()]
     sides = 1 + any(integral.integral_type() == "interior_facet" for integral in form.integrals())
-    return int(prod(sides * layout.bs * layout.dof_layout.num_dofs for layout in layouts))
+    return int(prod(sides * dofmap.bs * dofmap.dof_layout.num_dofs for dofmap in dofmaps))
 
 
 def _print_to_stderr() -> Callable[[str], None]:
@@ -180,48 +200,58 @@ def _print_to_stderr() -> Callable[[str], None]:
 
 @dataclass
 class Status:
-    """Progress of compilation: how many kernels of how many."""
+    """Progress of compilation.
+
+    Attributes
+    ----------
+    tell
+        Receives messages.
+    compiled, requested
+        Numbers of libraries.
+    """
 
     tell: Callable[[str], None] = field(default_factory=_print_to_stderr)
-    done: int = 0
-    known: int = 0
+    compiled: int = 0
+    requested: int = 0
 
     def compile(self, libraries: Sequence[Library]) -> None:
-        """Compile libraries side by side; see there."""
+        """Compile libraries in parallel, see `compile_libraries`, and tell how many are ready."""
         if not libraries:
             return
         begin = time.perf_counter()
-        last = 0, begin + SILENT_SECONDS - RENEWED
-        self.known += len(libraries)
+        last_count, last_time = 0, begin + SILENT_SECONDS - PROGRESS_SECONDS
+        self.requested += len(libraries)
 
-        def tell_progress(there: int) -> None:
-            nonlocal last
-            now, (before, then) = time.perf_counter(), last
-            if now - begin >= SILENT_SECONDS and (there != before or now - then >= RENEWED):
-                last = there, now
-                self.tell(f"compiling kernels (once) {self.done + there} of {self.known}")
+        def tell_progress(count: int) -> None:
+            nonlocal last_count, last_time
+            time_now = time.perf_counter()
+            if time_now - begin < SILENT_SECONDS:
+                return
+            if count != last_count or time_now - last_time >= PROGRESS_SECONDS:
+                last_count, last_time = count, time_now
+                self.tell(f"compiling kernels (once) {self.compiled + count} of {self.requested}")
 
-        side_by_side(libraries, tell_progress)
-        self.done += len(libraries)
+        compile_libraries(libraries, tell_progress)
+        self.compiled += len(libraries)
 
 
 _status = Status()
 
 
 @contextmanager
-def reported(tell: Callable[[str], None]) -> Iterator[None]:
+def reporting_progress_to(tell: Callable[[str], None]) -> Iterator[None]:
     """Tell a function how many kernels are compiled of how many, within `with`."""
     global _status
-    before, _status = _status, Status(tell)
+    previous, _status = _status, Status(tell)
     try:
         yield
     finally:
-        _status = before
+        _status = previous
 
 
 @dataclass(frozen=True)
 class _RequestedLibrary:
-    """A library that is asked for, and how many numbers its function gives."""
+    """A library that is requested, and how many numbers its function returns."""
 
     library: Library
     size: int
@@ -233,94 +263,95 @@ class KernelLog:
 
     names: list[str] = field(default_factory=list)
     seconds: float = 0.0
-    _begun: dict[str, _RequestedLibrary] = field(default_factory=dict)
+    _requested: dict[str, _RequestedLibrary] = field(default_factory=dict)
 
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
-        """A compiled form; collective."""
-        return self.derived(name, itself(expression))
+        """Return a compiled form; collective."""
+        return self.compile_derived(name, underived(expression))
 
-    def derived(self, name: str, form: Derived) -> fem.Form:
-        """A compiled form; collective."""
-        (compiled,) = self._compiled_together({name: form})
+    def compile_derived(self, name: str, form: DerivedForm) -> fem.Form:
+        """Return a compiled form that is derived from another one; collective."""
+        (compiled,) = self._compile_together({name: form})
         return compiled
 
-    def compile_all(self, named: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
-        """Compiled forms under their names; collective."""
-        forms = {name: form for each in named for name, form in each.items()}
-        compiled = self._compiled_together({name: itself(form) for name, form in forms.items()})
+    def compile_all(self, groups: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
+        """Return compiled forms under their names; collective."""
+        forms = {name: form for group in groups for name, form in group.items()}
+        compiled = self._compile_together({name: underived(form) for name, form in forms.items()})
         return dict(zip(forms, compiled, strict=True))
 
-    def _compiled_together(self, named: Mapping[str, Derived]) -> list[fem.Form]:
-        begun = [self.begin(name, form) for name, form in named.items()]
-        given = [
-            form.of
-            for form in named.values()
-            if isinstance(form.of, ufl.Form) and not form.of.empty()
-        ]
-        if given:
-            self.finish(_domain_of(given[0]).ufl_cargo().comm)
-        return [compiled() for compiled in begun]
+    def _compile_together(self, forms: Mapping[str, DerivedForm]) -> list[fem.Form]:
+        requests = [self.request_form(name, form) for name, form in forms.items()]
+        origins = [form.origin for form in forms.values()]
+        integrals = [form for form in origins if isinstance(form, ufl.Form) and not form.empty()]
+        if integrals:
+            self.compile_requested(_domain_of(integrals[0]).ufl_cargo().comm)
+        return [request() for request in requests]
 
-    def begin(self, name: str, form: Derived) -> Callable[[], fem.Form]:
-        """Return a function that gives the compiled form: from this process, from the cache or from
-        the compiler.
+    def request_form(self, name: str, form: DerivedForm) -> Callable[[], fem.Form]:
+        """Request a form; return a function that returns it compiled.
+
+        It comes from this process, from the cache or from the compiler.
         """
         start, key = time.perf_counter(), form.key
         try:
             if key in _compiled_forms:
-                known = form.bound(_compiled_forms[key])
-                return lambda: known
-            made = form.make()
-            if not isinstance(made, ufl.Form) or made.empty():
-                return lambda: None if isinstance(made, ufl.Form) else made
-            of_form = (
-                compat.form_signature(made),
-                partial(compat.form_code, made),
+                compiled = form.bind(_compiled_forms[key])
+                return lambda: compiled
+            ufl_form = form.make()
+            if not isinstance(ufl_form, ufl.Form):
+                return lambda: ufl_form
+            if ufl_form.empty():
+                return lambda: None
+            library = self._request_library(
+                compat.form_signature(ufl_form),
+                partial(compat.form_code, ufl_form),
                 FORM_OPTIONS,
-                _entries(made),
+                _tensor_size(ufl_form),
             )
-            library = self._library(*of_form)
-            return cache(lambda: self._form(form, made, library()))
+            return cache(lambda: self._load_form(form, ufl_form, library()))
         finally:
             self._note(name, start)
 
-    def _form(self, form: Derived, made: ufl.Form, library: ctypes.CDLL) -> fem.Form:
-        kernels, key = compat.Kernels.of(made, library), form.key
-        if key and (shared := form.shared(made, kernels)):
-            _compiled_forms[key] = shared
-        spaces = [each.ufl_function_space() for each in made.arguments()]
-        return _bound(
-            made, kernels, spaces, kernels.in_order(made.coefficients()), made.constants()
-        )
+    def _load_form(self, form: DerivedForm, ufl_form: ufl.Form, library: ctypes.CDLL) -> fem.Form:
+        kernels, key = compat.FormKernels.from_library(ufl_form, library), form.key
+        if key and (meshless := form.without_mesh(ufl_form, kernels)):
+            _compiled_forms[key] = meshless
+        spaces = [argument.ufl_function_space() for argument in ufl_form.arguments()]
+        fields = kernels.order_fields(ufl_form.coefficients())
+        return _bind(ufl_form, kernels, spaces, fields, ufl_form.constants())
 
-    def load(
+    def request_library(
         self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """Return a function that gives a library, whose function gives `size` numbers.
+        """Request a library, whose function returns `size` numbers; see `Library`.
 
-        See `Library`.
+        Returns
+        -------
+        Callable
+            Returns the library.
         """
         start = time.perf_counter()
-        library = self._library(key, source, options, size)
+        library = self._request_library(key, source, options, size)
         self._note(name, start)
         return library
 
-    def _library(
+    def _request_library(
         self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
         library = Library(key, source, options)
-        begun = self._begun.setdefault(library.file, _RequestedLibrary(library, size))
+        request = self._requested.setdefault(library.file, _RequestedLibrary(library, size))
 
         @cache
         def loaded() -> ctypes.CDLL:
-            if library.file in self._begun:
-                self._finish()
-            return ctypes.CDLL(str(begun.library.path()))
+            if library.file in self._requested:
+                self._compile_requested()
+            return ctypes.CDLL(str(request.library.path()))
 
         return loaded
 
-    def finish(self, comm: MPI.Comm) -> None:
-        """Compile what was begun; collective.
+    def compile_requested(self, comm: MPI.Comm) -> None:
+        """Compile all that was requested; collective.
 
         Raises
         ------
@@ -329,15 +360,14 @@ class KernelLog:
         CalledProcessError
             On all ranks, if a compiler fails.
         """
-        raised_by_all(comm, self._finish)
+        raise_on_all_ranks(comm, self._compile_requested)
 
-    def _finish(self) -> None:
-        start, begun = (
-            time.perf_counter(),
-            sorted(self._begun.values(), key=lambda each: -each.size),
-        )
-        self._begun.clear()
-        _status.compile([each.library for each in begun if not each.library.there])
+    def _compile_requested(self) -> None:
+        start = time.perf_counter()
+        largest_first = sorted(self._requested.values(), key=lambda request: -request.size)
+        libraries = [request.library for request in largest_first]
+        self._requested.clear()
+        _status.compile([library for library in libraries if not library.is_compiled])
         self.seconds += time.perf_counter() - start
 
     def _note(self, name: str, start: float) -> None:

@@ -1,6 +1,7 @@
-"""The matrix of a vector field, assembled from the matrices of cells and of interior edges.
+"""The sparse matrix of a vector field, assembled from element matrices.
 
-Its sparsity is that of (3, 3) blocks; every rank has the rows of its own nodes.
+They are those of cells and of interior edges. The sparsity pattern consists of (3, 3) blocks; every
+rank has the rows of its own nodes. Theory: docs/tangent.md.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,13 +16,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 Ints = NDArray[np.int32]
 Longs = NDArray[np.int64]
 
 
-class Pattern:
+class SparsityPattern:
     """The blocks of this rank, in an order that suits PETSc and communication.
 
     First come the blocks that couple this rank's n own nodes, row by row; then those that couple
@@ -44,9 +45,9 @@ class Pattern:
     starts
         (2 n + ghosts + 1,) number of the first block of every row, and of all blocks.
     columns
-        (blocks,) an own node, or n + the place of another in `others`.
+        (blocks,) an own node, or n + the position of another in `others`.
     others
-        Global numbers, ascending, of the others' nodes.
+        Global numbers, ascending, of nodes of other ranks.
     """
 
     def __init__(
@@ -54,81 +55,86 @@ class Pattern:
     ) -> None:
         n, ghosts, first = nodes.size_local, nodes.num_ghosts, nodes.local_range[0]
         self.owned, self._comm = n, comm
-        own = np.arange(n, dtype=np.int32)
+        own_nodes = np.arange(n, dtype=np.int32)
         numbers = nodes.local_to_global(np.arange(n + ghosts, dtype=np.int32))
-        i, j = (np.concatenate(part) for part in zip((own, own), *coupled, strict=True))
-        # the blocks that this rank has for others, by rank, and those that others have for it
-        theirs = _blocks(i[i >= n] - n, j[i >= n], (ghosts, n + ghosts)).tocoo()
-        ranks = nodes.owners[theirs.row] if ghosts else theirs.row
+        pairs = zip((own_nodes, own_nodes), *coupled, strict=True)
+        i, j = (np.concatenate(nodes_of_pairs) for nodes_of_pairs in pairs)
+        # Blocks in the rows of ghosts are sent to the ranks that own these, in the order of ranks.
+        in_ghost_rows = _unique_positions(i[i >= n] - n, j[i >= n], (ghosts, n + ghosts)).tocoo()
+        ranks = nodes.owners[in_ghost_rows.row] if ghosts else in_ghost_rows.row
         order = np.argsort(ranks, kind="stable")
-        leaving = theirs.row[order] + n, theirs.col[order]
-        self._sent = np.bincount(ranks, minlength=comm.size)
-        self._received = np.array(comm.alltoall(list(self._sent)))
-        arriving = tuple(self._exchange(numbers[x], 1) for x in leaving)
-        foreign = (arriving[1] < first) | (arriving[1] >= first + n)
-        self.others = np.unique(np.concatenate([numbers[n:], arriving[1][foreign]]))
-        places = np.where(
-            foreign, n + np.searchsorted(self.others, arriving[1]), arriving[1] - first
+        sent = in_ghost_rows.row[order] + n, in_ghost_rows.col[order]
+        self._sent_counts = np.bincount(ranks, minlength=comm.size)
+        self._received_counts = np.array(comm.alltoall(list(self._sent_counts)))
+        received = tuple(self._exchange(numbers[local], 1) for local in sent)
+        is_foreign = (received[1] < first) | (received[1] >= first + n)
+        self.others = np.unique(np.concatenate([numbers[n:], received[1][is_foreign]]))
+        received_columns = np.where(
+            is_foreign, n + np.searchsorted(self.others, received[1]), received[1] - first
         )
-        self._places = np.concatenate([own, n + np.searchsorted(self.others, numbers[n:])]).astype(
-            np.int32
-        )
+        ghost_columns = n + np.searchsorted(self.others, numbers[n:])
+        self._columns_of_nodes = np.concatenate([own_nodes, ghost_columns]).astype(np.int32)
         self._width = n + len(self.others)
-        came = self._row(arriving[0] - first, places), places
-        rows, columns = (
-            np.concatenate(part, dtype=np.int32) for part in zip(self._at(i, j), came, strict=True)
-        )
+        received_blocks = self._row(received[0] - first, received_columns), received_columns
+        both = zip(self._position(i, j), received_blocks, strict=True)
+        rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in both)
         del i, j
-        blocks = _blocks(rows, columns, (2 * n + ghosts, self._width))
+        blocks = _unique_positions(rows, columns, (2 * n + ghosts, self._width))
         self.starts, self.columns = blocks.indptr, blocks.indices
-        self._keys = (
-            np.repeat(np.arange(2 * n + ghosts) * self._width, np.diff(self.starts)) + self.columns
-        )
-        self._leave, self._arrive = (
-            self._entries(*at).ravel() for at in (self._at(*leaving), came)
-        )
+        block_rows = np.repeat(np.arange(2 * n + ghosts), np.diff(self.starts))
+        self._keys = block_rows * self._width + self.columns
+        self._sent_entries = self._entries(*self._position(*sent)).ravel()
+        self._received_entries = self._entries(*received_blocks).ravel()
 
     def blocks(self, i: Ints, j: Ints) -> Ints:
-        """Numbers of the blocks of pairs of local nodes; -1 for a missing block."""
-        return self._find(*self._at(i, j))
+        """Return the numbers of the blocks of pairs of local nodes; -1 for a missing block."""
+        return self._find(*self._position(i, j))
 
     def entries(self, i: Ints, j: Ints) -> Longs:
-        """Indices (pairs, 3, 3) of the entries of the blocks of pairs of local nodes in the array
-        of values.
+        """Return the indices in the array of values of the blocks of pairs of local nodes.
+
+        The shape is (pairs, 3, 3).
         """
-        return self._entries(*self._at(i, j))
+        return self._entries(*self._position(i, j))
 
     def add_ghosts(self, values: NDArray[np.float64]) -> None:
         """Add the rows of ghosts to the rows of their owners. Collective."""
-        np.add.at(values, self._arrive, self._exchange(values[self._leave], 9))
+        np.add.at(values, self._received_entries, self._exchange(values[self._sent_entries], 9))
 
     def csr(self, first: int, last: int) -> tuple[Ints, Ints]:
-        """Some rows of blocks in compressed sparse rows: the start of each row, and the columns."""
+        """Return rows of blocks, from `first` up to `last`, in compressed sparse rows.
+
+        Returns
+        -------
+        tuple
+            The start of each row, and the columns.
+        """
         starts = self.starts[first : last + 1]
         columns = self.columns[starts[0] : starts[-1]]
-        nothing = np.zeros((len(columns), 3, 3), dtype=np.int8)
+        values = np.zeros((len(columns), 3, 3), dtype=np.int8)
         shape = (3 * (last - first), 3 * self._width)
-        rows = scipy.sparse.bsr_array((nothing, columns, starts - starts[0]), shape=shape).tocsr()
+        rows = scipy.sparse.bsr_array((values, columns, starts - starts[0]), shape=shape).tocsr()
         return rows.indptr, rows.indices
 
-    def _at(self, i: Ints, j: Ints) -> tuple[Any, Any]:
-        """Row and column of the block of two local nodes."""
-        places = self._places[j]
-        return self._row(i, places), places
+    def _position(self, i: Ints, j: Ints) -> tuple[Any, Any]:
+        """Return row and column of the block of two local nodes."""
+        columns = self._columns_of_nodes[j]
+        return self._row(i, columns), columns
 
-    def _row(self, i: Any, places: Any) -> Any:
-        return i + self.owned * ((i >= self.owned) | (places >= self.owned))
+    def _row(self, i: Any, columns: Any) -> Any:
+        """Return the row of blocks: that of a node, n further down beside nodes of other ranks."""
+        return i + self.owned * ((i >= self.owned) | (columns >= self.owned))
 
     def _find(self, rows: Any, columns: Any) -> Ints:
+        """Return the numbers of blocks; -1 for a missing block."""
         keys = rows * np.int64(self._width) + columns
-        places = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        return np.where(self._keys[places] == keys, places, -1).astype(np.int32)
+        positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where(self._keys[positions] == keys, positions, -1).astype(np.int32)
 
     def _entries(self, rows: Any, columns: Any) -> Longs:
-        start, width = (
-            self.starts[rows].astype(np.int64),
-            3 * (self.starts[rows + 1] - self.starts[rows]),
-        )
+        """Return the indices (pairs, 3, 3) of blocks in the array of values."""
+        start = self.starts[rows].astype(np.int64)
+        width = 3 * (self.starts[rows + 1] - self.starts[rows])
         c = np.arange(3)
         first = 6 * start + 3 * self._find(rows, columns)
         return np.asarray(first[:, None, None] + c[:, None] * width[:, None, None] + c)
@@ -136,33 +142,37 @@ class Pattern:
     def _exchange(self, values: NDArray[Any], size: int) -> NDArray[Any]:
         """Send values, `size` for each block, to the owners of the rows. Collective."""
         values = np.ascontiguousarray(values)
-        came = np.empty(size * int(self._received.sum()), dtype=values.dtype)
-        self._comm.Alltoallv([values, size * self._sent], [came, size * self._received])
-        return came
+        received = np.empty(size * int(self._received_counts.sum()), dtype=values.dtype)
+        self._comm.Alltoallv(
+            [values, size * self._sent_counts], [received, size * self._received_counts]
+        )
+        return received
 
 
-def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> "scipy.sparse.csr_array":
-    """A matrix with each position once, sorted; its values have no meaning."""
-    positions = scipy.sparse.coo_array(
-        (np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape
-    ).tocsr()
+def _unique_positions(
+    rows: Ints, columns: Ints, shape: tuple[int, int]
+) -> "scipy.sparse.csr_array":
+    """Return a matrix with each position once, sorted; its values have no meaning."""
+    values = np.zeros(len(rows), dtype=np.int8)
+    positions = scipy.sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
     positions.sum_duplicates()
     return positions
 
 
 Array = NDArray[np.float64]
-FUNCTIONS = """
-    void scatter_same(double *, const int32_t *, int32_t, int64_t, int64_t, const int32_t *, const int32_t *,
-        const double *);
-    void scatter_cross(double *, const int32_t *, int32_t, int64_t, int64_t, const int32_t *, const int32_t *,
+C_DECLARATIONS = """
+    void scatter_same(double *, const int32_t *, int32_t, int64_t, int64_t, const int32_t *,
         const int32_t *, const double *);
+    void scatter_cross(double *, const int32_t *, int32_t, int64_t, int64_t, const int32_t *,
+        const int32_t *, const int32_t *, const double *);
 """
 
 
 class BlockMatrix:
-    """A symmetric matrix; clamped degrees of freedom have ones on the diagonal and zeros beside it.
+    """A symmetric matrix; the rows and columns of clamped unknowns are those of the identity.
 
-    PETSc shares the array of its values, so assembly copies and sorts nothing.
+    PETSc shares the array of its values, so assembly copies and sorts nothing. The constructor is
+    collective.
 
     Parameters
     ----------
@@ -180,14 +190,15 @@ class BlockMatrix:
         clamped: list[fem.DirichletBC],
     ) -> None:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
-        self._ffi, self._lib = native(Path(__file__).with_name("scatter.c"), FUNCTIONS, comm)
+        source = Path(__file__).with_name("scatter.c")
+        self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
         self._cells = np.ascontiguousarray(V.dofmap.list)
         self._coupled = [(self._cells[rows], self._cells[columns]) for rows, columns in coupled]
-        held = np.zeros((nodes.size_local + nodes.num_ghosts, 3), dtype=bool)
+        is_clamped = np.zeros((nodes.size_local + nodes.num_ghosts, 3), dtype=bool)
         for bc in clamped:
-            held.ravel()[bc.dof_indices()[0]] = True
-        self._wholly = np.array(held.all(axis=1))
-        self._pattern = pattern = Pattern(nodes, self._free_pairs(), comm)
+            is_clamped.ravel()[bc.dof_indices()[0]] = True
+        self._fully_clamped = np.array(is_clamped.all(axis=1))
+        self._pattern = pattern = SparsityPattern(nodes, self._free_pairs(), comm)
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
         self._coupling_blocks = [
             np.stack(
@@ -196,22 +207,29 @@ class BlockMatrix:
             )
             for rows, columns in self._coupled
         ]
-        self._zeros, self._ones = self._held_entries(held)
-        n = pattern.owned
+        self._zeros, self._ones = self._clamped_entries(is_clamped)
         self._values = np.zeros(9 * int(pattern.starts[-1]))
-        i, j = pattern.csr(0, n)
-        parts = [(i, j, self._values[: len(j)])]
+        self._K = self._create_matrix(comm)
+
+    def _create_matrix(self, comm: MPI.Comm) -> PETSc.Mat:
+        """Return the matrix that shares the array of values. Collective."""
+        n = self._pattern.owned
+        starts, columns = self._pattern.csr(0, n)
+        arrays = [(starts, columns, self._values[: len(columns)])]
         if comm.size > 1:
-            oi, oj = pattern.csr(n, 2 * n)
-            oj -= 3 * n
-            numbers = (3 * pattern.others[oj // 3] + oj % 3).astype(PETSc.IntType)
-            parts.append((oi, numbers, self._values[len(j) : len(j) + len(oj)]))
+            first = len(columns)
+            starts, columns = self._pattern.csr(n, 2 * n)
+            columns -= 3 * n
+            numbers = 3 * self._pattern.others[columns // 3] + columns % 3
+            values = self._values[first : first + len(columns)]
+            arrays.append((starts, numbers.astype(PETSc.IntType), values))
         size = ((3 * n, None), (3 * n, None))
-        self._K = PETSc.Mat().createAIJWithArrays(
-            size, parts[0] if comm.size == 1 else tuple(parts), comm=comm
+        K = PETSc.Mat().createAIJWithArrays(
+            size, arrays[0] if comm.size == 1 else tuple(arrays), comm=comm
         )
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
-            self._K.setOption(option, True)
+            K.setOption(option, True)
+        return K
 
     def clear(self) -> None:
         """Set all values to zero."""
@@ -240,7 +258,7 @@ class BlockMatrix:
         self._scatter("cross", *self._coupled[batch], self._coupling_blocks[batch], K)
 
     def assemble(self) -> PETSc.Mat:
-        """The matrix, summed over the ranks; always the same object. Collective."""
+        """Return the matrix, summed over the ranks; always the same object. Collective."""
         self._values[self._zeros] = 0
         self._pattern.add_ghosts(self._values)
         self._values[self._ones] = 1
@@ -258,41 +276,41 @@ class BlockMatrix:
         add(values, starts, self._pattern.owned, entities, functions, *map(pointer, arrays))
 
     def _free_pairs(self) -> Iterator[tuple[Ints, Ints]]:
-        """Pairs of nodes with a block; a clamped node has only its diagonal block."""
-        for rows, columns in self._together():
+        """Iterate over pairs of nodes with a block; a clamped node has only its diagonal block."""
+        for rows, columns in self._coupled_cells():
             i, j = _pairs(rows, columns)
-            free = ~(self._wholly[i] | self._wholly[j])
-            yield i[free], j[free]
+            has_block = ~(self._fully_clamped[i] | self._fully_clamped[j])
+            yield i[has_block], j[has_block]
 
-    def _together(self) -> Iterable[tuple[Ints, Ints]]:
+    def _coupled_cells(self) -> Iterable[tuple[Ints, Ints]]:
+        """Iterate over nodes (pairs, functions) of cells that are coupled, in both orders."""
         yield self._cells, self._cells
         for rows, columns in self._coupled:
             yield rows, columns
             yield columns, rows
 
-    def _held_entries(self, held: NDArray[np.bool_]) -> tuple[Longs, Longs]:
-        """This rank's entries in clamped rows and columns, and the diagonal ones among them."""
-        some, own = np.array(held.any(axis=1)), np.arange(self._pattern.owned, dtype=np.int32)
-        keys = [own[some[own]] * (len(held) + np.int64(1))]
+    def _clamped_entries(self, is_clamped: NDArray[np.bool_]) -> tuple[Longs, Longs]:
+        """Return this rank's entries in clamped rows and columns, and the diagonal ones of these.
+
+        Parameters
+        ----------
+        is_clamped
+            (local nodes, 3).
+        """
+        count, owned = len(is_clamped), self._pattern.owned
+        partly, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
+        keys = [own_nodes[partly[own_nodes]] * (count + np.int64(1))]
         for i, j in self._free_pairs():
-            touched = some[i] | some[j]
-            keys.append(np.unique(i[touched] * np.int64(len(held)) + j[touched]))
-        i, j = (x.astype(np.int32) for x in np.divmod(np.unique(np.concatenate(keys)), len(held)))
-        entries, rows, columns = (
-            self._pattern.entries(i, j),
-            held[i][:, :, None],
-            held[j][:, None, :],
-        )
-        diagonal = (
-            (i == j)[:, None, None]
-            & rows
-            & np.eye(3, dtype=bool)
-            & (i < self._pattern.owned)[:, None, None]
-        )
-        return entries[rows | columns], entries[diagonal]
+            has_clamped = partly[i] | partly[j]
+            keys.append(np.unique(i[has_clamped] * np.int64(count) + j[has_clamped]))
+        i, j = (x.astype(np.int32) for x in np.divmod(np.unique(np.concatenate(keys)), count))
+        entries = self._pattern.entries(i, j)
+        rows, columns = is_clamped[i][:, :, None], is_clamped[j][:, None, :]
+        is_own_diagonal = ((i == j) & (i < owned))[:, None, None] & np.eye(3, dtype=bool)
+        return entries[rows | columns], entries[rows & is_own_diagonal]
 
 
 def _pairs(rows: Ints, columns: Ints) -> tuple[Ints, Ints]:
-    """All pairs of an entity's nodes, (entities, functions, functions)."""
+    """Return all pairs of an entity's nodes, (entities, functions, functions)."""
     i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
     return i, j

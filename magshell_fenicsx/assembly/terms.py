@@ -1,4 +1,4 @@
-"""A potential Pi(u) with its amplitude: energy, residual and tangent."""
+"""Energy terms: a potential Pi(u) with its amplitude, its energy, residual and tangent."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -10,32 +10,33 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.following import PointField
-from magshell_fenicsx.assembly.kernels import Derived, KernelLog, itself
+from magshell_fenicsx.assembly.kernels import DerivedForm, KernelLog, underived
+from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.platform import compat
 
 Density = TypeVar("Density")  # the type of a form's density
 
 
 class Term(Protocol):
-    """A summand of a problem; `amplitude` is the name of mu in mu Pi(u), or None for mu = 1."""
+    """A summand mu Pi(u) of the potential; mu = 1 where `amplitude` is None."""
 
     @property
     def name(self) -> str: ...
 
     @property
-    def amplitude(self) -> str | None: ...
+    def amplitude(self) -> str | None:
+        """Name of mu."""
 
     @property
     def group(self) -> str:
-        """What its energy is reported with: that of all parts of one field."""
+        """Name under which its energy is reported, with that of all terms of one group."""
 
     @property
     def column(self) -> str:
-        """The column of a path with its energy: stretching, bending or magnetic; "" without one."""
+        """Column of a path with its energy: stretching, bending or magnetic; "" without one."""
 
     def energy(self) -> float:
-        """Pi(u) on this rank's part."""
+        """Return Pi(u), this rank's part."""
 
     def compile_residual(self) -> None:
         """Compile the forms of `energy` and `add_residual`."""
@@ -51,18 +52,24 @@ class Term(Protocol):
 
 
 def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
-    """What multiplies the energy of a term or slope with this amplitude."""
+    """Return the factor of the energy of a term or slope with this amplitude."""
     return 1.0 if amplitude is None else mu[amplitude]
 
 
 class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
-    `linear` says that the energy is linear in u, so that it has no tangent; `over` is an integral
-    that a linear one has been divided by.
+    A load may have no potential. Then its virtual work takes the place of the energy's gradient,
+    and the energy is only reported. The derivative of the work is no symmetric form.
 
-    A load may have no potential. Then `work`, its virtual work, takes the place of the energy's
-    gradient, and the energy is only reported. The derivative of the work is no symmetric form.
+    Parameters
+    ----------
+    linear
+        Whether the energy is linear in u, so that it has no tangent.
+    work
+        The virtual work of a load without potential.
+    over
+        An integral that a linear energy has been divided by.
 
     Attributes
     ----------
@@ -71,7 +78,7 @@ class FormTerm:
     energy_form, residual_form, tangent_form
         Compiled on first use, on all ranks; None for the tangent of a linear energy.
     skew_form
-        What the symmetric tangent lacks; None for a potential.
+        The skew part that the symmetric tangent lacks; None for a potential.
     """
 
     def __init__(
@@ -101,29 +108,29 @@ class FormTerm:
 
     @cached_property
     def energy_form(self) -> fem.Form:
-        return self._energy()
+        return self._requested_energy()
 
     @cached_property
     def residual_form(self) -> fem.Form:
-        return self._residual()
+        return self._requested_residual()
 
     @cached_property
     def tangent_form(self) -> fem.Form | None:
-        return self._tangent() if self._tangent else None
+        return self._requested_tangent() if self._requested_tangent else None
 
     @cached_property
-    def _energy(self) -> Callable[[], fem.Form]:
-        return self._log.begin(f"{self.name} energy", itself(self.form))
+    def _requested_energy(self) -> Callable[[], fem.Form]:
+        return self._log.request_form(f"{self.name} energy", underived(self.form))
 
     @cached_property
-    def _residual(self) -> Callable[[], fem.Form]:
-        return self._begin("residual", lambda: self._factor * self._gradient)
+    def _requested_residual(self) -> Callable[[], fem.Form]:
+        return self._request("residual", lambda: self._factor * self._gradient)
 
     @cached_property
-    def _tangent(self) -> Callable[[], fem.Form] | None:
-        return (
-            None if self.linear else self._begin("tangent", lambda: self._factor * self._symmetric)
-        )
+    def _requested_tangent(self) -> Callable[[], fem.Form] | None:
+        if self.linear:
+            return None
+        return self._request("tangent", lambda: self._factor * self._symmetric_hessian)
 
     @cached_property
     def skew_form(self) -> fem.Form | None:
@@ -134,17 +141,17 @@ class FormTerm:
             hessian = self._hessian
             return self._factor / 2 * (hessian - ufl.adjoint(hessian))
 
-        return self._begin("skew tangent", skew)()
+        return self._request("skew tangent", skew)()
 
-    def _begin(self, what: str, make: Callable[[], ufl.Form]) -> Callable[[], fem.Form]:
-        of = self.form if self._work is None else self._work
-        how = what if self._work is None else f"{what} of work"
-        return self._log.begin(
-            f"{self.name} {what}", Derived(of, how, make, self._u, (self._factor,))
-        )
+    def _request(self, kind: str, make: Callable[[], ufl.Form]) -> Callable[[], fem.Form]:
+        """Request a form that is made of the energy, or of the work of a load without potential."""
+        origin = self.form if self._work is None else self._work
+        description = kind if self._work is None else f"{kind} of work"
+        derived = DerivedForm(origin, description, make, self._u, (self._factor,))
+        return self._log.request_form(f"{self.name} {kind}", derived)
 
     @property
-    def _symmetric(self) -> ufl.Form:
+    def _symmetric_hessian(self) -> ufl.Form:
         hessian = self._hessian
         return hessian if self.has_potential else 0.5 * (hessian + ufl.adjoint(hessian))
 
@@ -153,64 +160,69 @@ class FormTerm:
         return ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
 
     @cached_property
-    def _fields(self) -> list[PointField]:
-        """Coefficients that follow the displacement."""
+    def _point_fields(self) -> list[PointField]:
+        """Coefficients that are functions of the displacement."""
         return [field for field in self.form.coefficients() if isinstance(field, PointField)]
 
     def renew(self) -> None:
         """Renew the coefficients of the forms, which assembly takes as they are."""
-        for field in self._fields:
+        for field in self._point_fields:
             field.renew()
 
     def energy(self) -> float:
+        """Return Pi(u), this rank's part."""
         self.renew()
         return float(fem.assemble_scalar(self.energy_form))
 
     def compile_residual(self) -> None:
-        _ = self._energy, self._residual
+        """Request the forms of energy and residual."""
+        _ = self._requested_energy, self._requested_residual
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add factor dPi/du to the local vector (ghosts included)."""
         self.renew()
         self._factor.value = factor
         fem.assemble_vector(b, self.residual_form)
 
     def compile_tangent(self) -> None:
-        _ = self._tangent
+        """Request the form of the tangent."""
+        _ = self._requested_tangent
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """Add factor d2Pi/du2, its symmetric part for a load without potential."""
         if self.tangent_form is not None:
             self.renew()
             self._factor.value = factor
             compat.add_matrix(K, self.tangent_form, clamped)
 
     def add_skew(self, N: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """Add factor times the skew part of the derivative of the work, of a load without
-        potential.
-        """
+        """Add factor times the skew part of the work's derivative, for a load without potential."""
         self.renew()
         self._factor.value = factor
         compat.add_matrix(N, self.skew_form, clamped)
 
 
-class Counted(FormTerm):
-    """-Pi = intensity times the angle of an edge, integrated; the angle goes on beyond half a turn.
+class AngleTerm(FormTerm):
+    """The potential of a moment at an edge: -Pi = intensity times its angle, integrated.
 
-    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that
-    stands in the state, so that it is a function of the state.
+    The angle goes on beyond half a turn, while forms know no turns. So the energy is that of the
+    angle nearest to `value`, a reference angle that stands in the state: it is a function of the
+    state.
     """
 
-    def count_from(self, past: fem.Constant, whole: float) -> None:
-        """Count the turns.
+    def set_reference_turn(self, cosine_and_sine: fem.Constant, moment: float) -> None:
+        """Set the reference angle to zero; to be called once.
 
         Parameters
         ----------
-        past
-            Cosine and sine of the turn that the angle is counted from; see `edges.turning`.
-        whole
+        cosine_and_sine
+            Of the reference angle, a constant in the form; see `edges.turning`.
+        moment
             Intensity times the edge's length: -Pi of one radian.
         """
-        self._past, self._whole, self._comm = past, whole, self._u.function_space.mesh.comm
-        self._turned = 0.0
+        self._cosine_and_sine, self._moment = cosine_and_sine, moment
+        self._comm = self._u.function_space.mesh.comm
+        self._reference_angle = 0.0
 
     @property
     def turn(self) -> str:
@@ -219,22 +231,23 @@ class Counted(FormTerm):
 
     @property
     def value(self) -> float:
-        """The angle (rad) that turns are counted from; the mean angle of the edge is within pi of
-        it.
-        """
-        return self._turned
+        """The reference angle (rad); the mean angle of the edge is within pi of it."""
+        return self._reference_angle
 
     @value.setter
-    def value(self, turned: float) -> None:
-        if turned != self._turned:
-            self._turned, self._past.value = turned, np.array([np.cos(turned), np.sin(turned)])
+    def value(self, angle: float) -> None:
+        if angle != self._reference_angle:
+            self._reference_angle = angle
+            self._cosine_and_sine.value = np.array([np.cos(angle), np.sin(angle)])
 
     def energy(self) -> float:
-        return super().energy() - (self._turned * self._whole if self._comm.rank == 0 else 0.0)
+        """Return Pi(u), this rank's part."""
+        reference = self._reference_angle * self._moment if self._comm.rank == 0 else 0.0
+        return super().energy() - reference
 
     def angle(self) -> float:
-        """The mean angle of the edge at the present u; collective."""
-        return -float(self._comm.allreduce(self.energy())) / self._whole
+        """Return the mean angle (rad) of the edge at the present u; collective."""
+        return -float(self._comm.allreduce(self.energy())) / self._moment
 
 
 class DensityTerm(FormTerm, Generic[Density]):
@@ -257,9 +270,16 @@ class DensityTerm(FormTerm, Generic[Density]):
 
 
 class LinearTerm:
-    """A dead load, Pi(u) = -l . u: `entries` of l at local, owned degrees of freedom.
+    """A dead load, Pi(u) = -l . u.
 
-    `forms` are those of its parts that depend on the placement.
+    Parameters
+    ----------
+    dofs
+        Local, owned degrees of freedom.
+    entries
+        The load vector l there.
+    forms
+        Those parts of the load that depend on the placement, as terms.
     """
 
     def __init__(
@@ -276,19 +296,21 @@ class LinearTerm:
         self._dofs, self._entries, self._u = dofs, entries, u
 
     def energy(self) -> float:
+        """Return Pi(u), this rank's part."""
         return -float(self._entries @ self._u.x.array[self._dofs])
 
     def compile_residual(self) -> None:
-        """A sum of entries."""
+        """Do nothing: the residual is a sum of entries."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add factor dPi/du to the local vector."""
         b[self._dofs] -= factor * self._entries
 
     def compile_tangent(self) -> None:
-        """A dead load has no tangent."""
+        """Do nothing: a dead load has no tangent."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """A dead load has no tangent."""
+        """Do nothing: a dead load has no tangent."""
 
 
 class TangentAssembler(Protocol):
@@ -297,14 +319,18 @@ class TangentAssembler(Protocol):
     def tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
     ) -> PETSc.Mat:
-        """The matrix of the terms with these factors, by name, at the present u.
+        """Return the tangent of the terms with these factors, by name, at the present u.
 
-        `stress` is that of `System.tangent`, of displacements with ghosts.
+        Parameters
+        ----------
+        stress
+            As in `System.tangent`, of displacements with ghosts.
         """
 
     def times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
-        """This rank's part of the matrix without supports times a vector with ghosts, exact where
-        nodes move.
+        """Return this rank's part of the tangent without supports times a vector with ghosts.
+
+        It is exact where nodes move.
         """
 
 

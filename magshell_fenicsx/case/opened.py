@@ -16,9 +16,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.shells import Part
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
-from magshell_fenicsx.platform.processes import from_first
-from magshell_fenicsx.problem.sizes import MeshSection
-from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.platform.processes import on_first_rank
+from magshell_fenicsx.problem.mesh_sizes import MeshSection
+from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -52,7 +52,7 @@ def opened(
 
 def read_together(file: str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Source:
     """The case file as rank 0 reads it; collective. See `read_source`."""
-    return from_first(comm, lambda: read_source(Path(file), settings))
+    return on_first_rank(comm, lambda: read_source(Path(file), settings))
 
 
 def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
@@ -67,7 +67,7 @@ def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
     if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
         return case
     own = case.model_dump_json()
-    first, contents = from_first(
+    first, contents = on_first_rank(
         comm, lambda: (own, {key: _content(reader) for key, reader in readers.items()})
     )
     if sum(comm.allgather(first != own)):

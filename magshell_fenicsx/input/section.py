@@ -33,7 +33,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.quantities.quantity import Given, Unit
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from magshell_fenicsx.platform.reading import Files, read_whole
+from magshell_fenicsx.platform.input_files import Files, read_bounded
 
 Location = tuple[str | int, ...]
 INSTEAD: dict[Location, str] = {
@@ -86,7 +86,7 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
         If the file cannot be read, is no YAML mapping, or has a key twice, or a setting is none.
     """
     try:
-        text = read_whole(file, LARGEST).decode("utf-8")
+        text = read_bounded(file, LARGEST).decode("utf-8")
     except OSError as e:
         large = e.errno == EFBIG
         raise CaseError(

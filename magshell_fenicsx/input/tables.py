@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.reading import Files, arrays, text_of
+from magshell_fenicsx.platform.input_files import Files, npz_arrays, table_text
 
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")  # x, x [mm] or x (mm)
@@ -97,7 +97,7 @@ def _cells(file: Path, files: Files) -> _Cells:
     if len(content) > LARGEST:
         raise TableError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
     try:
-        return _Cells(arrays(content)) if file.suffix == ".npz" else _csv_cells(text_of(content))
+        return _Cells(npz_arrays(content)) if file.suffix == ".npz" else _csv_cells(table_text(content))
     except TableError:
         raise
     except (ValueError, csv.Error) as e:
@@ -140,7 +140,7 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
         If it has other columns, no row, or what is no number; the message begins with the key.
     """
     try:
-        lines = text_of((files or Files()).content(file)).splitlines()
+        lines = table_text((files or Files()).content(file)).splitlines()
         header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if row]
     except (OSError, ValueError, csv.Error) as e:
         raise CaseError(

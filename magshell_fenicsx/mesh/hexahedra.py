@@ -1,8 +1,8 @@
-"""A body around a mid-surface: its triangles in quadrilaterals of degree 2, swept through the
-thickness.
+"""Hexahedra of a body around a mid-surface, swept through the thickness.
 
-Each triangle is split into three quadrilaterals, which meet at its centre: they are graded as the
-triangles are, and their edges follow the same circles.
+Each triangle of the mid-surface is divided into three quadrilaterals of degree 2, which meet at its
+centre: they are graded as the triangles are, and their edges follow the same circles. `sweep` makes
+the mesh of the body on all ranks. Lengths are over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.midsurface import create_mesh
+from magshell_fenicsx.mesh.midsurface import ORDERS, create_mesh
 from magshell_fenicsx.mesh.patch import (
-    Deviated,
+    DeviatedEmbedding,
     Embedding,
     MeshError,
     PatchMesh,
@@ -33,17 +33,22 @@ from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-STEP = 1e-5  # of the differences that give the normal: their error is 1e-10
-VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-SIDES = ((0, 1), (1, 2), (2, 0))  # of a triangle
-OUTER = ""  # face: a name that no edge has, while an annulus has an edge "outer"
-MIDDLE = 0.5  # of the thickness
-WHOLE = 5  # quadrature degree: three points in each direction
+DIFFERENCE_STEP = (
+    1e-5  # in the chart, of the differences that give the normal: their error is 1e-10
+)
+VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
+TRIANGLE_SIDES = ((0, 1), (1, 2), (2, 0))
+SIDE_NODES = np.array([0.25, 0.5, 0.75])  # on a side of a triangle, between its vertices
+OUTER_FACE = ""  # a name that no edge has, while an annulus has an edge "outer"
+MIDSURFACE_HEIGHT = 0.5  # of the thickness, from 0 inside to 1 outside
+QUADRATURE_DEGREE = 5  # three points in each direction
+CELLS_PER_CHECK = 2000  # whose volumes are computed at once
+TINY = 1e-300  # keeps divisions by a length defined
 
 
 @dataclass(frozen=True)
 class Quadrilaterals:
-    """Three above each triangle.
+    """The quadrilaterals of degree 2 of a mid-surface, three on each triangle.
 
     Attributes
     ----------
@@ -66,9 +71,12 @@ class Quadrilaterals:
 
 
 def split(patch: PatchMesh) -> Quadrilaterals:
-    """Vertex, middle of a side, centre and middle of the other side make a quadrilateral."""
-    reference, quads, on_sides = _reference_split()
-    order = {3: 1, 6: 2, 10: 3}[patch.cells.shape[1]]
+    """Divide each triangle into three quadrilaterals.
+
+    A vertex, the middle of a side, the centre and the middle of the other side make one.
+    """
+    reference, quads, nodes_on_sides = _reference_split()
+    order = ORDERS[patch.cells.shape[1]]
     geometry = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
     )
@@ -76,19 +84,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     values = geometry.tabulate(1, reference)[..., 0]
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3)
-    pairs = directed_sides(corners)
-    sides, side_of = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
-    side_of, backwards = side_of.reshape(3, -1), (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
-    numbers = np.empty((len(corners), len(reference)), dtype=np.int64)
-    numbers[:, :3] = corners
-    for side, places in enumerate(on_sides):  # three nodes on a side, counted from its lower vertex
-        along = np.where(backwards[side][:, None], [2, 1, 0], [0, 1, 2])
-        numbers[:, places] = len(vertices) + 3 * side_of[side][:, None] + along
-    inner = np.setdiff1d(np.arange(len(reference)), [0, 1, 2, *np.ravel(on_sides)])
-    below = len(vertices) + 3 * len(sides)
-    numbers[:, inner] = (
-        below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
-    )
+    sides, numbers = _node_numbers(corners, len(vertices), len(reference), nodes_on_sides)
     ordered = patch.cells[:, to_dolfinx]
     x = np.einsum("qk,ckx->cqx", values[0], patch.nodes[ordered])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
@@ -97,39 +93,79 @@ def split(patch: PatchMesh) -> Quadrilaterals:
         offsets = surface_normal(patch.embedding, nodes)
     else:
         a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[ordered])
-        offsets = _mitred(a1, a2, numbers, quads)
-    middle_of = {
-        (int(sides[n, 0]), int(sides[n, 1])): len(vertices) + 3 * n + 1 for n in range(len(sides))
+        offsets = _mitred_offsets(a1, a2, numbers, quads)
+    first_side_node = len(vertices)
+    middle_of_side = {
+        (int(sides[n, 0]), int(sides[n, 1])): first_side_node + 3 * n + 1 for n in range(len(sides))
     }
+    edges = dict[str, Numbers]()
+    for name, pairs in patch.edges.items():
+        halves = list[list[int]]()
+        for a, b in np.searchsorted(vertices, pairs):
+            middle = middle_of_side[int(min(a, b)), int(max(a, b))]
+            halves += [[int(a), middle], [middle, int(b)]]
+        edges[name] = np.array(halves, dtype=np.int64).reshape(-1, 2)
+    places = patch.embedding(nodes)
+    return Quadrilaterals(nodes, places, offsets, numbers[:, quads].reshape(-1, 9), edges)
 
-    def halves(a: int, b: int) -> list[list[int]]:
-        middle = middle_of[min(a, b), max(a, b)]
-        return [[a, middle], [middle, b]]
 
-    edges: dict[str, Numbers] = {
-        name: np.array(
-            [half for a, b in np.searchsorted(vertices, pairs) for half in halves(int(a), int(b))],
-            dtype=np.int64,
-        ).reshape(-1, 2)
-        for name, pairs in patch.edges.items()
-    }
-    return Quadrilaterals(
-        nodes, patch.embedding(nodes), offsets, numbers[:, quads].reshape(-1, 9), edges
-    )
+def _node_numbers(
+    corners: Numbers, vertex_count: int, nodes_per_triangle: int, nodes_on_sides: list[list[int]]
+) -> tuple[Numbers, Numbers]:
+    """Number the nodes of divided triangles: vertices, three nodes on each side, then inner ones.
+
+    Parameters
+    ----------
+    corners
+        (m, 3) vertices of the triangles.
+    nodes_on_sides
+        For each side of the reference triangle its nodes, in the direction of the side.
+
+    Returns
+    -------
+    sides
+        (s, 2) vertices of each side, the lower one first.
+    numbers
+        (m, nodes) of the nodes of each triangle.
+    """
+    pairs = directed_sides(corners)
+    sides, side_of_pair = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
+    side_numbers = side_of_pair.reshape(3, -1)
+    is_backwards = (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
+    numbers = np.empty((len(corners), nodes_per_triangle), dtype=np.int64)
+    numbers[:, :3] = corners
+    for side, nodes in enumerate(nodes_on_sides):  # counted from the lower vertex
+        position = np.where(is_backwards[side][:, None], [2, 1, 0], [0, 1, 2])
+        numbers[:, nodes] = vertex_count + 3 * side_numbers[side][:, None] + position
+    inner = np.setdiff1d(np.arange(nodes_per_triangle), [0, 1, 2, *np.ravel(nodes_on_sides)])
+    first_inner = vertex_count + 3 * len(sides)
+    first_of_triangle = first_inner + len(inner) * np.arange(len(corners))[:, None]
+    numbers[:, inner] = first_of_triangle + np.arange(len(inner))
+    return sides, numbers
 
 
 def surface_normal(embedding: Embedding, x: Array) -> Array:
-    """Unit normals (n, 3) at points (n, 2) of a chart, by central differences."""
-    a1, a2 = (embedding(x + STEP * e) - embedding(x - STEP * e) for e in np.eye(2))
+    """Return unit normals (n, 3) at points (n, 2) of a chart, by central differences."""
+    step = DIFFERENCE_STEP
+    a1, a2 = (embedding(x + step * e) - embedding(x - step * e) for e in np.eye(2))
     return _unit(np.cross(a1, a2))
 
 
-def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
-    """Offsets (nodes, 3) from the tangents (cells, places, 3) of a surface that may have kinks.
+def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
+    """Return offsets (nodes, 3) for a surface that may have kinks.
 
     At corners of quadrilaterals the mean normal, each cell's weighted by its angle there, over its
     mean cosine with the cells' normals: exact between two faces and between three that are normal
     to each other. What a cell's own normal lacks of it is interpolated to the nodes between.
+
+    Parameters
+    ----------
+    a1, a2
+        Tangents (cells, places, 3).
+    numbers
+        (cells, places) node of each place.
+    quads
+        (3, 9) places of the three quadrilaterals.
     """
     n = _unit(np.cross(a1, a2))
     weights = np.full(n.shape[:2], np.pi)
@@ -138,9 +174,9 @@ def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
         weights[:, corner] = np.arccos(np.clip(cosine, -1, 1))
     total = np.zeros((numbers.max() + 1, 3))
     np.add.at(total, numbers, weights[..., None] * n)
-    whole = np.bincount(numbers.ravel(), weights.ravel())[:, None]
-    mitre = total * whole / np.maximum(np.sum(total**2, axis=1, keepdims=True), 1e-300)
-    s, t = square().T
+    total_weight = np.bincount(numbers.ravel(), weights.ravel())[:, None]
+    mitre = total * total_weight / np.maximum(np.sum(total**2, axis=1, keepdims=True), TINY)
+    s, t = quadrilateral_nodes().T
     bilinear = np.column_stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t])
     lacking = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
     directions = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, lacking)
@@ -150,41 +186,52 @@ def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
 
 
 def _unit(v: NDArray[Any]) -> Array:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), TINY))
 
 
 def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
-    """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them;
-    those on each side.
+    """Divide the reference triangle into three quadrilaterals.
+
+    Returns
+    -------
+    places
+        (19, 2), vertices first.
+    quads
+        (3, 9) numbers of the places of each quadrilateral.
+    nodes_on_sides
+        For each side the numbers of the three places between its vertices.
     """
-    s, t = square().T[:, :, None]
+    s, t = quadrilateral_nodes().T[:, :, None]
     centre = VERTICES.mean(axis=0)
-    corners = [*VERTICES]
+    places = [*VERTICES]
     quads = []
     for i in range(3):
-        corner, following, before = (VERTICES[(i + k) % 3] for k in range(3))
-        side, other = (corner + following) / 2, (corner + before) / 2
+        vertex, following, previous = (VERTICES[(i + k) % 3] for k in range(3))
+        middle, other_middle = (vertex + following) / 2, (vertex + previous) / 2
         quad = (
-            (1 - s) * (1 - t) * corner + s * (1 - t) * side + s * t * centre + (1 - s) * t * other
+            (1 - s) * (1 - t) * vertex
+            + s * (1 - t) * middle
+            + s * t * centre
+            + (1 - s) * t * other_middle
         )
         numbers = []
         for x in quad:
-            same = [n for n, y in enumerate(corners) if np.allclose(x, y)]
-            if not same:
-                corners.append(x)
-            numbers.append(same[0] if same else len(corners) - 1)
+            known_numbers = [n for n, y in enumerate(places) if np.allclose(x, y)]
+            if not known_numbers:
+                places.append(x)
+            numbers.append(known_numbers[0] if known_numbers else len(places) - 1)
         quads.append(numbers)
-    places = np.array(corners)
+    reference = np.array(places)
 
-    def along(a: int, b: int) -> list[int]:
-        wanted = VERTICES[a] + np.array([0.25, 0.5, 0.75])[:, None] * (VERTICES[b] - VERTICES[a])
-        return [int(np.argmin(np.linalg.norm(places - x, axis=1))) for x in wanted]
+    def nodes_on_side(a: int, b: int) -> list[int]:
+        points = VERTICES[a] + SIDE_NODES[:, None] * (VERTICES[b] - VERTICES[a])
+        return [int(np.argmin(np.linalg.norm(reference - x, axis=1))) for x in points]
 
-    return places, np.array(quads), [along(*side) for side in SIDES]
+    return reference, np.array(quads), [nodes_on_side(*side) for side in TRIANGLE_SIDES]
 
 
-def square() -> Array:
-    """Nodes (9, 2) of the reference quadrilateral, corners first."""
+def quadrilateral_nodes() -> Array:
+    """Return the nodes (9, 2) of the reference quadrilateral of degree 2, corners first."""
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
     )
@@ -192,8 +239,8 @@ def square() -> Array:
 
 
 @dataclass(frozen=True)
-class Body:
-    """A body on all ranks.
+class BodyMesh:
+    """The mesh of a body on all ranks.
 
     Attributes
     ----------
@@ -201,14 +248,14 @@ class Body:
         Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs
         outwards.
     faces
-        Name -> facets (local numbers): those of `OUTER`, and those above each named edge of the
-        mid-surface.
+        Name -> facets (local numbers): those of `OUTER_FACE`, and those above each named edge of
+        the mid-surface.
     points, normals
         Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal
         there.
     patches
         Name -> whether each local cell is above that part of the mid-surface.
-    between
+    layer_bounds
         (cells, 2) where each local cell begins and ends in the thickness: from 0 inside to 1
         outside.
     chart, heights, thickness
@@ -224,17 +271,17 @@ class Body:
     points: dict[str, Array]
     normals: dict[str, Array]
     patches: dict[str, NDArray[np.bool_]]
-    between: Array
+    layer_bounds: Array
     chart: Array
     heights: Array
     thickness: Array
     w0: Array | None = None
 
     def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
-        """What is known at the nodes of the geometry, at those of a quadratic space."""
+        """Return values (n, ...) at the nodes of the geometry at those of a quadratic space."""
         nodes = V.dofmap.index_map
         nodal = np.empty((nodes.size_local + nodes.num_ghosts, *values.shape[1:]))
-        nodal[V.dofmap.list] = values[compat.corner_numbers(self.mesh)]
+        nodal[V.dofmap.list] = values[compat.geometry_dofs(self.mesh)]
         return nodal
 
 
@@ -244,11 +291,13 @@ def sweep(
     layers: int | Sequence[float],
     comm: MPI.Comm,
     factor: Callable[[Array], Array] | None = None,
-) -> Body:
-    """Make the body of all ranks from the triangulation, which each of them has: it is small.
+) -> BodyMesh:
+    """Make the mesh of a body on all ranks; collective.
 
     Parameters
     ----------
+    patch
+        Triangulation of the mid-surface, which every rank has: it is small.
     h
         The thickness over R.
     layers
@@ -262,99 +311,125 @@ def sweep(
         On every rank, if the body overlaps itself.
     """
     quads = split(patch)
-    ends = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
-    heights = np.concatenate([ends[:1], *([(a + b) / 2, b] for a, b in pairwise(ends))])
-    thick = h * (np.ones(len(quads.places)) if factor is None else factor(quads.places))
-    z = (heights - MIDDLE) * thick[:, None]
+    bounds = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
+    middles_and_ends = [((a + b) / 2, b) for a, b in pairwise(bounds)]
+    heights = np.concatenate([bounds[:1], *middles_and_ends])
+    factors = np.ones(len(quads.places)) if factor is None else factor(quads.places)
+    thickness = h * factors
+    z = (heights - MIDSURFACE_HEIGHT) * thickness[:, None]
     X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)
-    cells = _swept(quads.cells, len(ends) - 1)
+    layer_count = len(bounds) - 1
+    cells = _swept_cells(quads.cells, layer_count)
     _refuse_overlap(X, cells)
     domain = create_mesh(comm, basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)), cells, X)
     original = domain.topology.original_cell_index
-    triangle, layer = original // (3 * (len(ends) - 1)), original % (len(ends) - 1)
-    places = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
-    nearest = {
-        name: np.argmin(np.linalg.norm(quads.places - x, axis=1)) for name, x in places.items()
-    }
+    triangle, layer = original // (3 * layer_count), original % layer_count
+    points = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
+    normals = dict[str, Array]()
+    for name, x in points.items():
+        offset = quads.offsets[np.argmin(np.linalg.norm(quads.places - x, axis=1))]
+        normals[name] = offset / np.linalg.norm(offset)
     node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
-    return Body(
+    w0 = None
+    if isinstance(patch.embedding, DeviatedEmbedding):
+        w0 = patch.embedding.w0(quads.nodes)[node]
+    return BodyMesh(
         domain,
         _named_faces(domain, quads, len(heights)),
-        places,
-        {name: quads.offsets[n] / np.linalg.norm(quads.offsets[n]) for name, n in nearest.items()},
-        {name: inside[triangle] for name, inside in patch.patches.items()},
-        np.column_stack([ends[layer], ends[layer + 1]]),
+        points,
+        normals,
+        {name: mask[triangle] for name, mask in patch.patches.items()},
+        np.column_stack([bounds[layer], bounds[layer + 1]]),
         quads.nodes[node],
         heights[level],
-        thick[node],
-        patch.embedding.w0(quads.nodes)[node] if isinstance(patch.embedding, Deviated) else None,
+        thickness[node],
+        w0,
     )
 
 
 def _refuse_overlap(X: Array, cells: Numbers) -> None:
-    """Look at the volume of all cells at their nodes."""
+    """Refuse cells with a volume that is not positive at one of their nodes.
+
+    Parameters
+    ----------
+    X
+        (n, 3) nodes.
+    cells
+        (m, 27) node numbers.
+    """
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     )
     tables = element.tabulate(1, element.points)[1:, :, :, 0]
-    for part in np.array_split(cells, len(cells) // 2000 + 1):
-        volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[part]))
+    for some_cells in np.array_split(cells, len(cells) // CELLS_PER_CHECK + 1):
+        volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[some_cells]))
         if (volumes <= 0).any():
-            place = X[part[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
+            place = X[some_cells[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
             raise MeshError(
-                f"model: solid: the body overlaps itself around {place_text(place)}/R: half its thickness is "
-                "more than the radius of curvature, or than a fold leaves beside it"
+                f"model: solid: the body overlaps itself around {place_text(place)}/R: "
+                "half its thickness is more than the radius of curvature, or than a fold leaves "
+                "beside it"
             )
 
 
-def _swept(quads: Numbers, layers: int) -> Numbers:
-    """Hexahedra (quads * layers, 27) in the order of basix; node q at level k has the number q
-    levels + k.
+def _swept_cells(quads: Numbers, layers: int) -> Numbers:
+    """Return hexahedra (quads * layers, 27) in the order of basix.
+
+    Node q at level k has the number q levels + k.
     """
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     ).points
-    below = np.argmin(np.linalg.norm(points[:, None, :2] - square()[None], axis=2), axis=1)
+    distances = np.linalg.norm(points[:, None, :2] - quadrilateral_nodes()[None], axis=2)
+    node_of_quad = np.argmin(distances, axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
     levels = 2 * layers + 1
-    cells = [quads[:, below] * levels + level + 2 * layer for layer in range(layers)]
+    cells = [quads[:, node_of_quad] * levels + level + 2 * layer for layer in range(layers)]
     return np.stack(cells, axis=1).reshape(-1, 27)
 
 
 def _named_faces(
     domain: mesh.Mesh, quads: Quadrilaterals, levels: int
 ) -> dict[str, NDArray[np.int32]]:
-    """Outer and side faces, found by the numbers of their nodes."""
+    """Find the facets of the outer face and above the edges by the numbers of their nodes."""
     for pair in ((2, 3), (2, 0), (0, 3), (3, 2)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
     vertices = domain.topology.index_map(0)
-    # of a vertex its number in the chart and its level
-    ends = mesh.entities_to_geometry(
-        domain, 0, np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32)
-    )
-    numbers = domain.geometry.input_global_indices[ends[:, 0]]
+    vertex_numbers = np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32)
+    # for each vertex its number in the chart and its level
+    nodes = mesh.entities_to_geometry(domain, 0, vertex_numbers)
+    numbers = domain.geometry.input_global_indices[nodes[:, 0]]
     corners = domain.topology.connectivity(2, 0).array.reshape(-1, 4)[facets]
-    chart, level = np.divmod(numbers[corners], levels)
-    named = {OUTER: facets[(level == levels - 1).all(axis=1)]}
+    chart_nodes, level = np.divmod(numbers[corners], levels)
+    faces = {OUTER_FACE: facets[(level == levels - 1).all(axis=1)]}
     for name, pairs in quads.edges.items():
-        wanted = as_set(pairs)
-        above = [len(set(c)) == 2 and (min(c), max(c)) in wanted for c in chart]
-        named[name] = facets[np.array(above, dtype=bool)]
-    return named
+        pairs_of_edge = as_set(pairs)
+        is_above = [len(set(c)) == 2 and (min(c), max(c)) in pairs_of_edge for c in chart_nodes]
+        faces[name] = facets[np.array(is_above, dtype=bool)]
+    return faces
 
 
-def quadratic(domain: mesh.Mesh) -> fem.FunctionSpace:
-    """Displacements of the mesh's own degree: rigid motions are exact."""
+def quadratic_space(domain: mesh.Mesh) -> fem.FunctionSpace:
+    """Return the space of displacements of the mesh's own degree: rigid motions are exact."""
     return fem.functionspace(domain, ("Lagrange", 2, (3,)))
 
 
 def face_measure(domain: mesh.Mesh, parts: Sequence[NDArray[np.int32]]) -> ufl.Measure:
-    """Undeformed area of some facets, those of each part under its number from 1."""
+    """Return the measure of undeformed area of some facets.
+
+    Parameters
+    ----------
+    parts
+        Local numbers of facets; those of each part have its number, from 1.
+    """
     facets = np.concatenate(parts)
     tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
     order = np.argsort(facets)
     tagged = mesh.meshtags(domain, 2, facets[order], tags[order])
     return ufl.Measure(
-        "ds", domain=domain, subdomain_data=tagged, metadata={"quadrature_degree": WHOLE}
+        "ds",
+        domain=domain,
+        subdomain_data=tagged,
+        metadata={"quadrature_degree": QUADRATURE_DEGREE},
     )

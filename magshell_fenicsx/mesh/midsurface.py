@@ -1,8 +1,10 @@
-"""The mid-surface: an affine dolfinx mesh and, separate from it, the placement r0.
+"""The mid-surface: an affine dolfinx mesh and, separate from it, the reference placement r0.
 
 The kernels use the affine mesh alone. So their Jacobian is constant, and one compiled kernel serves
 every shape. The shape itself is the vector field r0. It is interpolated at the nodes of the
 displacement's own element, so that rigid motions are exact.
+
+`distribute` makes a `Midsurface` of a triangulation that every rank has. Lengths are over R.
 """
 
 from collections.abc import Sequence
@@ -19,11 +21,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import (
-    Deviated,
+    DeviatedEmbedding,
     Deviation,
     Embedding,
-    GivenField,
     PatchMesh,
+    UserField,
     as_set,
     check_orientation,
 )
@@ -34,8 +36,10 @@ ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 
 
 def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
-    """Unit normals (n, 3): means over the triangles (m, 3 | 6 | 10) around each node, with their
-    angles as weights.
+    """Return unit normals (n, 3) at the nodes of a triangulation in space.
+
+    A normal is the mean over the triangles (m, 3 | 6 | 10) around the node, with their angles as
+    weights.
     """
     count = cells.shape[1]
     element = basix.create_element(
@@ -49,11 +53,10 @@ def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
         "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[ordered]
     )
     angles = np.full(ordered.shape, np.pi)
-    for corner, (e, f) in enumerate(
-        ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))
-    ):  # vertices come first
-        cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
-        angles[:, corner] = np.arccos(np.clip(cosine, -1, 1))
+    sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))  # vertices are the first nodes
+    for vertex, (e, f) in enumerate(sides_at_vertices):
+        cosine = np.sum(_unit(e[:, vertex]) * _unit(f[:, vertex]), axis=1)
+        angles[:, vertex] = np.arccos(np.clip(cosine, -1, 1))
     total = np.zeros_like(nodes)
     np.add.at(total, ordered, angles[..., None] * _unit(np.cross(a1, a2)))
     return _unit(total)
@@ -66,6 +69,8 @@ def _unit(v: Array) -> Array:
 @dataclass(frozen=True)
 class Midsurface:
     """A mid-surface on all ranks.
+
+    Arrays over cells have this rank's cells, ghosts included.
 
     Attributes
     ----------
@@ -82,155 +87,160 @@ class Midsurface:
     points: dict[str, NDArray[np.float64]]
     _patch: PatchMesh
 
-    def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its
-        own chart.
+    def chart_coordinates(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
+        """Return the coordinates (cells, nodes, 2 | 3) of the nodes of each cell in its own chart.
 
         Of several shells, and of a mesh file, they are places in space.
         """
-        return self._charted(compat.interpolation_points(V))[..., :3]
+        return self._node_coordinates(compat.interpolation_points(V))[..., :3]
 
-    def charted_by_shell(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """The same, of several shells that have charts in that of each cell's shell, where others
-        may be too.
+    def chart_coordinates_by_shell(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
+        """Return the coordinates of the nodes of each cell in the chart of its shell.
+
+        Charts of several shells may overlap. Without charts the same as `chart_coordinates`.
         """
-        if not getattr(self._patch.embedding, "charts", False):
-            return self.charted(V)
-        return self._charted(compat.interpolation_points(V))[..., 3:5]
+        if not getattr(self._patch.embedding, "has_charts", False):
+            return self.chart_coordinates(V)
+        return self._node_coordinates(compat.interpolation_points(V))[..., 3:5]
 
-    def _charted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same at reference points (q, 2), with the normals of a mesh file that has
-        imperfections.
+    def _node_coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what `PatchMesh.nodes` has at reference points (q, 2) of each cell, (cells, q, d).
+
+        Of a mesh file with imperfections these are places and normals.
         """
         return at_reference_points(
             self._patch.nodes, self._patch.cells[self._original_cells], points
         )
 
     def deviation(
-        self, points: NDArray[np.float64], besides: Sequence[Deviation] = ()
+        self, points: NDArray[np.float64], further: Sequence[Deviation] = ()
     ) -> NDArray[np.float64] | None:
-        """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no
-        imperfections.
+        """Return w0 over R at reference points (q, 2) of each cell, (cells, q).
+
+        None without imperfections. `further` deviations are added.
         """
         embedding = self._patch.embedding
-        if not isinstance(embedding, Deviated):
+        if not isinstance(embedding, DeviatedEmbedding):
             return None
-        return self.at(points, replace(embedding, deviations=(*embedding.deviations, *besides)).w0)
+        deviations = (*embedding.deviations, *further)
+        return self.evaluate(points, replace(embedding, deviations=deviations).w0)
 
-    def at(self, points: NDArray[np.float64], of: Embedding) -> NDArray[np.float64]:
-        """A function of nodes of the triangulation at reference points (q, 2) of each cell, (cells,
-        q, ...).
+    def evaluate(self, points: NDArray[np.float64], function: Embedding) -> NDArray[np.float64]:
+        """Return a function of nodes of the triangulation at points of each cell, (cells, q, ...).
+
+        Parameters
+        ----------
+        points
+            (q, 2) in the reference triangle.
+        function
+            Rows of `PatchMesh.nodes` (n, d) -> values (n, ...).
         """
-        chart = self._charted(points)
-        values = of(chart.reshape(-1, chart.shape[-1]))
-        return np.asarray(values.reshape(*chart.shape[:2], *values.shape[1:]))
+        coordinates = self._node_coordinates(points)
+        values = function(coordinates.reshape(-1, coordinates.shape[-1]))
+        return np.asarray(values.reshape(*coordinates.shape[:2], *values.shape[1:]))
 
-    def reshaped(self, embedding: Embedding) -> PatchMesh:
-        """The triangulation with another map to space."""
+    def with_embedding(self, embedding: Embedding) -> PatchMesh:
+        """Return the triangulation with another map to space."""
         return replace(self._patch, embedding=embedding)
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
-        """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
-        return self._field(V, "r0", self._patch.embedding)
+        """Return the reference placement r0 in the Lagrange space `V` (vector valued)."""
+        return self._vector_field(V, "r0", self._patch.embedding)
 
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
-        """What further deviations add to the placement in the same space."""
-        drawn = self._patch.embedding
-        assert isinstance(drawn, Deviated)
-        return self._field(V, "growth", lambda chart: drawn.along_normal(chart, deviations))
+        """Return what further deviations add to the placement, in the same space."""
+        embedding = self._patch.embedding
+        assert isinstance(embedding, DeviatedEmbedding)
+        return self._vector_field(
+            V, "growth", lambda chart: embedding.along_normal(chart, deviations)
+        )
 
-    def _field(self, V: fem.FunctionSpace, name: str, of: Embedding) -> fem.Function:
+    def _vector_field(self, V: fem.FunctionSpace, name: str, values: Embedding) -> fem.Function:
         function = fem.Function(V, name=name)
-        function.x.array.reshape(-1, 3)[V.dofmap.list] = self.at(compat.interpolation_points(V), of)
+        nodal = self.evaluate(compat.interpolation_points(V), values)
+        function.x.array.reshape(-1, 3)[V.dofmap.list] = nodal
         function.x.scatter_forward()
         return function
 
     @property
     def patch(self) -> PatchMesh:
-        """The triangulation, whole on every rank."""
+        """The triangulation, complete on every rank."""
         return self._patch
 
     @property
-    def read(self) -> bool:
-        """Whether it comes from a mesh file, and so may have facets or folds."""
+    def from_mesh_file(self) -> bool:
+        """Whether the nodes are places in space: of a mesh file or of several shells.
+
+        Such a surface may have facets or creases.
+        """
         return self._patch.nodes.shape[1] != 2
 
     @property
     def kinked(self) -> bool:
-        """Whether cells may meet at angles: in a mesh file, also that of one of several shells, and
-        at joints.
-        """
-        charts = getattr(self._patch.embedding, "charts", not self.read)
-        return any(self._patch.joints) or not charts
+        """Whether cells may meet at angles: at joints, and in the mesh file of any shell."""
+        has_charts = getattr(self._patch.embedding, "has_charts", not self.from_mesh_file)
+        return any(self._patch.joints) or not has_charts
 
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:
-        """Name -> whether each cell of this rank, ghosts included, belongs to that part of the
-        surface.
-        """
-        return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
+        """Name -> (cells,) whether each cell belongs to that part of the surface."""
+        return {name: mask[self._original_cells] for name, mask in self._patch.patches.items()}
 
     @property
     def shells(self) -> tuple[str, ...]:
-        """Their names, where there are several."""
+        """Names of the shells, where there are several."""
         return self._patch.shells
 
-    def beside(self, point: str) -> NDArray[np.bool_] | None:
-        """Whether each cell of this rank, ghosts too, is of the shell of a named point; None if
-        there is one shell.
+    def cells_of_point(self, point: str) -> NDArray[np.bool_] | None:
+        """Return whether each cell (cells,) is on the shell of a named point; None for one shell.
 
-        Another shell may have a vertex at the same place, or a sheet that stands on this one at a
+        Another shell may have a vertex at the same place, or a sheet that ends on this one at a
         T-junction.
         """
-        if self._patch.feet:
-            standing = np.unique(
-                np.concatenate([self._patch.edges[name].ravel() for name in self._patch.feet])
-            )
-            stands = np.asarray(np.isin(self._patch.corners, standing).any(axis=1))
-            return np.asarray(~stands[self._original_cells])
-        if not hasattr(self._patch.embedding, "charts"):
+        if self._patch.t_junctions:
+            edges = [self._patch.edges[name].ravel() for name in self._patch.t_junctions]
+            vertices = np.unique(np.concatenate(edges))
+            ends_on_sheet = np.asarray(np.isin(self._patch.corners, vertices).any(axis=1))
+            return np.asarray(~ends_on_sheet[self._original_cells])
+        if not hasattr(self._patch.embedding, "has_charts"):
             return None
-        shells = np.rint(
-            self._patch.nodes[self._patch.cells[:, 0], -1]
-        )  # the last number of a node is its shell's
-        return np.asarray((shells == np.rint(self._patch.points[point][-1]))[self._original_cells])
+        # the last number of a node is that of its shell
+        shell_of_cell = np.rint(self._patch.nodes[self._patch.cells[:, 0], -1])
+        shell_of_point = np.rint(self._patch.points[point][-1])
+        return np.asarray((shell_of_cell == shell_of_point)[self._original_cells])
 
     @cached_property
     def joints(self) -> list[NDArray[np.float64] | None]:
-        """For each joint a number of each cell of this rank, ghosts too: 1 on its one edge, -1 on
-        the other, else 0.
+        """Sides of each joint (cells,): 1 in cells on its first edge, -1 on its second one, else 0.
 
-        A T-junction has None.
+        None for a T-junction.
         """
         return [
-            both and (1.0 * both[0] - 1.0 * both[1])[self._original_cells]
-            for both in self._patch.joints
+            masks and (1.0 * masks[0] - 1.0 * masks[1])[self._original_cells]
+            for masks in self._patch.joints
         ]
 
     @cached_property
-    def feet(self) -> dict[str, NDArray[np.bool_]]:
-        """Name of an edge at a T-junction of a mesh file -> whether it stands on each cell of this
-        rank.
-        """
-        return {name: on[self._original_cells] for name, on in self._patch.feet.items()}
+    def t_junctions(self) -> dict[str, NDArray[np.bool_]]:
+        """Name of an edge at a T-junction of a mesh file -> whether it ends on each cell."""
+        return {name: mask[self._original_cells] for name, mask in self._patch.t_junctions.items()}
 
     @cached_property
-    def given(self) -> NDArray[np.int64]:
-        """This rank's cells among the triangles that were given, see `PatchMesh.given`."""
-        assert self._patch.given is not None
-        return self._patch.given[self._original_cells]
+    def source_triangles(self) -> NDArray[np.int64]:
+        """This rank's cells among those of a program, see `PatchMesh.source_triangles`."""
+        assert self._patch.source_triangles is not None
+        return self._patch.source_triangles[self._original_cells]
 
-    def in_cells(self, field: GivenField) -> Array:
-        """The values (cells, nodes, size) in this rank's cells, ghosts included."""
-        return field.in_cells(self.given)
+    def in_cells(self, field: UserField) -> Array:
+        """Return the values (cells, nodes, size) of a user's field."""
+        return field.in_cells(self.source_triangles)
 
-    def function(self, field: GivenField) -> fem.Function:
-        """The same as a function on this mesh, of the shape (size,)."""
-        f = fem.Function(
-            fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name
-        )
-        f.x.array.reshape(-1, field.size)[f.function_space.dofmap.list] = self.in_cells(field)
-        return f
+    def function(self, field: UserField) -> fem.Function:
+        """Return a user's field as a discontinuous function on this mesh, of the shape (size,)."""
+        V = fem.functionspace(self.mesh, ("DG", field.degree, (field.size,)))
+        function = fem.Function(V, name=field.name)
+        function.x.array.reshape(-1, field.size)[V.dofmap.list] = self.in_cells(field)
+        return function
 
     @property
     def _original_cells(self) -> NDArray[np.int64]:
@@ -242,7 +252,7 @@ class Midsurface:
 
 
 def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
-    """Make the mid-surface on all ranks from the triangulation, which every rank has: it is small.
+    """Make the mid-surface on all ranks of a triangulation that every rank has; collective.
 
     Raises
     ------
@@ -263,22 +273,28 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
 def create_mesh(
     comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]
 ) -> mesh.Mesh:
-    """A mesh on all ranks, from cells and node positions (n, 3) that every rank has."""
-    first = comm.rank == 0
+    """Return a distributed mesh of cells and nodes (n, 3) that every rank has; collective."""
+    is_first_rank = comm.rank == 0
     return mesh.create_mesh(
         comm,
-        cells=cells if first else cells[:0],
-        x=x if first else x[:0],
+        cells=cells if is_first_rank else cells[:0],
+        x=x if is_first_rank else x[:0],
         e=element,
-        partitioner=compat.shared_facets(),
+        partitioner=compat.shared_facet_partitioner(),
     )
 
 
 def at_reference_points(
     nodes: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Coordinates (m, q, d) of reference points (q, 2) in triangles (m, 3 | 6 | 10) in gmsh's
-    order.
+    """Return coordinates (m, q, d) at reference points (q, 2) of triangles.
+
+    Parameters
+    ----------
+    nodes
+        (n, d) coordinates.
+    cells
+        (m, 3 | 6 | 10) node numbers in gmsh's order.
     """
     count = cells.shape[1]
     geometry = basix.create_element(
@@ -300,15 +316,13 @@ def _named_facets(
     domain.topology.create_connectivity(1, 0)
     facets = mesh.exterior_facet_indices(domain.topology)
     # a rank may have no part of any edge, and dolfinx divides by their number
-    ends = (
-        mesh.entities_to_geometry(domain, 1, facets)
-        if len(facets)
-        else np.empty((0, 2), dtype=np.int32)
-    )
+    ends = np.empty((0, 2), dtype=np.int32)
+    if len(facets):
+        ends = mesh.entities_to_geometry(domain, 1, facets)
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
-    named = {}
+    facets_of_edges = {}
     for name, pairs in patch.edges.items():
-        wanted = as_set(pairs)
-        inside = [(a, b) in wanted for a, b in numbers]
-        named[name] = facets[np.array(inside, dtype=bool)]
-    return named
+        pairs_of_edge = as_set(pairs)
+        is_on_edge = [(a, b) in pairs_of_edge for a, b in numbers]
+        facets_of_edges[name] = facets[np.array(is_on_edge, dtype=bool)]
+    return facets_of_edges

@@ -1,4 +1,10 @@
-"""Reading a surface mesh from a file of gmsh (.msh), with triangles of order 1, 2 or 3."""
+"""Surface meshes of gmsh (.msh) with triangles of order 1, 2 or 3.
+
+`read_msh` makes a `PatchMesh` of a file, of the triangles that a program gives in its place, or of
+several shells. It orients the triangles, takes T-junctions apart, names edges and patches by
+physical groups, and finds named points among the vertices. Messages tell places in the coordinates
+of the file.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,12 +15,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.assembly import Assembly
-from magshell_fenicsx.mesh.branches import renamed, separated
-from magshell_fenicsx.mesh.distinct import told_apart
 from magshell_fenicsx.mesh.midsurface import nodal_normals
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
-from magshell_fenicsx.mesh.msh_format import Content, parsed
+from magshell_fenicsx.mesh.msh_format import MshContent, parsed
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
+from magshell_fenicsx.mesh.non_manifold import edges_with_new_nodes, separate_sheets
 from magshell_fenicsx.mesh.patch import (
     MeshError,
     PatchMesh,
@@ -25,28 +30,39 @@ from magshell_fenicsx.mesh.patch import (
     on_border,
     place_text,
 )
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.mesh.vertex_spacing import distinguishable_texts
+from magshell_fenicsx.platform.input_files import Files
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.mesh.given import Home
+    from magshell_fenicsx.mesh.user_mesh import UserMesh
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
-TURNED = {
+REVERSED_NODES = {
     3: [0, 2, 1],
     6: [0, 2, 1, 5, 4, 3],
     10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9],
-}  # nodes of a reversed triangle, gmsh's order
-SAME_PLACE = 1e-9  # of the extent
-TIE = 1e-6  # of the area: a difference that decides nothing
+}  # nodes of a triangle -> gmsh's order of the nodes of the reversed one
+FLAT_TRIANGLE_TOLERANCE = 1e-12  # area over the square of a side, below which there is no area
+SAME_PLACE_TOLERANCE = 1e-9  # over the extent: nodes at one place
+AREA_TIE_TOLERANCE = 1e-6  # over the area: a difference of areas that decides nothing
+POINT_TOLERANCE = 1e-6  # over the extent: distance up to which a vertex counts as a named point
+HEIGHT_DIGITS = 9  # decimals of coordinates over R by which the highest vertex is found
+TRIANGLE_TYPES = ("Triangle 3", "Triangle 6", "Triangle 10")  # gmsh's names
+LINE_TYPES = ("Line 2", "Line 3", "Line 4")
 
 
 def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
-    """The triangles (m, 3 | 6 | 10); those of a piece have one orientation, that of its larger
-    area, or of a rule.
+    """Return triangles (m, 3 | 6 | 10) with one orientation in each connected piece.
 
-    An edge has two at most. Nodes from `first_copy` on stand at places of others: see
-    `branches.separated`.
+    It is that of the larger area, see `_is_reversed`.
+
+    Parameters
+    ----------
+    nodes, cells
+        (n, 3), and node numbers; an edge has two triangles at most.
+    first_copy
+        Nodes from this one on stand at places of others, see `non_manifold.separate_sheets`.
 
     Raises
     ------
@@ -55,21 +71,21 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     """
     a, b, c = (nodes[cells[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    flat = np.flatnonzero(areas <= 1e-12 * np.linalg.norm(b - a, axis=1) ** 2)
+    squared_side = np.linalg.norm(b - a, axis=1) ** 2
+    flat = np.flatnonzero(areas <= FLAT_TRIANGLE_TOLERANCE * squared_side)
     if len(flat):
         raise MeshError(f"the triangle at {place_text(a[flat[0]])} has no area")
     edges = directed_sides(cells)
-    _, which, times = np.unique(
+    _, edge_of_side, times = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    order = np.argsort(which.ravel(), kind="stable")
-    first = np.cumsum(times)[times == 2] - 2
-    one, other = order[first], order[first + 1]
-    agree = (
-        edges[one, 0] != edges[other, 0]
-    )  # neighbours run through their edge in opposite directions
+    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
+    first_of_inner = np.cumsum(times)[times == 2] - 2
+    side, opposite_side = sides_by_edge[first_of_inner], sides_by_edge[first_of_inner + 1]
+    # neighbours that agree run through their edge in opposite directions
+    agree = edges[side, 0] != edges[opposite_side, 0]
     m = len(cells)
-    left, right = one % m, other % m
+    left, right = side % m, opposite_side % m
     # each triangle counts twice, once in each orientation: an orientable surface then has two
     # separate copies
     rows = np.concatenate([left, left + m])
@@ -77,59 +93,63 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
     _, copy = scipy.sparse.csgraph.connected_components(graph, directed=False)
     if (copy[:m] == copy[m:]).any():
-        place = nodes[edges[one[~agree][0]]].mean(axis=0)
+        place = nodes[edges[side[~agree][0]]].mean(axis=0)
         raise MeshError(
-            f"the surface has only one side: its normals cannot agree across the edge around {place_text(place)}"
+            "the surface has only one side: its normals cannot agree across the edge around "
+            f"{place_text(place)}"
         )
     _refuse_torn(nodes, cells, copy[:m], first_copy)
-    as_first = np.empty(m, dtype=bool)
+    keeps_orientation = np.empty(m, dtype=bool)
     pieces = np.minimum(copy[:m], copy[m:])
     for piece in np.unique(pieces):
-        of = np.flatnonzero(pieces == piece)
-        same = copy[of] == copy[of[0]]
-        as_first[of] = ~same if _other_side(nodes, cells[of], areas[of], same) else same
-    return np.where(as_first[:, None], cells, cells[:, TURNED[cells.shape[1]]])
+        in_piece = np.flatnonzero(pieces == piece)
+        as_first = copy[in_piece] == copy[in_piece[0]]
+        is_reversed = _is_reversed(nodes, cells[in_piece], areas[in_piece], as_first)
+        keeps_orientation[in_piece] = ~as_first if is_reversed else as_first
+    reversed_cells = cells[:, REVERSED_NODES[cells.shape[1]]]
+    return np.where(keeps_orientation[:, None], cells, reversed_cells)
 
 
-def _other_side(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
-    """Whether the normals are those of the triangles that are not `as_first`: of the larger area.
+def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
+    """Return whether a piece has the orientation of the triangles that are not `as_first`.
 
-    Halves of the same size, as refined meshes have them, do not depend on the numbers of triangles:
-    their normals point upwards on the whole, else along e2 or e1, else out of the volume.
+    The larger area decides. Halves of the same size, as refined meshes have them, do not depend on
+    the numbers of triangles: their normals point upwards on the whole, else along e2 or e1, else
+    out of the volume.
     """
-    same, whole = areas[as_first].sum(), areas.sum()
-    if abs(2 * same - whole) > TIE * whole:
-        return bool(2 * same < whole)
+    area_as_first, total_area = areas[as_first].sum(), areas.sum()
+    if abs(2 * area_as_first - total_area) > AREA_TIE_TOLERANCE * total_area:
+        return bool(2 * area_as_first < total_area)
     a, b, c = (nodes[cells[:, i]] - nodes[np.unique(cells)].mean(axis=0) for i in range(3))
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
     outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
-    for along in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
-        if abs(total := along.sum()) > TIE * whole:
+    for components in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
+        if abs(total := components.sum()) > AREA_TIE_TOLERANCE * total_area:
             return bool(total < 0)
     return False
 
 
 def _refuse_torn(
-    nodes: Array, cells: Cells, copy: NDArray[np.int32], first_copy: int | None
+    nodes: Array, cells: Cells, piece: NDArray[np.int32], first_copy: int | None
 ) -> None:
-    """See that pieces which are not connected lie apart."""
-    if (copy == copy[0]).all():
+    """Refuse a surface with pieces that have nodes at one place and are not connected."""
+    if (piece == piece[0]).all():
         return
     vertices = np.unique(cells[:, :3])
-    vertices = vertices if first_copy is None else vertices[vertices < first_copy]
-    near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
-        SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
+    if first_copy is not None:
+        vertices = vertices[vertices < first_copy]
+    near_pairs = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
+        SAME_PLACE_TOLERANCE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
     )
-    if len(near):
-        place = place_text(nodes[vertices[near[0, 0]]])
+    if len(near_pairs):
+        place = place_text(nodes[vertices[near_pairs[0, 0]]])
         raise MeshError(
             f"the surface is torn: there are two nodes at {place}, and its parts are not connected"
         )
 
 
-def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict[str, Cells]:
-    """The part of each named curve (e, 2) that is a border of the surface; every border edge needs
-    a name.
+def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dict[str, Cells]:
+    """Return the part of each named curve (e, 2) that is a border of the surface.
 
     Raises
     ------
@@ -138,81 +158,81 @@ def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict
         surface touches itself in a vertex.
     """
     border = border_pairs(directed_sides(cells))
-    listed = {pair for lines in named.values() for pair in as_set(lines)}
-    unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in listed]
+    named_pairs = {pair for lines in curves.values() for pair in as_set(lines)}
+    unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in named_pairs]
     if unnamed:
         place = nodes[list(unnamed[0])].mean(axis=0)
         vertices = np.unique(cells[:, :3])
         extent = np.ptp(nodes[vertices], axis=0).max()
         corner = nodes[unnamed[0][0]]
-        twice = np.sum(np.linalg.norm(nodes[vertices] - corner, axis=1) < SAME_PLACE * extent) > 1
-        if twice:
+        distances = np.linalg.norm(nodes[vertices] - corner, axis=1)
+        if np.sum(distances < SAME_PLACE_TOLERANCE * extent) > 1:
             raise MeshError(
-                f"there are two nodes at {place_text(corner)}: the triangles beside it are not connected"
+                f"there are two nodes at {place_text(corner)}: "
+                "the triangles beside it are not connected"
             )
         raise MeshError(
-            f"the surface ends at the edge around {place_text(place)}, which belongs to no physical curve: "
-            "close the hole, or name the edge (an edge without a condition is free)"
+            f"the surface ends at the edge around {place_text(place)}, "
+            "which belongs to no physical curve: close the hole, or name the edge "
+            "(an edge without a condition is free)"
         )
     ends, times = np.unique(border, return_counts=True)
     if (times > 2).any():
         raise MeshError(
             f"the surface touches itself in the vertex {place_text(nodes[ends[times > 2][0]])}"
         )
-    return on_border(named, border)
-
-
-TRIANGLES, LINES = ("Triangle 3", "Triangle 6", "Triangle 10"), ("Line 2", "Line 3", "Line 4")
-NEAR = 1e-6  # distance, over the extent, up to which a vertex counts as a named point
+    return on_border(curves, border)
 
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A .msh file, triangles that a program gives under that name, or several shells.
+    """A .msh file, or what a program gives under that name: triangles or several shells.
 
     Attributes
     ----------
+    path
+        Path of the file.
     scale
         Factor from its coordinates to lengths over R.
     normals
         Whether nodes are places followed by normals, (n, 6), which the triangles around a node have
         on average.
     files
-        What has its content.
-    given
-        The triangles or the shells; None of a file.
+        Reads the file.
+    in_memory
+        The triangles or the shells; None for a file.
     """
 
     path: Path
     scale: float
     normals: bool = False
     files: Files = field(default_factory=Files, compare=False)
-    given: Triangles | Assembly | None = None
+    in_memory: Triangles | MultiShellMesh | None = None
 
     @property
-    def home(self) -> "Home | None":
-        """The mesh of a program; None of a file."""
-        return self.given.home if self.given else None
+    def user_mesh(self) -> "UserMesh | None":
+        """The mesh of a program; None for a file."""
+        return self.in_memory.user_mesh if self.in_memory else None
 
     def content(self) -> Triangles:
-        """What is in it, or was given.
+        """Return the triangles of the file or of the program.
 
         Raises
         ------
         MeshError
-            If it cannot be read.
+            If the file cannot be read.
         """
-        assert not isinstance(self.given, Assembly)
-        return self.given or _content(self)
+        assert not isinstance(self.in_memory, MultiShellMesh)
+        return self.in_memory or _triangles_of_file(self)
 
 
-def in_space(x: Array) -> Array:
-    """The embedding of a mesh whose nodes are given in space."""
+def space_embedding(x: Array) -> Array:
+    """Return the places (..., 3) of nodes in space: the embedding of a mesh without a chart."""
     return x[..., :3]
 
 
-def normals(x: Array) -> Array:
-    """Unit normals (n, 3) of nodes (n, 6)."""
+def node_normals(x: Array) -> Array:
+    """Return unit normals (n, 3) of nodes (n, 6), which are places and normals."""
     return np.asarray(x[:, 3:] / np.linalg.norm(x[:, 3:], axis=1)[:, None])
 
 
@@ -220,23 +240,23 @@ def read_msh(
     file: MeshFile,
     points: Mapping[str, Array],
     mirror: Mirror | None = None,
-    held: Collection[str] = (),
+    held_edges: Collection[str] = (),
 ) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
     Physical groups of surfaces become named patches, those of curves named edges. Triangles whose
-    orientation differs from that of the larger area are turned over.
+    orientation differs from that of the larger area are reversed.
 
     Parameters
     ----------
     points
         Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is
-        the pole; of several that are, one on no `held` edge, and best the pole of one of several
+        the pole; of several that are, one on no held edge, and best the pole of one of several
         shells.
     mirror
-        The plane whose half is read; None for the whole surface.
-    held
-        Names of edges.
+        The symmetry plane or the sector of which that part is read; None for the whole surface.
+    held_edges
+        Names of edges that are clamped or hinged.
 
     Raises
     ------
@@ -244,163 +264,186 @@ def read_msh(
         If the file cannot be read, or its surface cannot carry a shell. Places in messages are
         those of the file.
     """
-    if isinstance(file.given, Assembly):
-        patch = file.given.patch
-        on_alike = {
-            name: patch.points[like] for like in patch.points for name in _alike(points, like)
-        }
-        others = {name: x for name, x in points.items() if name not in on_alike}
-        own = [
-            patch.points[name]
-            for name in map("{}_pole".format, patch.shells)
-            if name in patch.points
-        ]
-        return replace(
-            patch, points={**_vertices(patch, others, file.scale, held, own), **on_alike}
-        )
+    if isinstance(file.in_memory, MultiShellMesh):
+        return _with_points_of_shells(file, file.in_memory.patch, points, held_edges)
     try:
-        patch = _whole(file)
+        patch = _patch_of_triangles(file)
     except MeshError as e:
-        raise MeshError(f"shell: {e}" if file.given else f"shell.file: {e}") from None
-    if isinstance(mirror, Sector) and patch.feet:
+        key = "shell" if file.in_memory else "shell.file"
+        raise MeshError(f"{key}: {e}") from None
+    if isinstance(mirror, Sector) and patch.t_junctions:
         raise MeshError(
             f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half"
         )
     patch = cut(patch, mirror) if mirror else patch
-    return replace(patch, points=_vertices(patch, points, file.scale, held))
+    return replace(patch, points=_named_vertices(patch, points, file.scale, held_edges))
 
 
-def _alike(points: Mapping[str, Array], name: str) -> list[str]:
-    """The names of points at the place of one."""
-    return [
-        other for other, x in points.items() if name in points and np.array_equal(x, points[name])
-    ]
+def _with_points_of_shells(
+    file: MeshFile, patch: PatchMesh, points: Mapping[str, Array], held_edges: Collection[str]
+) -> PatchMesh:
+    """Return the triangulation of several shells with named points, as `read_msh`."""
+    points_of_shells = dict[str, Array]()
+    for name_in_shell, x in patch.points.items():
+        for name in _names_of_same_place(points, name_in_shell):
+            points_of_shells[name] = x
+    other_points = {name: x for name, x in points.items() if name not in points_of_shells}
+    pole_names = [f"{shell}_pole" for shell in patch.shells]
+    poles = [patch.points[name] for name in pole_names if name in patch.points]
+    vertices = _named_vertices(patch, other_points, file.scale, held_edges, poles)
+    return replace(patch, points={**vertices, **points_of_shells})
 
 
-def _whole(file: MeshFile) -> PatchMesh:
+def _names_of_same_place(points: Mapping[str, Array], name: str) -> list[str]:
+    """Return the names of all points at the place of one; none if there is no such point."""
+    if name not in points:
+        return []
+    return [other for other, x in points.items() if np.array_equal(x, points[name])]
+
+
+def _patch_of_triangles(file: MeshFile) -> PatchMesh:
+    """Return the whole surface of a file or of a program, oriented and over R, without points."""
     triangles = file.content()
     nodes, cells, edges = triangles.nodes, triangles.cells, dict(triangles.edges)
-    used, again = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
-    cells = again.reshape(cells.shape)
-    number = np.full(len(nodes), -1, dtype=np.int64)
-    number[used] = np.arange(len(used))
+    used, numbers = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
+    cells = numbers.reshape(cells.shape)
+    new_number = np.full(len(nodes), -1, dtype=np.int64)
+    new_number[used] = np.arange(len(used))
     nodes = nodes[used]
     for name, pairs in edges.items():
-        edges[name] = number[pairs]
+        edges[name] = new_number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
     first_copy = len(nodes)
-    origin, cells, feet = separated(nodes, cells)
-    nodes, edges = nodes[origin], renamed(edges, cells, origin) if feet else edges
-    for name, foot in feet.items():
+    origin, cells, t_junctions = separate_sheets(nodes, cells)
+    nodes = nodes[origin]
+    if t_junctions:
+        edges = edges_with_new_nodes(edges, cells, origin)
+    for name, t_junction in t_junctions.items():
         if name in edges:
             raise MeshError(
-                f"{file.path}: the physical curve {name}: is how a T-junction is called: take another"
+                f"{file.path}: the physical curve {name}: is how a T-junction is called: "
+                "take another"
             )
-        edges[name] = foot.pairs
-    before, cells = cells, oriented(nodes, cells, first_copy if feet else None)
-    turned = (cells[:, 1] != before[:, 1]).astype(np.int64)
+        edges[name] = t_junction.pairs
+    cells_of_file = cells
+    cells = oriented(nodes, cells, first_copy if t_junctions else None)
+    is_reversed = (cells[:, 1] != cells_of_file[:, 1]).astype(np.int64)
     edges = border_edges(nodes, cells, edges)
     nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
-    given = np.column_stack([np.arange(len(cells)), turned])
-    on = {name: foot.on for name, foot in feet.items()}
-    return PatchMesh(nodes, cells, in_space, edges, patches=triangles.patches, given=given, feet=on)
+    return PatchMesh(
+        nodes,
+        cells,
+        space_embedding,
+        edges,
+        patches=triangles.patches,
+        source_triangles=np.column_stack([np.arange(len(cells)), is_reversed]),
+        t_junctions={name: t_junction.supports for name, t_junction in t_junctions.items()},
+    )
 
 
 def cell_count(file: MeshFile) -> int:
-    """How many triangles are in it; none in a file that cannot be read, which `read_msh` reports."""
-    if file.given:
-        return len(file.given.cells)
+    """Return the number of triangles; 0 of a file that cannot be read, which `read_msh` reports."""
+    if file.in_memory:
+        return len(file.in_memory.cells)
     try:
-        held = parsed(file.files.content(file.path))
+        content = parsed(file.files.content(file.path))
     except (OSError, MeshError):
         return 0
-    return sum(len(nodes) for _, dim, _, nodes in held.blocks if dim == 2)
+    return sum(len(nodes) for _, dim, _, nodes in content.blocks if dim == 2)
 
 
-def _vertices(
+def _named_vertices(
     patch: PatchMesh,
     points: Mapping[str, Array],
     scale: float,
-    held: Collection[str],
-    own: Sequence[Array] = (),
+    held_edges: Collection[str],
+    shell_poles: Sequence[Array] = (),
 ) -> dict[str, Array]:
-    """Named ones, and the highest as "pole": of several that are, a free one, best of the poles that shells have of
-    their `own`."""
+    """Return the vertex of each named point, and the highest vertex as "pole".
+
+    Of several highest ones the pole is one on no held edge, best one of `shell_poles` (d,).
+    """
     numbers = np.unique(patch.cells[:, :3])
     corners = patch.nodes[numbers]
-    on_held = [pairs.ravel() for name, pairs in patch.edges.items() if name in held]
-    free = ~np.isin(numbers, np.concatenate([*on_held, np.zeros(0, dtype=np.int64)]))
-    all_of_them = np.array([*corners, *own])
-    x, y, z = np.round(all_of_them[:, :3], 9).T
-    is_own = np.arange(len(x)) >= len(corners)
-    is_free = free[scipy.spatial.cKDTree(corners[:, :3]).query(all_of_them[:, :3])[1]]
-    vertices = {"pole": all_of_them[np.lexsort((x, y, is_own, is_free, z))[-1]]}
+    held_vertices = [pairs.ravel() for name, pairs in patch.edges.items() if name in held_edges]
+    is_free = ~np.isin(numbers, np.concatenate([*held_vertices, np.zeros(0, dtype=np.int64)]))
+    candidates = np.array([*corners, *shell_poles])
+    x, y, z = np.round(candidates[:, :3], HEIGHT_DIGITS).T
+    is_shell_pole = np.arange(len(x)) >= len(corners)
+    nearest_corner = scipy.spatial.cKDTree(corners[:, :3]).query(candidates[:, :3])[1]
+    pole = np.lexsort((x, y, is_shell_pole, is_free[nearest_corner], z))[-1]
+    vertices = {"pole": candidates[pole]}
     for name, x in points.items():
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
-        if distance.min() > NEAR * np.ptp(corners[:, :3], axis=0).max():
-            wanted, near = told_apart(x[:3] / scale, nearest[:3] / scale)
+        if distance.min() > POINT_TOLERANCE * np.ptp(corners[:, :3], axis=0).max():
+            text, nearest_text = distinguishable_texts(x[:3] / scale, nearest[:3] / scale)
             raise MeshError(
-                f"points.{name}: ({wanted}) in the file's coordinates is no vertex of the mesh; the nearest is ({near})"
+                f"points.{name}: ({text}) in the file's coordinates is no vertex of the mesh; "
+                f"the nearest is ({nearest_text})"
             )
         vertices[name] = nearest
     return vertices
 
 
-def _content(file: MeshFile) -> Triangles:
-    """Those of a file, and the names of its physical groups."""
+def _triangles_of_file(file: MeshFile) -> Triangles:
+    """Return the triangles of a file, with curves and patches by its physical groups."""
     try:
-        held = parsed(file.files.content(file.path))
+        content = parsed(file.files.content(file.path))
     except FileNotFoundError:
         raise MeshError(f"{file.path}: there is no such mesh file") from None
     except OSError as e:
         raise MeshError(f"{file.path}: cannot be read: {e.strerror}") from None
     except MeshError as e:
         raise MeshError(f"{file.path}: {e}") from None
-    if not len(held.tags):
+    if not len(content.tags):
         raise MeshError(f"{file.path}: there is no mesh in it")
-    faces = _elements(file, held, 2, TRIANGLES)
-    if len({nodes.shape[1] for _, nodes in faces}) != 1:
+    blocks = _blocks_of_dimension(file, content, 2, TRIANGLE_TYPES)
+    if len({nodes.shape[1] for _, nodes in blocks}) != 1:
         raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
-    cells = _places(file, held, np.concatenate([nodes for _, nodes in faces]))
-    entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in faces])
-    patches = {name: np.isin(entity, entities) for name, entities in held.groups[2].items()}
+    cells = _node_indices(file, content, np.concatenate([nodes for _, nodes in blocks]))
+    entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in blocks])
+    patches = {name: np.isin(entity, entities) for name, entities in content.groups[2].items()}
     edges = {}
-    for name, entities in held.groups[1].items():
+    for name, entities in content.groups[1].items():
         lines = [
-            nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities
+            nodes[:, :2]
+            for entity, nodes in _blocks_of_dimension(file, content, 1, LINE_TYPES)
+            if entity in entities
         ]
         if lines:  # a curve of the geometry may have no elements
-            edges[name] = _places(file, held, np.concatenate(lines))
-    return Triangles(held.places, cells, edges, patches)
+            edges[name] = _node_indices(file, content, np.concatenate(lines))
+    return Triangles(content.places, cells, edges, patches)
 
 
-def _elements(
-    file: MeshFile, held: Content, dimension: int, passed_over: Collection[str]
+def _blocks_of_dimension(
+    file: MeshFile, content: MshContent, dimension: int, allowed_types: Collection[str]
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Entity and nodes of the blocks of one dimension."""
+    """Return entity and node numbers (m, k) of the blocks of one dimension."""
     blocks = []
-    for name, dim, entity, nodes in held.blocks:
+    for name, dim, entity, nodes in content.blocks:
         if dim == dimension:
-            if name not in passed_over:
+            if name not in allowed_types:
                 raise MeshError(
-                    f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3"
+                    f"{file.path}: it has elements {name}; "
+                    "allowed are triangles of order 1, 2 and 3"
                 )
             blocks.append((entity, nodes))
     return blocks
 
 
-def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices of the nodes with these numbers."""
-    order = np.argsort(held.tags)
-    positions: NDArray[np.int64] = order[
-        np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)
-    ]
-    if (missing := held.tags[positions] != numbers).any():
+def _node_indices(
+    file: MeshFile, content: MshContent, numbers: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the indices of the nodes with these numbers of the file."""
+    order = np.argsort(content.tags)
+    positions = np.searchsorted(content.tags, numbers, sorter=order).clip(max=len(order) - 1)
+    indices: NDArray[np.int64] = order[positions]
+    if (missing := content.tags[indices] != numbers).any():
         raise MeshError(
             f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there"
         )
-    return positions
+    return indices

@@ -1,5 +1,4 @@
-"""The content of a file in gmsh's mesh format (MSH 2 to 4, text or binary), read by gmsh without
-running anything.
+"""Content of a file in gmsh's mesh format (MSH 2 to 4, text or binary), read safely by gmsh.
 
 gmsh chooses how to read a file from its first line. It runs scripts (SystemCall "..."), and it also
 runs a file of the same name with .opt at its end. So gmsh gets a copy in an empty folder, and only
@@ -21,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.platform.packages import Unusable, gmsh_module
+from magshell_fenicsx.platform.packages import Unusable, import_gmsh
 
 Integers = NDArray[np.int64]
 Blocks = list[tuple[str, int, int, Integers]]
-FOUND = "found"
+RESULT_FILE = "found"  # what the process of its own writes
 UNUSABLE = 4  # exit code where gmsh cannot be loaded
 
 
 @dataclass(frozen=True)
-class Content:
+class MshContent:
     """The mesh in a file.
 
     Attributes
@@ -50,9 +49,9 @@ class Content:
     groups: dict[int, dict[str, list[int]]] = field(default_factory=lambda: {1: {}, 2: {}})
 
 
-@lru_cache(maxsize=1)  # the planner looks for mirror planes in the file that is then built
-def parsed(content: bytes) -> Content:
-    """Read the content of a file.
+@lru_cache(maxsize=1)  # the planner looks for symmetry planes in the file that is then built
+def parsed(content: bytes) -> MshContent:
+    """Return the mesh in the content of a file; the last result is cached.
 
     Raises
     ------
@@ -61,54 +60,48 @@ def parsed(content: bytes) -> Content:
     """
     if not content.startswith((b"$MeshFormat", b"$Comments")):
         raise MeshError(
-            "is no mesh of gmsh's, which begins with $MeshFormat; allowed are versions 2 and 4, as text or binary. "
-            "A script is not run here: gmsh -2 -o part.msh part.geo makes a mesh of it"
+            "is no mesh of gmsh's, which begins with $MeshFormat; allowed are versions 2 and 4, "
+            "as text or binary. A script is not run here: gmsh -2 -o part.msh part.geo makes a "
+            "mesh of it"
         )
     with TemporaryDirectory() as folder:
-        alone = Path(folder) / "part.msh"
-        alone.write_bytes(content)
-        command = [sys.executable, "-m", __name__, str(alone)]
-        env = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(
-                [str(Path(__file__).parents[2]), *filter(None, sys.path)]
-            ),
-        }
-        done = subprocess.run(
+        copy = Path(folder) / "part.msh"
+        copy.write_bytes(content)
+        command = [sys.executable, "-m", __name__, str(copy)]
+        import_paths = [str(Path(__file__).parents[2]), *filter(None, sys.path)]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(import_paths)}
+        process = subprocess.run(
             command, env=env, cwd=folder, capture_output=True, text=True, check=False
         )
-        if done.returncode == UNUSABLE:
-            raise Unusable(done.stderr.strip())
-        if done.returncode:
-            reason = (
-                (done.stderr.strip().splitlines() or ["nothing"])[-1]
-                if done.returncode > 0
-                else "it crashed"
-            )
-            reason = reason.replace(str(alone), "the file").removeprefix("Exception: ").strip()
+        if process.returncode == UNUSABLE:
+            raise Unusable(process.stderr.strip())
+        if process.returncode:
+            reason = "it crashed"
+            if process.returncode > 0:
+                reason = (process.stderr.strip().splitlines() or ["nothing"])[-1]
+            reason = reason.replace(str(copy), "the file").removeprefix("Exception: ").strip()
             raise MeshError(
                 f"is damaged, or of a version that gmsh does not read, which says: {reason}"
             )
-        mesh: Content = Content(*pickle.loads((Path(folder) / FOUND).read_bytes()))
+        mesh = MshContent(*pickle.loads((Path(folder) / RESULT_FILE).read_bytes()))
     if not np.isfinite(mesh.places).all():
         raise MeshError("a coordinate is not a number")
     return mesh
 
 
-def _held(
+def _fields_of_model(
     model: Any,
 ) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:
-    """The fields of `Content`."""
+    """Return the fields of `MshContent` of gmsh's current model."""
     tags, xyz, _ = model.mesh.getNodes()
     blocks, groups = Blocks(), dict[int, dict[str, list[int]]]({1: {}, 2: {}})
     for dim, entity in model.getEntities():
         for kind, _, nodes in zip(*model.mesh.getElements(dim, entity), strict=True):
             name, _, _, width, *_ = model.mesh.getElementProperties(kind)
-            each = nodes.astype(np.int64).reshape(-1, width)
-            first = np.unique(each, axis=0, return_index=True)[
-                1
-            ]  # MSH 2 repeats an element for each of its groups
-            blocks.append((name, dim, entity, each[np.sort(first)]))
+            elements = nodes.astype(np.int64).reshape(-1, width)
+            # MSH 2 repeats an element for each of its groups
+            first_index = np.unique(elements, axis=0, return_index=True)[1]
+            blocks.append((name, dim, entity, elements[np.sort(first_index)]))
     for dim, group in model.getPhysicalGroups():
         if dim in groups:
             name = model.getPhysicalName(dim, group) or str(group)
@@ -118,14 +111,14 @@ def _held(
 
 def _main(file: Path) -> None:
     try:
-        gmsh = gmsh_module()
+        gmsh = import_gmsh()
     except Unusable as e:
         print(e, file=sys.stderr)
         sys.exit(UNUSABLE)
     gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may run commands
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.open(str(file))
-    (file.parent / FOUND).write_bytes(pickle.dumps(_held(gmsh.model)))
+    (file.parent / RESULT_FILE).write_bytes(pickle.dumps(_fields_of_model(gmsh.model)))
 
 
 if __name__ == "__main__":

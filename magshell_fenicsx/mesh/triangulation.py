@@ -1,4 +1,8 @@
-"""Triangulating a plane shape by gmsh, with cubic edges."""
+"""Triangulation of a plane shape by gmsh, with cubic edges.
+
+`triangulate` refines where cubic triangles are overturned, and names the boundary edges. Lengths
+are those of the chart, over R.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,31 +13,32 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Size
-from magshell_fenicsx.mesh.grid import CLOSE
+from magshell_fenicsx.mesh.grid import CHART_TOLERANCE
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh, place_text
-from magshell_fenicsx.mesh.shapes import Shape
-from magshell_fenicsx.platform.packages import gmsh_module
+from magshell_fenicsx.mesh.shapes import PlaneShape
+from magshell_fenicsx.platform.packages import import_gmsh
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-BOX = 1e-6  # gmsh's boxes are larger than what is in them by 1e-7
-ATTEMPTS, GROWTH = 7, 0.4
-WIDER, WIDEN = (
-    2,
-    3e-3,
-)  # after how many attempts rims are made wider, and by how much: no part of the error
+BOX_TOLERANCE = 1e-6  # gmsh's boxes are larger than what is in them by 1e-7
+MAX_ATTEMPTS = 7
+SIZE_GROWTH = 0.4  # of the size per distance, from where triangles were overturned
+# attempt after which rims are widened, and by what part: no part of the error
+WIDENING_ATTEMPT, WIDENING = 2, 3e-3
+GLUING_TOLERANCE = 1e3 * CHART_TOLERANCE  # distance of nodes of glued sides
+POINT_DIGITS = 12  # decimals of coordinates by which points are one
 ORDER, TRIANGLE10, LINE4 = 3, 21, 26  # gmsh's numbers of the cubic elements
 
 
 def triangulate(
-    shape: Shape, size: Size, points: Mapping[str, Array], embedding: Embedding
+    shape: PlaneShape, size: Size, points: Mapping[str, Array], embedding: Embedding
 ) -> PatchMesh:
     """Triangulate a shape with gmsh; call it on one rank only.
 
     Parameters
     ----------
     size
-        Wanted element size at a point; smaller ones are made where curves nearly touch.
+        Largest element size at a point (2,); smaller ones are made where curves nearly touch.
     points
         Named points (2,) that must be vertices.
     embedding
@@ -44,34 +49,44 @@ def triangulate(
     MeshError
         If gmsh cannot mesh the shape.
     """
-    for attempt in range(ATTEMPTS):
-        nodes, cells, lines = _meshed(shape, size, points)
-        bad = _overturned(nodes[cells])
-        if not len(bad):
+    for attempt in range(MAX_ATTEMPTS):
+        nodes, cells, lines = _gmsh_mesh(shape, size, points)
+        overturned = _overturned_corners(nodes[cells])
+        if not len(overturned):
             break
-        size = _smaller(size, bad)
-        if attempt == WIDER:  # curves that touch leave cusps: they shall overlap
-            shape = replace(shape, rims=tuple(x + WIDEN * (x - x.mean(axis=0)) for x in shape.rims))  # type: ignore[type-var]
+        size = _halved_at(size, overturned)
+        if attempt == WIDENING_ATTEMPT:  # curves that touch leave cusps: they shall overlap
+            rims = tuple(x + WIDENING * (x - x.mean(axis=0)) for x in shape.rims)
+            shape = replace(shape, rims=rims)  # type: ignore[type-var]
     else:
+        place = place_text(embedding(overturned[:1])[0])
         raise MeshError(
-            f"gmsh leaves an element without area around {place_text(embedding(bad[:1])[0])}, over R: rims of "
-            "dimples nearly touch, or a rim nearly touches an edge; move one of them a little, or use kind: gaussian, "
-            "which has no rim"
+            f"gmsh leaves an element without area around {place}, over R: rims of "
+            "dimples nearly touch, or a rim nearly touches an edge; move one of them a little, "
+            "or use kind: gaussian, which has no rim"
         )
-    one = _glue(shape, nodes)
-    edges = {name: one[lines[on[lines].all(axis=1)]] for name, on in shape.on_edges(nodes).items()}
-    return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one if shape.glued else None)
+    representative = _glued_nodes(shape, nodes)
+    edges = dict[str, Numbers]()
+    for name, is_on_edge in shape.on_edges(nodes).items():
+        edges[name] = representative[lines[is_on_edge[lines].all(axis=1)]]
+    return PatchMesh(
+        nodes,
+        cells,
+        embedding,
+        edges,
+        dict(points),
+        representative=representative if shape.glued else None,
+    )
 
 
-def _meshed(
-    shape: Shape, size: Size, points: Mapping[str, Array]
+def _gmsh_mesh(
+    shape: PlaneShape, size: Size, points: Mapping[str, Array]
 ) -> tuple[Array, Numbers, Numbers]:
-    """Nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
-    gmsh = gmsh_module()
+    """Return nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
+    gmsh = import_gmsh()
 
-    gmsh.initialize(
-        readConfigFiles=False, interruptible=False
-    )  # ~/.gmshrc may change meshes, and run commands
+    # ~/.gmshrc may change meshes, and run commands
+    gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         for rule in ("MeshSizeExtendFromBoundary", "MeshSizeFromPoints", "MeshSizeFromCurvature"):
@@ -92,12 +107,10 @@ def _meshed(
         number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
         number[tags.astype(np.int64)] = np.arange(len(tags))
         nodes = xyz.reshape(-1, 3)[:, :2].copy()
-        cells = number[gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)].reshape(
-            -1, 10
-        )
-        lines = number[gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)].reshape(-1, 4)[
-            :, :2
-        ]
+        triangle_tags = gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)
+        cells = number[triangle_tags].reshape(-1, 10)
+        line_tags = gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)
+        lines = number[line_tags].reshape(-1, 4)[:, :2]
     except Exception as e:  # gmsh's own errors have no class of their own
         raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
     finally:
@@ -109,34 +122,36 @@ def _meshed(
     return nodes, cells, lines
 
 
-def _smaller(size: Size, places: Array) -> Size:
-    """Half the size at places (n, 2), growing from there."""
+def _halved_at(size: Size, places: Array) -> Size:
+    """Return an element size that is half the old one at places (n, 2), growing from there."""
     halved = np.array([size(x) / 2 for x in places])
-    return lambda x: min(size(x), float((halved + GROWTH * np.hypot(*(places - x).T)).min()))
+    return lambda x: min(size(x), float((halved + SIZE_GROWTH * np.hypot(*(places - x).T)).min()))
 
 
-def _with_images(shape: Shape, points: Mapping[str, Array]) -> list[Array]:
-    """The points, each once, and on glued sides their images on the other one."""
+def _with_images(shape: PlaneShape, points: Mapping[str, Array]) -> list[Array]:
+    """Return the points, each once, and on glued sides their images on the other side."""
     places = list(points.values())
     for axis, low, high in shape.glued:
-        for side, image in ((low, high), (high, low)):
-            for x in [x for x in places if abs(x[axis] - side) < CLOSE]:
-                places.append(np.where(np.arange(2) == axis, image, x))
-    return list(np.unique(np.round(places, 12), axis=0)) if shape.glued else places
+        for side, opposite in ((low, high), (high, low)):
+            for x in [x for x in places if abs(x[axis] - side) < CHART_TOLERANCE]:
+                places.append(np.where(np.arange(2) == axis, opposite, x))
+    if not shape.glued:
+        return places
+    return list(np.unique(np.round(places, POINT_DIGITS), axis=0))
 
 
 def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
     """Give the curves of two opposite sides the same nodes."""
 
-    def side(across: float) -> list[tuple[float, int]]:
-        lines = []
+    def curves_at(coordinate: float) -> list[tuple[float, int]]:
+        curves = []
         for _, tag in model.getEntities(1):
             box = np.reshape(model.getBoundingBox(1, tag), (2, 3))
-            if np.abs(box[:, axis] - across).max() < BOX:
-                lines.append((float(box[:, 1 - axis].mean()), tag))
-        return sorted(lines)
+            if np.abs(box[:, axis] - coordinate).max() < BOX_TOLERANCE:
+                curves.append((float(box[:, 1 - axis].mean()), tag))
+        return sorted(curves)
 
-    first, second = side(low), side(high)
+    first, second = curves_at(low), curves_at(high)
     shift = np.eye(4)
     shift[axis, 3] = high - low
     model.mesh.setPeriodic(
@@ -144,33 +159,32 @@ def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
     )
 
 
-def _glue(shape: Shape, nodes: Array) -> NDArray[np.int64]:
-    """For each node the node that it is glued to, or itself."""
-    one = np.arange(len(nodes))
+def _glued_nodes(shape: PlaneShape, nodes: Array) -> NDArray[np.int64]:
+    """Return for each node (n,) the node that it is glued to, or itself."""
+    representative = np.arange(len(nodes))
     for axis, low, high in shape.glued:
         first, second = (
-            np.flatnonzero(np.abs(nodes[:, axis] - end) < CLOSE) for end in (low, high)
+            np.flatnonzero(np.abs(nodes[:, axis] - end) < CHART_TOLERANCE) for end in (low, high)
         )
-        distance, nearest = scipy.spatial.cKDTree(nodes[first, 1 - axis, None]).query(
-            nodes[second, 1 - axis, None]
-        )
-        if len(first) != len(second) or distance.max() > 1e3 * CLOSE:
+        tree = scipy.spatial.cKDTree(nodes[first, 1 - axis, None])
+        distance, nearest = tree.query(nodes[second, 1 - axis, None])
+        if len(first) != len(second) or distance.max() > GLUING_TOLERANCE:
             raise MeshError(
                 "gmsh cannot mesh this surface: the two sides that are glued have different nodes"
             )
-        one[second] = one[first[nearest]]
-    return one
+        representative[second] = representative[first[nearest]]
+    return representative
 
 
-def _overturned(nodes: Array) -> Array:
-    """The corners (k, 2) of cubic triangles (m, 10, 2) that are turned over there."""
+def _overturned_corners(nodes: Array) -> Array:
+    """Return the corners (k, 2) at which cubic triangles (m, 10, 2) are overturned."""
     x = nodes.transpose(1, 0, 2)
     sides = ((0, 3, 4, 1), (1, 5, 6, 2), (2, 7, 8, 0))  # nodes along each, in its direction
-    out = [
-        -5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides
-    ]  # derivatives at the beginning
-    into = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
-    turned = [
-        into[i - 1][:, 0] * out[i][:, 1] - into[i - 1][:, 1] * out[i][:, 0] <= 0 for i in range(3)
-    ]
-    return np.concatenate([x[sides[i][0]][turned[i]] for i in range(3)])
+    tangents_at_start = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides]
+    tangents_at_end = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
+    corners = list[Array]()
+    for i in range(3):
+        incoming, outgoing = tangents_at_end[i - 1], tangents_at_start[i]
+        determinant = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
+        corners.append(x[sides[i][0]][determinant <= 0])
+    return np.concatenate(corners)

@@ -23,7 +23,7 @@ from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.shape_tables import Table
+from magshell_fenicsx.assembly.shape_tables import ShapeTable
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -365,7 +365,7 @@ def on_meridian(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
 
 
 def _tables_on_surface(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
-    table, nodes = Table.tabulate(V.element.basix_element, places), V.dofmap.list
+    table, nodes = ShapeTable.tabulate(V.element.basix_element, places), V.dofmap.list
     return lambda nodal: np.asarray(np.moveaxis(table.jets(nodal.reshape(-1, 3)[nodes]), 2, 0))
 
 

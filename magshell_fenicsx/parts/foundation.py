@@ -13,14 +13,14 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import ByPlace, OwnTerm
 from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
-from magshell_fenicsx.platform.later import later
+from magshell_fenicsx.platform.lazy_import import lazy_import
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 
 if TYPE_CHECKING:
     import ufl
     from ufl.core.expr import Expr
 else:
-    ufl = later("ufl")
+    ufl = lazy_import("ufl")
 
 Number = Annotated[float, Field(gt=0)]
 Stiffness = Annotated[float, or_number("newton/metre**3", Number), Field(gt=0)]

@@ -13,8 +13,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import Follows
-from magshell_fenicsx.assembly.parameters import Settable
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
+from magshell_fenicsx.assembly.memo import Memo
 from magshell_fenicsx.models.carriers import Carrier
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
 ROUNDING = 1e-5  # of the soft penetration: a smaller change of it is no divisor
 Thinning = Callable[
-    [Array], Follows[Array]
+    [Array], Memo[Array]
 ]  # from places in the reference cell to values there, (cells * places,)
 
 
@@ -31,7 +31,7 @@ class Grown(Protocol):
     """A natural shape."""
 
     @property
-    def stretch(self) -> Settable | None:
+    def stretch(self) -> SettableNumber | None:
         """The amplitude of its stretch; None if that does not grow."""
         ...
 
@@ -69,7 +69,7 @@ def thinning(
     r0, V = carrier.r0, u.function_space
     by = natural.values if natural else None
 
-    def at(points: Array) -> Follows[Array]:
+    def at(points: Array) -> Memo[Array]:
         jets_of = carrier.tables(V, points)
 
         def values() -> Array:
@@ -81,7 +81,7 @@ def thinning(
             factor = natural.volume(first, points) if natural and by else 1.0
             return np.asarray(1 + thins * (factor * area0 / area - 1)).ravel()
 
-        return Follows(values, lambda: (r0.x.array, u.x.array, *(by or ())))
+        return Memo(values, lambda: (r0.x.array, u.x.array, *(by or ())))
 
     return at
 

@@ -13,9 +13,9 @@ from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.platform.later import later
+from magshell_fenicsx.platform.lazy_import import lazy_import
 from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
-from magshell_fenicsx.shape.symmetry import Leaves, unit
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 if TYPE_CHECKING:
     import ufl
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from magshell_fenicsx.shape.outline import Outline
 else:
-    ufl = later("ufl")
+    ufl = lazy_import("ufl")
 
 ACCELERATION = Unit(
     "E/(ρ R)",
@@ -72,8 +72,8 @@ class GravityStep(BodyForceStep):
         """The unit vector (3,)."""
         return unit(np.array(self.direction))
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
-        return [Leaves(vectors=[self._along])]
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+        return [SymmetryConstraint(vectors=[self._along])]
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
         return [OwnTerm(step.name, energy, (self._along,), of_volume=True)]

@@ -1,4 +1,7 @@
-"""The calls that differ between dolfinx 0.9, 0.10 and 0.11; no other module depends on a version."""
+"""Calls that differ between dolfinx 0.9, 0.10 and 0.11.
+
+No other module depends on the version of dolfinx.
+"""
 
 import ctypes
 from collections.abc import Mapping, Sequence
@@ -24,8 +27,8 @@ from magshell_fenicsx.platform.packages import Unusable
 
 if np.issubdtype(PETSc.ScalarType, np.complexfloating):
     raise Unusable(
-        "this PETSc computes with complex numbers; the program takes one with real numbers: of PyPI's wheels "
-        "dolfinx-solver-real in place of dolfinx-solver"
+        "this PETSc computes with complex numbers; the program takes one with real numbers: of "
+        "PyPI's wheels dolfinx-solver-real in place of dolfinx-solver"
     )
 _Reason = PETSc.SNES.ConvergedReason
 NOT_A_NUMBER = (  # renamed by PETSc 3.25
@@ -38,14 +41,12 @@ NOT_A_NUMBER = (  # renamed by PETSc 3.25
 Field = TypeVar("Field")
 
 
-FORMS = (
-    cffi.FFI()
-)  # the declarations of UFCx; pointers to complex numbers, which cffi lacks, are none of ours
-FORMS.cdef(
-    (jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL).replace(
-        "_Complex", ""
-    )
+_UFCX_DECLARATIONS = (
+    jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL
 )
+# cffi lacks pointers to complex numbers, which kernels in real numbers do not have.
+UFCX = cffi.FFI()
+UFCX.cdef(_UFCX_DECLARATIONS.replace("_Complex", ""))
 
 
 @cache
@@ -59,84 +60,102 @@ def form_signature(form: ufl.Form) -> str:
 
 
 def form_code(form: ufl.Form) -> str:
-    """The code of a form in C, as FFCx makes it."""
-    made = compiler.compile_ufl_objects([form], _form_options())
-    source = (
-        made[1] if isinstance(made[1], str) else made[0][1]
-    )  # lists of files, and their endings, from FFCx 0.10
+    """Return the C code of a form, as FFCx generates it."""
+    generated = compiler.compile_ufl_objects([form], _form_options())
+    # From FFCx 0.10 on the result has lists of files and of their endings.
+    source = generated[1] if isinstance(generated[1], str) else generated[0][1]
     return str(source)
 
 
-def form_include() -> str:
-    """The folder of the header that the code includes."""
+def form_include_folder() -> str:
+    """Return the folder of the header that the code of forms includes."""
     return str(get_include_path())
 
 
 @dataclass(frozen=True)
-class Kernels:
-    """A compiled form without mesh, fields and numbers."""
+class FormKernels:
+    """The kernels of a compiled form, without mesh, fields and constants.
+
+    Attributes
+    ----------
+    ufcx
+        The form's structure in C.
+    library
+        The shared library that it is in.
+    """
 
     ufcx: Any
     library: ctypes.CDLL
 
     @classmethod
-    def of(cls, form: ufl.Form, library: ctypes.CDLL) -> "Kernels":
-        """Those of a form in the library that its code became."""
+    def from_library(cls, form: ufl.Form, library: ctypes.CDLL) -> "FormKernels":
+        """Return the kernels of a form from the library that its code was compiled into."""
         variable = ctypes.c_char.in_dll(library, naming.form_name(form, 0, ""))
-        return cls(FORMS.cast("ufcx_form*", ctypes.addressof(variable))[0], library)
+        return cls(UFCX.cast("ufcx_form*", ctypes.addressof(variable))[0], library)
 
     @property
     def ffi(self) -> cffi.FFI:
-        """What dolfinx asks of a module that cffi has made."""
-        return FORMS
+        """The cffi object that dolfinx expects of a module."""
+        return UFCX
 
-    def in_order(self, fields: Sequence[Field]) -> list[Field]:
-        """Those of a form that its kernels take, in their order."""
-        places = self.ufcx.original_coefficient_positions
-        return [fields[places[i]] for i in range(self.ufcx.num_coefficients)]
+    def order_fields(self, fields: Sequence[Field]) -> list[Field]:
+        """Return those of a form's fields that the kernels take, in their order."""
+        positions = self.ufcx.original_coefficient_positions
+        return [fields[positions[i]] for i in range(self.ufcx.num_coefficients)]
 
-    def marked(self, kind: Any) -> list[int]:
-        """The marks of the parts of the mesh that integrals of a kind are over; those over all of
-        it have none.
+    def subdomain_ids(self, kind: Any) -> list[int]:
+        """Return the ids of the subdomains that integrals of a kind are over.
+
+        Integrals over the whole mesh have none.
         """
         first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
-        return [mark for i in range(first, last) if (mark := self.ufcx.form_integral_ids[i]) != -1]
+        ids = [self.ufcx.form_integral_ids[i] for i in range(first, last)]
+        return [subdomain_id for subdomain_id in ids if subdomain_id != -1]
 
 
-def bound(
-    kernels: Kernels,
+def bind_form(
+    kernels: FormKernels,
     spaces: Sequence[fem.FunctionSpace],
     fields: Sequence[fem.Function],
-    numbers: Sequence[fem.Constant],
-    marks: Mapping[str, mesh.MeshTags | None],
+    constants: Sequence[fem.Constant],
+    tags: Mapping[str, mesh.MeshTags | None],
     domain: Any,
 ) -> fem.Form:
-    """A compiled form on a mesh, as `fem.form` makes it.
+    """Return a compiled form on a mesh, as `fem.form` makes it.
 
     Parameters
     ----------
-    marks
+    spaces
+        Of its arguments.
+    fields, constants
+        Its coefficients and constants, in the order of the kernels.
+    tags
         By the kind of integral, such as "exterior_facet".
     domain
         The mesh in C++.
     """
-    kinds = {getattr(fem.IntegralType, name): tags for name, tags in marks.items()}
-    parts = {
-        kind: get_integration_domains(kind, tags, kernels.marked(kind))
-        for kind, tags in kinds.items()
+    tags_by_kind = {getattr(fem.IntegralType, name): of_kind for name, of_kind in tags.items()}
+    integration_domains = {
+        kind: get_integration_domains(kind, of_kind, kernels.subdomain_ids(kind))
+        for kind, of_kind in tags_by_kind.items()
     }
-    address = int(FORMS.cast("uintptr_t", FORMS.addressof(kernels.ufcx)))
-    objects = ([each._cpp_object for each in of] for of in (spaces, fields, numbers))
-    make, given = form_cpp_class(np.float64), (*objects, parts)
+    address = int(UFCX.cast("uintptr_t", UFCX.addressof(kernels.ufcx)))
+    inputs = (*(_cpp_objects(group) for group in (spaces, fields, constants)), integration_domains)
+    create_form = form_cpp_class(np.float64)
     try:
-        made = make(address, *given, {}, domain)
+        cpp_form = create_form(address, *inputs, {}, domain)
     except TypeError:
-        made = make([address], *given, [], domain)  # of cells of several kinds, from dolfinx 0.10
-    return fem.Form(made, kernels.ufcx, None, kernels)
+        # From dolfinx 0.10 on a form may have cells of several kinds.
+        cpp_form = create_form([address], *inputs, [], domain)
+    return fem.Form(cpp_form, kernels.ufcx, None, kernels)
 
 
-def shared_facets() -> Any:
-    """The partitioner for `create_mesh` that gives each rank one layer of ghosts."""
+def _cpp_objects(objects: Sequence[Any]) -> list[Any]:
+    return [wrapper._cpp_object for wrapper in objects]
+
+
+def shared_facet_partitioner() -> Any:
+    """Return the partitioner for `create_mesh` that gives each rank one layer of ghosts."""
     mode = mesh.GhostMode.shared_facet
     try:
         return mesh.create_cell_partitioner(mode)
@@ -145,22 +164,22 @@ def shared_facets() -> Any:
 
 
 def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
-    """The nodes (n, dim) of a Lagrange space on the reference cell."""
+    """Return the nodes (n, dim) of a Lagrange space on the reference cell."""
     points = V.element.interpolation_points  # a method in dolfinx 0.9
     return np.asarray(points() if callable(points) else points)
 
 
-def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
-    """Rows of `geometry.x` at each cell's nodes; (cells, nodes)."""
-    dofmaps = getattr(
-        domain.geometry, "dofmaps", None
-    )  # a list since dolfinx 0.11, where `dofmap` is deprecated
+def geometry_dofs(domain: mesh.Mesh) -> NDArray[np.int32]:
+    """Return the rows of `geometry.x` at each cell's nodes, (cells, nodes)."""
+    # A list since dolfinx 0.11, where `dofmap` is deprecated.
+    dofmaps = getattr(domain.geometry, "dofmaps", None)
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 
 def original_cells(domain: mesh.Mesh) -> NDArray[np.int64]:
-    """The number of each local cell in the order in which they were made; none of a part of another
-    mesh.
+    """Return the number of each local cell in the input of its mesh.
+
+    The array is empty for a submesh.
     """
     try:
         return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
@@ -168,24 +187,24 @@ def original_cells(domain: mesh.Mesh) -> NDArray[np.int64]:
         return np.empty(0, dtype=np.int64)
 
 
-def tags_of(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
-    """Whether tags belong to a mesh; topologies have a wrapper, or not."""
-    topologies = (tags.topology, domain.topology)
-    own, other = (getattr(each, "_cpp_object", each) for each in topologies)
-    return own is other
+def tags_belong_to(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
+    """Return whether tags belong to a mesh."""
+    # Some versions wrap topologies.
+    topologies = tags.topology, domain.topology
+    of_tags, of_mesh = (getattr(topology, "_cpp_object", topology) for topology in topologies)
+    return of_tags is of_mesh
 
 
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:
     """Add a bilinear form to a matrix, skipping the rows and columns of `clamped`."""
     cpp = form._cpp_object
-    _assemble_matrix(
-        K, cpp, pack_constants(cpp), pack_coefficients(cpp), [bc._cpp_object for bc in clamped]
-    )
+    constants, coefficients = pack_constants(cpp), pack_coefficients(cpp)
+    _assemble_matrix(K, cpp, constants, coefficients, _cpp_objects(clamped))
 
 
 def finish_matrix(K: PETSc.Mat, V: fem.FunctionSpace, clamped: list[fem.DirichletBC]) -> None:
     """Communicate the entries and put ones on the diagonal of `clamped`."""
     K.assemblyBegin(PETSc.Mat.AssemblyType.FLUSH)
     K.assemblyEnd(PETSc.Mat.AssemblyType.FLUSH)
-    insert_diagonal(K, V._cpp_object, [bc._cpp_object for bc in clamped], 1.0)
+    insert_diagonal(K, V._cpp_object, _cpp_objects(clamped), 1.0)
     K.assemble()

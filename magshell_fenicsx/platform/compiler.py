@@ -1,13 +1,12 @@
-"""The C compiler, and shared libraries of C, compiled once, side by side, and kept for later
-processes.
+"""The C compiler, and shared libraries of C: compiled once, in parallel, and cached on disk.
 
 The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's,
 which PyPI has.
 
 Of several processes that ask for a library one compiles it. A process holds the lock of a library
-only while it makes its code and a compiler runs, and waits for none meanwhile: whoever waits for
-another one's library waits for no more than that. So ranks share the work without a message: each
-takes what no other one has.
+only while it generates its code and a compiler runs, and waits for none meanwhile: whoever waits
+for another one's library waits for no more than that. So ranks share the work without a message:
+each takes what no other one has.
 """
 
 import fcntl
@@ -30,34 +29,30 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
 
-from magshell_fenicsx.platform.kept import keep, kept_file, kernel_cache, recall
+from magshell_fenicsx.platform.disk_cache import cache_folder, cached_file, load_cached, save_cached
 from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
-FULL = re.compile(
+FULL_DISK = re.compile(
     "No space left on device|Disk quota exceeded|File too large|Read-only file system"
 )
-POLL = 0.02  # s between two looks whether another process has made a library
-RENEWED = 0.5  # s after which it is told again how many there are
-VECTORS = ("avx2", "fma")  # of x86: what vectors of four numbers need to be one register
+POLL_SECONDS = 0.02  # between two checks whether another process has compiled a library
+PROGRESS_SECONDS = 0.5  # between two messages of progress
+VECTOR_FLAGS = ("avx2", "fma")  # of x86, for which four numbers are one register
 
-USUAL = ("cc", "gcc", "clang")
+USUAL_COMPILERS = ("cc", "gcc", "clang")
 # For any processor, as the kernels may be shared; and without traps for undefined behaviour, which
 # it adds by default.
 ZIG_OPTIONS = ("-mcpu=baseline", "-fno-sanitize=undefined")
 HINT = "install gcc or clang, or `python3 -m pip install ziglang`, or name one in CC"
-SMALLEST = "#include <math.h>\ndouble root(double x) { return sqrt(x); }\n"
-USED = (
-    "-O3",
-    "-ffast-math",
-    "-fno-strict-overflow",
-    "-std=gnu17",
-)  # what kernels ask of any compiler, by kind
-CHECKED = "magshell_compiler_checked"  # of a cache for which a compiler has compiled
+SMALLEST_SOURCE = "#include <math.h>\ndouble root(double x) { return sqrt(x); }\n"
+# Options of every kind that kernels have.
+KERNEL_OPTIONS = ("-O3", "-ffast-math", "-fno-strict-overflow", "-std=gnu17")
+COMPILER_CHECKED = "magshell_compiler_checked"  # name in a cache for which a compiler works
 
 
 class NoCompiler(Unusable):
-    """There is no C compiler that can compile kernels."""
+    """No C compiler can compile kernels."""
 
 
 def c_compiler() -> tuple[str, ...]:
@@ -68,15 +63,15 @@ def c_compiler() -> tuple[str, ...]:
     NoCompiler
         If there is none.
     """
-    if given := os.environ.get("CC"):
+    if user_command := os.environ.get("CC"):
         try:
-            command = tuple(shlex.split(given))
+            command = tuple(shlex.split(user_command))
         except ValueError:  # a quotation without its end
             command = ()
         if not command or not shutil.which(command[0]):
-            raise NoCompiler(f"CC={given}: there is no such compiler; {HINT}")
+            raise NoCompiler(f"CC={user_command}: there is no such compiler; {HINT}")
         return command
-    for name in (sysconfig.get_config_var("CC"), *USUAL):
+    for name in (sysconfig.get_config_var("CC"), *USUAL_COMPILERS):
         command = tuple(shlex.split(name or ""))
         if command and shutil.which(command[0]):
             return command
@@ -87,26 +82,25 @@ def c_compiler() -> tuple[str, ...]:
 
 @cache
 def is_gnu(compiler: tuple[str, ...]) -> bool:
-    """Whether a compiler is GCC itself; others say so too, but are Clang."""
+    """Return whether a compiler is GCC itself; Clang defines its macros too."""
     command = [*compiler, "-dM", "-E", "-x", "c", os.devnull]
-    macros = subprocess.run(
-        command, capture_output=True, text=True, errors="replace", check=False
-    ).stdout
+    macros = _run(command).stdout
     return "__GNUC__" in macros and "__clang__" not in macros
 
 
 def check_compiler() -> None:
-    """Refuse a compiler that cannot compile kernels, before any is compiled; a cache that has some
-    needs none.
+    """Refuse a compiler that cannot compile kernels, before any is compiled.
+
+    A cache for which a compiler has worked is not checked again.
 
     Raises
     ------
     NoCompiler
         With the compiler's first error, or if there is none.
     """
-    if recall(CHECKED) is None:
+    if load_cached(COMPILER_CHECKED) is None:
         refuse_unusable()
-        keep(CHECKED, b"yes")
+        save_cached(COMPILER_CHECKED, b"yes")
 
 
 def refuse_unusable() -> None:
@@ -119,30 +113,36 @@ def refuse_unusable() -> None:
     """
     command = c_compiler()
     with tempfile.TemporaryDirectory() as scratch:
-        code, made = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
-        code.write_text(SMALLEST, encoding="utf-8")
-        done = _compiler_run(command, (*USED, *processor_options()), code, made)
-    if done.returncode and not FULL.search(done.stderr):
-        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        error = next((line for line in lines if "error" in line), lines[0]).replace(
-            f"{scratch}/", ""
-        )
+        code, library = Path(scratch) / "smallest.c", Path(scratch) / "smallest.so"
+        code.write_text(SMALLEST_SOURCE, encoding="utf-8")
+        process = _compiler_run(command, (*KERNEL_OPTIONS, *processor_options()), code, library)
+    if process.returncode and not FULL_DISK.search(process.stderr):
+        lines = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
+        error = next((line for line in lines if "error" in line), lines[0])
+        error = error.replace(f"{scratch}/", "")
         raise NoCompiler(
             f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}"
         )
 
 
 class Library:
-    """A library: it is there, or is compiled meanwhile, by this process or another one.
+    """A shared library that is cached, or being compiled by this process or another one.
 
     Parameters
     ----------
     name
-        Says what it depends on, but for the options.
+        Determines it, but for the options.
     source
-        Its code in C; called if it must be compiled.
-    options, gnu_options
-        Of any compiler, and more of GCC itself.
+        Returns its code in C; called if it must be compiled.
+    options
+        For any compiler.
+    gnu_options
+        Further ones for GCC itself.
+
+    Attributes
+    ----------
+    file
+        Name of its file.
     """
 
     def __init__(
@@ -152,18 +152,16 @@ class Library:
         options: tuple[str, ...],
         gnu_options: tuple[str, ...] = (),
     ) -> None:
-        depends = hashlib.sha256("\n".join((name, *options, *gnu_options)).encode()).hexdigest()[
-            :40
-        ]
-        self.file = f"libmagshell_{depends}.so"
+        inputs = "\n".join((name, *options, *gnu_options))
+        self.file = f"libmagshell_{hashlib.sha256(inputs.encode()).hexdigest()[:40]}.so"
         self._source, self._options, self._gnu_options = source, options, gnu_options
-        self._work: Future[Path] | None = None
+        self._compilation: Future[Path] | None = None
         self._lock: IO[str] | None = None
-        self._kept = kept_file(self.file)
+        self._path = cached_file(self.file)
 
     @property
-    def there(self) -> bool:
-        """Whether it can be loaded.
+    def is_compiled(self) -> bool:
+        """Whether its file can be loaded.
 
         Raises
         ------
@@ -172,63 +170,63 @@ class Library:
         CalledProcessError
             If the compiler has failed.
         """
-        if not self._kept and self._work and self._work.done():
-            self._kept = self._work.result()
-        elif not self._kept and not self._work:
-            self._kept = kept_file(self.file)
-        return self._kept is not None
+        if not self._path and self._compilation and self._compilation.done():
+            self._path = self._compilation.result()
+        elif not self._path and not self._compilation:
+            self._path = cached_file(self.file)
+        return self._path is not None
 
     @property
-    def work(self) -> "Future[Path] | None":
+    def running_compilation(self) -> "Future[Path] | None":
         """The compilation by this process, while it lasts."""
-        return self._work if self._work and not self._work.done() else None
+        compilation = self._compilation
+        return compilation if compilation and not compilation.done() else None
 
     def start(self) -> None:
-        """Have it compiled, unless it is there or another process does so; returns at once.
+        """Start its compilation, unless it is compiled or another process compiles it.
 
         Raises
         ------
         RuntimeError
             If the folder of the kernels cannot be written.
         """
-        if self.there or self._work or not self._take_lock():
+        if self.is_compiled or self._compilation or not self._take_lock():
             return
         try:
-            if not self.there:  # another process may have made it meanwhile
-                self._work = _pool().submit(self._compile, self._source())
+            if not self.is_compiled:  # another process may have compiled it meanwhile
+                self._compilation = _pool().submit(self._compile, self._source())
         finally:
-            if not self._work:
+            if not self._compilation:
                 self._release_lock()
 
     def path(self) -> Path:
-        """Its file, once it is there."""
-        side_by_side([self])
-        assert self._kept
-        return self._kept
+        """Return its file; compile it, or wait for another process that does, if need be."""
+        compile_libraries([self])
+        assert self._path
+        return self._path
 
     def cancel(self) -> None:
-        """Give it up if no compiler runs yet."""
-        if self._work and self._work.cancel():
-            self._work = None
+        """Cancel its compilation if no compiler runs yet."""
+        if self._compilation and self._compilation.cancel():
+            self._compilation = None
             self._release_lock()
 
     def _compile(self, source: str) -> Path:
         try:
-            options = (
-                *self._options,
-                *(self._gnu_options if self._gnu_options and is_gnu(c_compiler()) else ()),
-            )
-            _compile(source, options, file := kernel_cache() / self.file)
+            options, file = self._options, cache_folder() / self.file
+            if self._gnu_options and is_gnu(c_compiler()):
+                options = (*options, *self._gnu_options)
+            _compile(source, options, file)
             return file
         finally:
             self._release_lock()
 
     def _take_lock(self) -> bool:
-        """Lock out other processes; False if one has the lock.
+        """Lock out other processes; return False if one has the lock.
 
-        Where files cannot be locked, go on.
+        Where files cannot be locked, return True.
         """
-        folder = kernel_cache()
+        folder = cache_folder()
         with written_into(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = (folder / f"{self.file}.lock").open("w")
@@ -247,18 +245,18 @@ class Library:
         Path(self._lock.name).unlink(missing_ok=True)
 
 
-def side_by_side(
+def compile_libraries(
     libraries: Sequence[Library], tell: Callable[[int], None] = lambda _: None
 ) -> None:
-    """Compile libraries in their order, several at once, and return when all are there.
+    """Compile libraries in their order, several in parallel, and return when all are compiled.
 
-    While compilers run, the code of one more is made; no more than that, so that other ranks find
-    work.
+    While compilers run, the code of one more is generated; no more than that, so that other ranks
+    find work.
 
     Parameters
     ----------
     tell
-        Called again and again with the number of those that are there.
+        Called again and again with the number of those that are compiled.
 
     Raises
     ------
@@ -267,57 +265,60 @@ def side_by_side(
     RuntimeError
         If the folder of the kernels cannot be written.
     CalledProcessError
-        If the compiler fails. Libraries that have not begun are given up.
+        If the compiler fails. Compilations that have not begun are cancelled.
     """
     try:
-        while missing := [each for each in libraries if not each.there]:
+        while missing := [library for library in libraries if not library.is_compiled]:
             tell(len(libraries) - len(missing))
-            for each in missing:
-                if not each.work and len(_running(missing)) <= cores():
-                    each.start()
-                    tell(sum(each.there for each in libraries))
+            for library in missing:
+                if not library.running_compilation and len(_running(missing)) <= cores():
+                    library.start()
+                    tell(sum(library.is_compiled for library in libraries))
             if running := _running(missing):
-                wait(running, RENEWED, FIRST_COMPLETED)
+                wait(running, PROGRESS_SECONDS, FIRST_COMPLETED)
             else:
-                time.sleep(POLL)
+                time.sleep(POLL_SECONDS)
         tell(len(libraries))
     except BaseException:
-        for each in libraries:
-            each.cancel()
+        for library in libraries:
+            library.cancel()
         raise
 
 
 def _running(libraries: Iterable[Library]) -> list["Future[Path]"]:
-    return [each.work for each in libraries if each.work]
+    compilations = [library.running_compilation for library in libraries]
+    return [compilation for compilation in compilations if compilation]
 
 
 @cache
 def cores() -> int:
-    """How many compilers this process runs at once: ranks share the cores that they see."""
-    seen = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, seen // int(world().size))
+    """Return how many compilers this process runs at once: ranks share the cores that they see."""
+    if hasattr(os, "sched_getaffinity"):
+        visible = len(os.sched_getaffinity(0))
+    else:
+        visible = os.cpu_count() or 1
+    return max(1, visible // int(world().size))
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """Threads that wait for compilers."""
+    """Return the pool of threads that wait for compilers."""
     return ThreadPoolExecutor(cores(), "compiler")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads stay behind
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has no threads
 
 
 @cache
 def processor_options() -> tuple[str, ...]:
-    """Options for the vectors that this processor has."""
+    """Return compiler options for the vectors that this processor has."""
     if platform.machine() != "x86_64":
         return ()
     with suppress(OSError):
-        flags = re.search(
-            r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE
-        )
-        if flags and {*VECTORS} <= {*flags[1].split()}:
-            return tuple(f"-m{vector}" for vector in VECTORS)
+        cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        flags = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
+        if flags and {*VECTOR_FLAGS} <= {*flags[1].split()}:
+            return tuple(f"-m{vector}" for vector in VECTOR_FLAGS)
     return ()
 
 
@@ -331,48 +332,47 @@ def _compiler_run(
     """
     to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
     to_library = [*compiler, "-shared", f"{code}.o", "-o", str(library), "-lm"]
-    compiled = subprocess.run(
-        to_object, capture_output=True, text=True, errors="replace", check=False
-    )
+    compiled = _run(to_object)
     if compiled.returncode:
         return compiled
-    linked = subprocess.run(
-        to_library, capture_output=True, text=True, errors="replace", check=False
-    )
+    linked = _run(to_library)
     linked.stderr = compiled.stderr + linked.stderr
     return linked
 
 
-def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
-    """Compile a library under a name of its own first, so that others find a whole one or none.
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
 
-    Whoever has its lock removes what killed processes have left of it.
+
+def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
+    """Compile a library in a scratch folder, then move it: others find it complete or not at all.
+
+    This process has its lock, so it removes scratch folders that killed processes have left.
     """
     compiler = c_compiler()
-    for left in file.parent.glob(f"{file.stem}????????/"):
-        shutil.rmtree(left, ignore_errors=True)
+    for abandoned in file.parent.glob(f"{file.stem}????????/"):
+        shutil.rmtree(abandoned, ignore_errors=True)
     with (
         written_into(file.parent),
         tempfile.TemporaryDirectory(dir=file.parent, prefix=file.stem) as scratch,
     ):
-        code, made = Path(scratch) / "kernel.c", Path(scratch) / file.name
+        code, library = Path(scratch) / "kernel.c", Path(scratch) / file.name
         code.write_text(source, encoding="utf-8")
-        done = _compiler_run(compiler, options, code, made)
-        print(done.stderr, end="", file=sys.stderr)
-        if done.returncode and (
-            full := FULL.search(done.stderr)
-        ):  # of its own, or of the folder for temporary files
-            raise OSError(0, full[0])
-        if done.returncode:
+        process = _compiler_run(compiler, options, code, library)
+        print(process.stderr, end="", file=sys.stderr)
+        if process.returncode:
+            # The disk of the cache may be full, or that of temporary files.
+            if full_disk := FULL_DISK.search(process.stderr):
+                raise OSError(0, full_disk[0])
             refuse_unusable()
-        done.check_returncode()
-        made.chmod(0o755)  # whatever the umask: what others may write is not trusted
-        made.replace(file)
+        process.check_returncode()
+        library.chmod(0o755)  # whatever the umask: a file that others may write is not trusted
+        library.replace(file)
 
 
 @contextmanager
 def written_into(folder: Path) -> Iterator[None]:
-    """Turn an error of the disk into one that names the cache."""
+    """Turn an error of the disk within `with` into one that names the cache."""
     try:
         yield
     except OSError as e:

@@ -1,4 +1,4 @@
-"""The package's C code, compiled once into the folder of the kernels."""
+"""The package's own C code, compiled once into the folder of the kernels."""
 
 from pathlib import Path
 from typing import Any
@@ -7,13 +7,13 @@ import cffi
 from mpi4py import MPI
 
 from magshell_fenicsx.platform.compiler import Library
-from magshell_fenicsx.platform.processes import raised_by_all
+from magshell_fenicsx.platform.processes import raise_on_all_ranks
 
 OPTIONS = ("-O3", "-g0", "-DNDEBUG", "-fno-strict-overflow", "-std=gnu17")
-GNU_OPTIONS = (
-    "-fschedule-insns",
-    "-fsched-pressure",
-)  # of GCC alone: sums over pairs are a sixth faster
+# For GCC alone: sums over pairs are a sixth faster.
+GNU_OPTIONS = ("-fschedule-insns", "-fsched-pressure")
+
+# The begin of each file: FAST functions are compiled for several processors.
 PRELUDE = """#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -24,12 +24,20 @@ PRELUDE = """#include <math.h>
 #define FAST
 #endif
 #define INLINE static inline __attribute__((always_inline))
-"""  # of each file: FAST functions are compiled for several processors
+"""
 
 
-def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tuple[Any, Any]:
-    """Return the cffi objects (ffi, lib) of a C file and of what is `behind` it, compiled on first
-    use. Collective.
+def load_native(
+    source: Path, declarations: str, comm: MPI.Comm, *further_sources: Path
+) -> tuple[Any, Any]:
+    """Return the cffi objects (ffi, lib) of C files, compiled on first use. Collective.
+
+    Parameters
+    ----------
+    declarations
+        Of their functions.
+    further_sources
+        Files that are compiled together with the first one, after it.
 
     Raises
     ------
@@ -38,12 +46,11 @@ def native(source: Path, declarations: str, comm: MPI.Comm, *behind: Path) -> tu
     RuntimeError
         On all ranks, if the folder of the kernels cannot be written.
     """
-    texts = (
-        f'#line 1 "{each.name}"\n{each.read_text(encoding="utf-8")}\n' for each in (source, *behind)
-    )
-    text = PRELUDE + "".join(texts)
+    text = PRELUDE
+    for file in (source, *further_sources):
+        text += f'#line 1 "{file.name}"\n{file.read_text(encoding="utf-8")}\n'
     library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
-    raised_by_all(comm, library.path)
+    raise_on_all_ranks(comm, library.path)
     ffi = cffi.FFI()
     ffi.cdef(declarations)
     return ffi, ffi.dlopen(str(library.path()))

@@ -1,7 +1,7 @@
-"""Work of rank 0 for all ranks; a command in a separate process, with its wall time, CPU time and
-peak memory.
+"""Ranks and processes: work of rank 0 for all ranks, and the cost of a command.
 
-If the work of rank 0 fails, all ranks fail together.
+If the work of rank 0 fails, all ranks fail together. A command is run in a separate process, and
+its wall time, CPU time and peak memory are measured.
 
 `python3 -m magshell_fenicsx.platform.processes FOLDER MODULE ARGUMENT...` runs a module as `python3
 -m` does, and writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM.
@@ -24,30 +24,30 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from magshell_fenicsx.platform.terminal import LAUNCHERS
+from magshell_fenicsx.platform.terminal import LAUNCHER_VARIABLES
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Alone:
-    """What a process without others has of a communicator, before it needs MPI."""
+class SerialComm:
+    """A communicator of one process, before it needs MPI."""
 
     rank: int = 0
     size: int = 1
 
 
 def world() -> Any:
-    """All ranks.
+    """Return the communicator of all ranks.
 
-    A process that no launcher started has `Alone` until MPI is imported, which takes 0.1 s.
+    A process that no launcher started gets a `SerialComm` until MPI is imported, which takes 0.1 s.
     """
-    if not LAUNCHERS & os.environ.keys() and "mpi4py.MPI" not in sys.modules:
-        return Alone()
+    if not LAUNCHER_VARIABLES & os.environ.keys() and "mpi4py.MPI" not in sys.modules:
+        return SerialComm()
     from mpi4py import MPI
 
     return MPI.COMM_WORLD
@@ -78,34 +78,33 @@ class Usage:
 
     @property
     def last_error(self) -> str:
-        """The last line of its errors; empty without."""
+        """The last line of standard error; empty without."""
         return (self.errors.strip().splitlines() or [""])[-1]
 
 
 @cache
-def mpirun_itself() -> str | None:
-    """The launcher of ranks: that beside this Python, as PyPI's MPI has it, or that of the system;
-    None without.
+def mpirun_path() -> str | None:
+    """Return the path of the launcher of ranks; None without.
+
+    One in the folder of this Python, where PyPI's MPI has it, is preferred to that of the system.
     """
-    beside = Path(sys.executable).parent
-    return shutil.which("mpirun", path=f"{beside}{os.pathsep}{os.environ.get('PATH', os.defpath)}")
+    python_folder = Path(sys.executable).parent
+    folders = f"{python_folder}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+    return shutil.which("mpirun", path=folders)
 
 
 @cache
-def mpirun(ranks: int) -> tuple[str, ...]:
-    """The words that start so many ranks, even if there are fewer cores; Open MPI must be told
-    that.
+def mpirun_command(ranks: int) -> tuple[str, ...]:
+    """Return the command that starts so many ranks, even if there are fewer cores.
+
+    Open MPI needs an option for that.
     """
-    launcher = mpirun_itself() or "mpirun"
-    about = subprocess.run(
+    launcher = mpirun_path() or "mpirun"
+    version = subprocess.run(
         [launcher, "--version"], capture_output=True, text=True, check=False
     ).stdout
-    return (
-        launcher,
-        *(("--map-by", ":OVERSUBSCRIBE") if "Open MPI" in about else ()),
-        "-n",
-        str(ranks),
-    )
+    options = ("--map-by", ":OVERSUBSCRIBE") if "Open MPI" in version else ()
+    return launcher, *options, "-n", str(ranks)
 
 
 def measure(
@@ -123,7 +122,7 @@ def measure(
     environment
         Additional environment variables.
     """
-    launcher = mpirun(ranks) if ranks > 1 else []
+    launcher = mpirun_command(ranks) if ranks > 1 else []
     with TemporaryDirectory() as scratch:
         command = [
             *launcher,
@@ -180,7 +179,7 @@ if __name__ == "__main__":
     main()
 
 
-def from_first(comm: "MPI.Comm", do: Callable[[], T]) -> T:
+def on_first_rank(comm: "MPI.Comm", do: Callable[[], Result]) -> Result:
     """Call `do` on rank 0 and return its result on every rank; collective.
 
     Raises
@@ -199,14 +198,14 @@ def from_first(comm: "MPI.Comm", do: Callable[[], T]) -> T:
     sent = comm.bcast(sent)
     if failure:
         raise failure  # with its traceback
-    result: T
+    result: Result
     result, failure = pickle.loads(sent)
     if failure:
         raise failure
     return result
 
 
-def raised_by_all(comm: "MPI.Comm", do: Callable[[], object]) -> None:
+def raise_on_all_ranks(comm: "MPI.Comm", do: Callable[[], object]) -> None:
     """Call `do` on every rank; collective.
 
     Raises
@@ -214,20 +213,20 @@ def raised_by_all(comm: "MPI.Comm", do: Callable[[], object]) -> None:
     Exception
         On every rank, the exception of the first rank where `do` raises one; there its own.
     """
-    own = None
+    failure = None
     try:
         do()
     except Exception as e:
         if comm.size == 1:
             raise
-        own = e
-    for sent in comm.allgather(_pickled(own) if own else b"") if comm.size > 1 else ():
+        failure = e
+    for sent in comm.allgather(_pickled(failure) if failure else b"") if comm.size > 1 else ():
         if sent:
-            raise own or pickle.loads(sent)[1]
+            raise failure or pickle.loads(sent)[1]
 
 
 def _pickled(e: Exception) -> bytes:
-    """An error for the other ranks: the same one if it can be pickled."""
+    """Return an error for the other ranks: the same one if it can be pickled."""
     try:
         sent = pickle.dumps((None, e))
         pickle.loads(sent)

@@ -11,14 +11,18 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 Say = Callable[[str], None]
-ERASED = "\r\x1b[K"
-ROOM = 3  # columns for the ^C of an interrupt; a full line would wrap and could not be erased
-COLUMNS = 79  # of a line that stays, in the narrowest usual terminal
-EACH = 30.0  # seconds without a line after which a pipe gets one
-LOOKS = 0.1  # of that, between two looks whether it is time
-lost: list[str] = []  # why standard output is not written
-# mpirun gives every rank a terminal, even if its own output is a file
-LAUNCHERS = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
+ERASE_LINE = "\r\x1b[K"
+
+# For the ^C of an interrupt: a full line would wrap and could not be erased.
+RESERVED_COLUMNS = 3
+
+LINE_COLUMNS = 79  # of a line that stays, in the narrowest usual terminal
+STATUS_SECONDS = 30.0  # without a line, after which a pipe gets one
+POLL_FRACTION = 0.1  # of that, between two checks whether it is time
+output_failures: list[str] = []  # why standard output is not written
+
+# Environment variables of launchers: mpirun gives every rank a terminal, even if its own output is a file
+LAUNCHER_VARIABLES = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
 
 
 def print_line(line: str) -> None:
@@ -36,17 +40,22 @@ def write(text: str) -> None:
     except BrokenPipeError:
         raise
     except OSError as e:
-        lost.append(f"standard output cannot be written: {e.strerror}")
+        output_failures.append(f"standard output cannot be written: {e.strerror}")
         with suppress(OSError, ValueError):  # what it has buffered would fail again at the end
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)
-            print(f"warning: {lost[-1]}; nothing more is printed", file=sys.stderr, flush=True)
+            print(
+                f"warning: {output_failures[-1]}; nothing more is printed",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 def open_standard_streams() -> None:
-    """Give the process those of the descriptors 0 to 2 that its parent has closed: files would take
-    their numbers.
+    """Open those of the descriptors 0 to 2 that the parent process has closed.
+
+    Otherwise files would take their numbers.
     """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
@@ -56,11 +65,14 @@ def open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
-def plain(ranks: int) -> bool:
-    """Whether no line can be rewritten: standard output is no terminal, or there are several ranks."""
+def is_plain_output(ranks: int) -> bool:
+    """Return whether no line can be rewritten.
+
+    Standard output is then no terminal, or there are several ranks.
+    """
     return (
         ranks > 1
-        or bool(LAUNCHERS & os.environ.keys())
+        or bool(LAUNCHER_VARIABLES & os.environ.keys())
         or not sys.stdout.isatty()
         or os.environ.get("TERM") == "dumb"
     )
@@ -68,42 +80,47 @@ def plain(ranks: int) -> bool:
 
 @contextmanager
 def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
-    """Two functions: the first prints a line, the second rewrites the status line.
+    """Yield two functions: the first prints a line, the second rewrites the status line.
 
     If standard output is no terminal, or there are several ranks, the second prints a line where
-    EACH seconds have passed without one, and again after as many more. The status line is erased
+    STATUS_SECONDS have passed without one, and again after as many more. The status line is erased
     after `with`, and also when SIGTERM ends the process.
     """
-    if plain(ranks):
-        yield from _plain(say)
+    if is_plain_output(ranks):
+        yield from _plain_output(say)
         return
     foot = ""
 
     def stay(line: str) -> None:
-        write(f"{ERASED}{line}\n{foot}")
+        write(f"{ERASE_LINE}{line}\n{foot}")
 
     def rewrite(line: str) -> None:
         nonlocal foot
-        foot = fitting(line.split("  "), max(0, shutil.get_terminal_size().columns - ROOM))
-        write(f"{ERASED}{foot}")
+        foot = fit_to_columns(
+            line.split("  "), max(0, shutil.get_terminal_size().columns - RESERVED_COLUMNS)
+        )
+        write(f"{ERASE_LINE}{foot}")
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(sys.stdout.fileno(), ERASED.encode())  # the stream may be in use
-        signal.signal(number, before)
+        os.write(sys.stdout.fileno(), ERASE_LINE.encode())  # the stream may be in use
+        signal.signal(number, previous_handler)
         signal.raise_signal(number)
 
-    before = signal.signal(signal.SIGTERM, end)
+    previous_handler = signal.signal(signal.SIGTERM, end)
     try:
         yield stay, rewrite
     finally:
-        signal.signal(signal.SIGTERM, before)
-        write(ERASED)
+        signal.signal(signal.SIGTERM, previous_handler)
+        write(ERASE_LINE)
 
 
-def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
-    """Both functions print lines, the second seldom; the last status is repeated while nothing else
-    is said."""
-    last, status, lock, ended = time.monotonic(), ("", 0.0), threading.Lock(), threading.Event()
+def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
+    """Yield two functions that print lines, the second of them seldom.
+
+    The last status is repeated while nothing else is printed.
+    """
+    last, status = time.monotonic(), ("", 0.0)
+    lock, ended = threading.Lock(), threading.Event()
 
     def stay(line: str) -> None:
         nonlocal last
@@ -113,16 +130,16 @@ def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
 
     def seldom(line: str) -> None:
         nonlocal status
-        status = line, (now := time.monotonic())
-        if now - last >= EACH:
+        status = line, (time_now := time.monotonic())
+        if time_now - last >= STATUS_SECONDS:
             stay(line)
 
     def repeat() -> None:
         with suppress(BrokenPipeError):  # which ends the program where it prints next
-            while not ended.wait(LOOKS * EACH):
-                (line, told), now = status, time.monotonic()
-                if line and now - last >= (1 - LOOKS) * EACH:
-                    stay(f"{line}  (for {now - told:.0f} s)")
+            while not ended.wait(POLL_FRACTION * STATUS_SECONDS):
+                (line, status_time), time_now = status, time.monotonic()
+                if line and time_now - last >= (1 - POLL_FRACTION) * STATUS_SECONDS:
+                    stay(f"{line}  (for {time_now - status_time:.0f} s)")
 
     repeating = threading.Thread(target=repeat, daemon=True)
     repeating.start()
@@ -133,9 +150,10 @@ def _plain(say: Say) -> Iterator[tuple[Say, Say]]:
         repeating.join()
 
 
-def fitting(parts: Sequence[str], columns: int) -> str:
-    """The first parts of a line that fit, two spaces between them; none is cut but a first one that
-    is too long.
+def fit_to_columns(parts: Sequence[str], columns: int) -> str:
+    """Return the first parts of a line that fit, two spaces between them.
+
+    Only a first part that is too long is cut.
 
     Examples
     --------

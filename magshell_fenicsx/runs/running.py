@@ -30,7 +30,7 @@ from magshell_fenicsx.output.store.folder import DiskError, by_first, given_fold
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform.environment import fast_blas
-from magshell_fenicsx.platform.terminal import COLUMNS, fitting, plain
+from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -178,7 +178,7 @@ def run(
     listened = tell is not None
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     with (
-        reporting_progress_to(_of_kernels(say, tell, start, apart=plain(comm.size)))
+        reporting_progress_to(_of_kernels(say, tell, start, apart=is_plain_output(comm.size)))
         if listened
         else nullcontext()
     ):
@@ -488,8 +488,8 @@ def _line(row: Row) -> str:
         *(_value(n, row, formats[n]) for n in loads),
         *at_pole,
     ]
-    return fitting(
-        [f"{row['point']:4d} {row['label']:>11}", *parts, f"it {row['iterations']}"], COLUMNS
+    return fit_to_columns(
+        [f"{row['point']:4d} {row['label']:>11}", *parts, f"it {row['iterations']}"], LINE_COLUMNS
     )
 
 

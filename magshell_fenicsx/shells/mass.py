@@ -17,7 +17,7 @@ from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.models import carriers
@@ -119,7 +119,7 @@ Rates = Mapping[str, tuple[float, float]]  # of each motion: first and second de
 
 
 class Ground:
-    """Supports that move in time; a `continuation.transient.Ground`.
+    """Supports that move in time; a `continuation.motion.MovingSupports`.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class Ground:
         pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
         return direct + self._sum(product * self._moving.bend(mu, a, b) for a, b, product in pairs)
 
-    def along(self, mu: Amplitudes, name: str) -> Vector:
+    def displacement_rate(self, mu: Amplitudes, name: str) -> Vector:
         """dE/dmu of a motion."""
         return self._sum([self._moving.rate(mu, name)])
 
@@ -178,9 +178,9 @@ class Ground:
         self._mass.mult(self._x, self._y)
         return np.array(self._y.array_r)
 
-    def held(self, x: Vector) -> Vector:
+    def zeroed_at_supports(self, x: Vector) -> Vector:
         """With zeros at supports."""
-        return self._system.held(x)
+        return self._system.zero_at_supports(x)
 
     def _sum(self, parts: Iterable[Vector]) -> Vector:
         whole = np.sum([np.zeros(len(self._system.u.x.array)), *parts], axis=0)

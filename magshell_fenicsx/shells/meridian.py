@@ -14,10 +14,15 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.kernels import KernelLog, itself
-from magshell_fenicsx.assembly.moving import Lid, Pressed
-from magshell_fenicsx.assembly.parameters import Growing, Parameter, Settable, make_parameters
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.free_parameters import (
+    FreeParameter,
+    PlacementAmplitudes,
+    SettableNumber,
+    make_parameters,
+)
+from magshell_fenicsx.assembly.kernels import KernelLog, underived
+from magshell_fenicsx.assembly.prescribed_motion import EdgePressure, Lid
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
@@ -80,7 +85,7 @@ class Probe:
     def at(s: float, azimuth: float, r0: fem.Function) -> "Probe":
         """For a parameter of the meridian with the placement `r0`."""
         V = r0.function_space
-        ends = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0]
+        ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
         local = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
         values, slopes = V.element.basix_element.tabulate(1, local)[:, 0, :, 0]
@@ -175,7 +180,7 @@ class MeridianModel(Thin):
         shapes = {
             name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()
         }
-        self.growing = Growing(self.r0, shapes, material.h) if shapes else None
+        self.growing = PlacementAmplitudes(self.r0, shapes, material.h) if shapes else None
         self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
         self.made_of: fem.Function | None = None
         if material.shells:
@@ -185,7 +190,7 @@ class MeridianModel(Thin):
         if loads.natural:
             loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
             shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
-        carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
+        carrier = on_meridian(self.r0, self.growing and self.growing.initial_placement)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
         folded = meridian.largest_fold(self.r0) > FOLD
         creases = Creases.of(loads.joints, meridian) if loads.joints else None
@@ -241,7 +246,7 @@ class MeridianModel(Thin):
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
-        parameters: dict[str, Parameter] = {
+        parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free, terms, self.u, self.kernels)
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
@@ -266,7 +271,7 @@ class MeridianModel(Thin):
             from magshell_fenicsx.shells.tee import tees_of_meridian
 
             self.tees = tees_of_meridian(self)
-        begun = self.kernels.begin("volume energy", itself(volume))
+        begun = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
             [*terms, *self.touchings, *self.tees],
@@ -301,7 +306,7 @@ class MeridianModel(Thin):
             ]
         return values
 
-    def with_numbers(self, of: "MeridianModel", numbers: Settable, value: float) -> "MeridianModel":
+    def with_numbers(self, of: "MeridianModel", numbers: SettableNumber, value: float) -> "MeridianModel":
         """The same model with the numbers of another one, which all evaluations put in place by
         that value.
         """
@@ -351,7 +356,7 @@ class MeridianModel(Thin):
             return unresisted(waves, held, lambda: self.waves.tangent(state, m), comm)
 
         tangent = partial(self.system.tangent, state.u, state.mu)
-        along = unresisted(motions.along, self.system.held, tangent, comm)
+        along = unresisted(motions.along, self.system.zero_at_supports, tangent, comm)
         return RigidMotions(
             along, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1)
         )
@@ -374,11 +379,11 @@ class MeridianModel(Thin):
         """See `Observed`."""
         return self._seen[point].rows(self.system.size)
 
-    def _pressed(self) -> Pressed:
+    def _pressed(self) -> EdgePressure:
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
-            Lid.over_ring(
+            Lid.disc(
                 self.meridian.section(np.array([s]))[0, 0],
                 motions,
                 last=(side > 0) != self.meridian.begins(name),
@@ -387,7 +392,7 @@ class MeridianModel(Thin):
             if (side := side_of(name, self.loads.pressed))
             and (motions := motions_of(self.loads, name))
         ]
-        return Pressed(PRESSURE, self.material.classical_pressure / self.material.h, lids)
+        return EdgePressure(PRESSURE, self.material.classical_pressure / self.material.h, lids)
 
 
 def _with_zeros(unknowns: NDArray[np.int32], v: Vector) -> Vector:

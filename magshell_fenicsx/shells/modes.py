@@ -17,8 +17,8 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.sliding import Projection
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.oblique_supports import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes

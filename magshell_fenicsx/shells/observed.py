@@ -10,9 +10,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.free_parameters import PlacementAmplitudes
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameters import Growing
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
@@ -98,7 +98,7 @@ class Observed:
     touchings: "Sequence[Touching] | Sequence[MeridianTouching]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
-    growing: Growing | None = None
+    growing: PlacementAmplitudes | None = None
     axes: ClassVar[list[int]] = [0, 1, 2]
     thickness: fem.Function | None = None
     midsurface: Midsurface | None = None
@@ -173,9 +173,9 @@ class Observed:
     def volume_change(self, u: Vector, mu: Amplitudes | None = None) -> float:
         """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
         moving = self.system.moving
-        lids = moving.pressed.swept(mu) if mu and moving and moving.pressed else 0.0
+        lids = moving.edge_pressure.swept_volume(mu) if mu and moving and moving.edge_pressure else 0.0
         return self.multiplicity * (
-            self.system.at(State(u, dict(mu or {}))).integral(self._volume) + lids
+            self.system.at_state(State(u, dict(mu or {}))).integral(self._volume) + lids
         )
 
     def deflection(self, u: Vector, point: str) -> float:
@@ -199,9 +199,9 @@ class Observed:
     def region(self, state: State, approach: str) -> Region:
         """Where a body touches."""
         pressing, forms = self.contacts[approach]
-        at = self.system.at(state)
+        at = self.system.at_state(state)
         pressure, moment = (at.integral(forms[name]) for name in ("pressure", "radius"))
-        return at.of(
+        return at.evaluate(
             lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0)
         )
 
@@ -217,7 +217,7 @@ class Observed:
                 sum((*each, *(touching.of_cells()[0] for touching in self.touchings)))
             )
 
-        return self.system.at(state).of(present)
+        return self.system.at_state(state).evaluate(present)
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
         """Whether the mean in each local cell is the pressure of a contact there, see `Pressing`."""
@@ -228,7 +228,7 @@ class Observed:
             of_shells = [touching.of_cells()[2] for touching in self.touchings]
             return np.asarray(np.any([*each, *of_shells], axis=0))
 
-        return self.system.at(state).of(present)
+        return self.system.at_state(state).evaluate(present)
 
     def cell_gaps(self, state: State) -> Array | None:
         """The least gap over R in each local cell between parts of the shell, see `Touching`; None
@@ -236,7 +236,7 @@ class Observed:
         """
         if not self.touchings:
             return None
-        gaps = self.system.at(state).of(
+        gaps = self.system.at_state(state).evaluate(
             lambda: [touching.of_cells()[1] for touching in self.touchings]
         )
         return np.asarray(np.min(gaps, axis=0))
@@ -251,7 +251,7 @@ class Observed:
         if not size:
             return self.deflection(u, "pole")
         load = next(term for term in self.system.terms if term.name == name)
-        energy = self.system.at(State(u, {})).of(load.energy)
+        energy = self.system.at_state(State(u, {})).evaluate(load.energy)
         return -float(self.system.comm.allreduce(energy)) / size
 
     @property

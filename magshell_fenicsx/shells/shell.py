@@ -13,14 +13,20 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.free_parameters import FreeParameter, PlacementAmplitudes
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.moving import Curve, triangle_sides
-from magshell_fenicsx.assembly.parameters import Growing, Parameter
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.sliding import Constraint, held_along
+from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
+from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, triangle_sides
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector
+from magshell_fenicsx.mesh.mirror import (
+    SECOND_SYMMETRY_EDGE,
+    SYMMETRY_EDGE,
+    Y0_PLANE,
+    Mirror,
+    Sector,
+)
 from magshell_fenicsx.mesh.patch import Deviation, Embedding, MeshError
 from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
@@ -131,7 +137,7 @@ class ShellModel(Thin):
         loads: Loads,
         sigma: float | None = None,
         thickness: Thickness | None = None,
-        mirror: Mirror = Y0,
+        mirror: Mirror = Y0_PLANE,
     ) -> None:
         self._given = material, degree, conditions, loads, sigma, thickness
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
@@ -144,7 +150,7 @@ class ShellModel(Thin):
         self.load_size, self.load_sizes = {}, {}
         sides = {
             name: plane
-            for name, plane in mirror.sides.items()
+            for name, plane in mirror.planes.items()
             if conditions.get(name) == "symmetry"
         }
         self.multiplicity = mirror.copies if sides else 1
@@ -168,13 +174,13 @@ class ShellModel(Thin):
             thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
         self.sigma = default_penalty(degree) if sigma is None else sigma
         for name in [
-            name for name, c in conditions.items() if c == "plane" and not midsurface.read
+            name for name, c in conditions.items() if c == "plane" and not midsurface.from_mesh_file
         ]:
             put_in_plane(self.r0, midsurface.edges[name])
         shapes = {
             name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()
         }
-        self.growing = Growing(self.r0, shapes, material.h) if shapes else None
+        self.growing = PlacementAmplitudes(self.r0, shapes, material.h) if shapes else None
         self.thickness = factor = (
             thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
         )
@@ -191,7 +197,7 @@ class ShellModel(Thin):
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
         folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD
-        carrier = on_surface(self.r0, self.growing and self.growing.drawn)
+        carrier = on_surface(self.r0, self.growing and self.growing.initial_placement)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
         creases = Creases.of(loads.joints, midsurface) if loads.joints else None
         pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
@@ -223,10 +229,10 @@ class ShellModel(Thin):
         for name, side in sides.items():
             planes.append(side)
             where = midsurface.edges[name]
-            edge = "mirror edges" if name == CUT else f"{name} mirror edges"
+            edge = "mirror edges" if name == SYMMETRY_EDGE else f"{name} mirror edges"
             self._mirror_term = factory.term(factory.mirror_edges(where, side.normal, edge))
             terms.append(self._mirror_term)
-            mirrored.append(held_along(V, 1, where, side.normal))
+            mirrored.append(support_along(V, 1, where, side.normal))
         clamped = [
             name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges
         ]
@@ -251,7 +257,7 @@ class ShellModel(Thin):
                     midsurface.edges[name], plane.normal, f"{name} mirror edges"
                 )
                 terms.append(factory.term(mirrored_edges))
-                held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
+                held.append(support_along(V, 1, midsurface.edges[name], plane.normal))
                 on_edge = held_on(V, 1, midsurface.edges[name], components)
                 on_planes[name] = Support.of(on_edge, f"{name} mirror edges", kind="plane")
                 continue
@@ -272,7 +278,7 @@ class ShellModel(Thin):
                 )
             else:
                 conditions_of_part = held_at_vertex(
-                    V, midsurface.points[name], components, midsurface.beside(name)
+                    V, midsurface.points[name], components, midsurface.cells_of_point(name)
                 )
             held += conditions_of_part
             kind: SupportKind = "point" if name in midsurface.points else "part"
@@ -301,7 +307,7 @@ class ShellModel(Thin):
             terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
         terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {
-            name: vertex_normal(self.r0, x, midsurface.beside(name))
+            name: vertex_normal(self.r0, x, midsurface.cells_of_point(name))
             for name, x in midsurface.points.items()
         }
         terms += [self._force(name, force) for name, force in loads.forces.items()]
@@ -325,7 +331,7 @@ class ShellModel(Thin):
             )
             terms += meeting
         self.touchings = meeting
-        if loads.joints or midsurface.feet:
+        if loads.joints or midsurface.t_junctions:
             from magshell_fenicsx.shells.tee import tees
 
             terms += tees(self)
@@ -334,7 +340,7 @@ class ShellModel(Thin):
         if closed:
             in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
             curves = {
-                name: Curve.of(V, side, triangle_sides(), pressed and on_each(pressed))
+                name: EdgeCurve.from_facets(V, side, triangle_sides(), pressed and on_each(pressed))
                 for name, side in open_at.items()
                 if name in in_planes or motions_of(loads, name)
             }
@@ -360,7 +366,7 @@ class ShellModel(Thin):
                 self.growing and term.amplitude == "pressure"
             ):  # whose form measures from the drawn placement
                 term.points = gradients
-        parameters: dict[str, Parameter] = {
+        parameters: dict[str, FreeParameter] = {
             **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
@@ -387,7 +393,7 @@ class ShellModel(Thin):
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(
-            self.kernels.compile("volume energy", volume), midsurface.points, midsurface.beside
+            self.kernels.compile("volume energy", volume), midsurface.points, midsurface.cells_of_point
         )
         if loads.interaction:
             interacting.refuse_near()  # now that all is there which it reads
@@ -404,7 +410,7 @@ class ShellModel(Thin):
             return UnfoldedModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [
-            held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane
+            support_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane_vectors
         ]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
@@ -429,8 +435,8 @@ class ShellModel(Thin):
     def _as_half(self, midsurface: Midsurface) -> "ShellModel":
         """The same shell on the mid-surface of a half."""
         material, degree, conditions, loads, sigma, thickness = self._given
-        conditions = {name: c for name, c in conditions.items() if name != SECOND_CUT}
-        plane = Mirror.upright(self.mirror.azimuth)
+        conditions = {name: c for name, c in conditions.items() if name != SECOND_SYMMETRY_EDGE}
+        plane = Mirror.through_axis(self.mirror.azimuth)
         return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness, plane)
 
     @property
@@ -445,15 +451,15 @@ class ShellModel(Thin):
         """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes,
         ...).
         """
-        return self.midsurface.at(self.V.element.basix_element.points, of)
+        return self.midsurface.evaluate(self.V.element.basix_element.points, of)
 
     def chart(self) -> NDArray[np.float64]:
         """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""
-        return self._at_nodes(self.midsurface.charted(self.V))
+        return self._at_nodes(self.midsurface.chart_coordinates(self.V))
 
     def chart_by_shell(self) -> NDArray[np.float64]:
         """The same, of several shells that have charts in that of each node's shell."""
-        return self._at_nodes(self.midsurface.charted_by_shell(self.V))
+        return self._at_nodes(self.midsurface.chart_coordinates_by_shell(self.V))
 
     def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
         nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
@@ -465,7 +471,7 @@ class ShellModel(Thin):
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
-        beside = self.midsurface.beside(force.point)
+        beside = self.midsurface.cells_of_point(force.point)
         if force.patch:
             entries = patch_entries(
                 self.r0, x, force.patch, inward, self.degree, self.kernels, beside

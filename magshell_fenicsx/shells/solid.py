@@ -16,14 +16,14 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.free_parameters import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.moving import Curve, level_sides
-from magshell_fenicsx.assembly.parameters import Parameter, make_parameters
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.sliding import Constraint, held_along
+from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
+from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, level_sides
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, quadratic
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyMesh, quadratic_space
+from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
@@ -91,12 +91,12 @@ class SolidModel(Observed):
 
     def __init__(
         self,
-        body: Body,
+        body: BodyMesh,
         material: Material,
         law: MooneyRivlin,
         conditions: Mapping[str, Condition],
         loads: Loads,
-        mirror: Mirror = Y0,
+        mirror: Mirror = Y0_PLANE,
     ) -> None:
         magnetic, remanence = (
             field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence)
@@ -106,7 +106,7 @@ class SolidModel(Observed):
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
-        self.V = V = quadratic(body.mesh)
+        self.V = V = quadratic_space(body.mesh)
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
 
@@ -142,7 +142,7 @@ class SolidModel(Observed):
         self._pattern, *areal = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
-        ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
+        ends = {name: facets for name, facets in body.faces.items() if name != OUTER_FACE}
         free_ends, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
         closed = enclosed(loads, free_ends, self.without_potential)
         swept = loads.pressure or closed
@@ -176,7 +176,7 @@ class SolidModel(Observed):
         if closed:
             in_planes = {name for name, c in conditions.items() if c in MIRRORS}
             curves = {
-                name: self._rim(ends[name], MIDDLE if name in hinged else 1.0)
+                name: self._rim(ends[name], MIDSURFACE_HEIGHT if name in hinged else 1.0)
                 for name in ends
                 if name in in_planes or motions_of(loads, name)
             }
@@ -195,7 +195,7 @@ class SolidModel(Observed):
         if self.multiplicity == 1:
             return None
         return AntisymmetricModes(
-            self._system(self._held + self._held_on_mirror(self.mirror.in_plane))
+            self._system(self._held + self._held_on_mirror(self.mirror.in_plane_vectors))
         )
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
@@ -219,13 +219,13 @@ class SolidModel(Observed):
         )
         return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
-    def _rim(self, facets: NDArray[np.int32], height: float) -> Curve:
+    def _rim(self, facets: NDArray[np.int32], height: float) -> EdgeCurve:
         """Where the pressed surface ends on the faces of an end, at a height over the thickness."""
         links = self.body.mesh.topology.connectivity(2, 3)
-        low, high = self.body.between[links.array[links.offsets[facets]]].T
+        low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
         inside = (low < height - ROUNDING) & (height < high + ROUNDING)
         part = (height - low[inside]) / (high - low)[inside]
-        return Curve.of(self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0))
+        return EdgeCurve.from_facets(self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0))
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:
@@ -233,7 +233,7 @@ class SolidModel(Observed):
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [
-            held_along(self.V, 2, facets, along) for facets in self._faces for along in directions
+            support_along(self.V, 2, facets, along) for facets in self._faces for along in directions
         ]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
@@ -244,7 +244,7 @@ class SolidModel(Observed):
                 make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells),
             )
         fast = FastTangent(self.u, self._sites, held, near)
-        parameters: dict[str, Parameter] = {
+        parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free, self._terms, self.u, self.kernels)
         }
         parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
@@ -261,7 +261,7 @@ class SolidModel(Observed):
         )
 
 
-def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
+def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
     """The magnetisation, with a vector for each cell where it is given by patches or by layers.
 
     Raises
@@ -269,7 +269,7 @@ def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
     MeshError
         If the body has no such patch.
     """
-    own = field.on(body.patches, len(body.between))
+    own = field.on(body.patches, len(body.layer_bounds))
     return (
         replace(own, remanent=_layered(field.layers, body))
         if field.layers and not field.patches
@@ -277,12 +277,12 @@ def _in_cells(field: Magnetisation, body: Body) -> Magnetisation:
     )
 
 
-def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:
+def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
     """Layers from the inner face outwards: fractions of the thickness, which end where cells do,
     and vectors.
     """
     ends = np.cumsum([fraction for fraction, _ in layers])
-    middle = body.between.mean(axis=1)
+    middle = body.layer_bounds.mean(axis=1)
     return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])
 
 

@@ -14,13 +14,19 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.batches import POINTS, Batch, Blocks, Contraction, Rule
-from magshell_fenicsx.assembly.following import Follows
+from magshell_fenicsx.assembly.batches import (
+    MAX_BATCH_POINTS,
+    Contraction,
+    EntityBatch,
+    EntityRule,
+    HessianBlocks,
+)
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_hessian
-from magshell_fenicsx.assembly.shape_tables import Table
+from magshell_fenicsx.assembly.memo import Memo
+from magshell_fenicsx.assembly.point_kernels import BlockPairs, PointStorage, point_hessian
+from magshell_fenicsx.assembly.shape_tables import ShapeTable
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.mesh.hexahedra import Body
+from magshell_fenicsx.mesh.hexahedra import BodyMesh
 from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
 from magshell_fenicsx.shells.solid_terms import SolidTerm
 
@@ -48,41 +54,41 @@ class Site:
         The number of this face.
     """
 
-    coupling: Sequence[Batch] = ()
+    coupling: Sequence[EntityBatch] = ()
 
     def __init__(
         self,
         X: fem.Function,
         cells: NDArray[np.int32],
-        rule: Rule,
+        rule: EntityRule,
         terms: Sequence[SolidTerm],
         log: KernelLog,
         facet: int | None = None,
     ) -> None:
         V = X.function_space
         self._dofs = V.dofmap.list
-        size = max(POINTS // len(rule.weights), 1)
+        size = max(MAX_BATCH_POINTS // len(rule.weights), 1)
         parts = [cells[i : i + size] for i in range(0, len(cells), size)]
-        self._batches = [Batch((part,), rule, np.empty((len(part), 0))) for part in parts]
-        self._points = Points(max([1, *(batch.size for batch in self._batches)]))
+        self._batches = [EntityBatch((part,), rule, np.empty((len(part), 0))) for part in parts]
+        self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
         where = terms[0].density.where
         self._geometry = [
             _geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches
         ]
         self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * PARTS)
         self._hessians = {}
-        self._pairs: dict[str, Pairs] = {}
-        self._varying: dict[str, list[tuple[fem.Function, Follows[list[Array]]]]] = {}
+        self._pairs: dict[str, BlockPairs] = {}
+        self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
         for term in terms:
-            pairs = Pairs(tuple(combinations_with_replacement(term.density.parts, 2)))
+            pairs = BlockPairs(tuple(combinations_with_replacement(term.density.parts, 2)))
             z = self._points.field(3 * PARTS) if term.density.work else self._u
             W = self._density(term, z)
             self._pairs[term.name] = pairs
             self._hessians[term.name] = point_hessian(
                 term.name, W, z, PARTS, pairs, log, at_zero=z is not self._u
             )
-        wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.same})
-        self._coupled = Pairs(tuple(wanted))
+        wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.within_side})
+        self._coupled = BlockPairs(tuple(wanted))
         self._contraction = Contraction(rule, self._coupled)
 
     def add(
@@ -100,7 +106,7 @@ class Site:
         for number, (batch, geometry) in enumerate(zip(self._batches, self._geometry, strict=True)):
             fill(self._u, self._jets(batch, u))
             fill(self._g, geometry)
-            blocks = Blocks(batch, self._coupled)
+            blocks = HessianBlocks(batch, self._coupled)
             for name in names:
                 for target, values in self._varying[name]:
                     fill(target, values.latest[number])
@@ -109,9 +115,9 @@ class Site:
                     factors[name],
                     self._pairs[name],
                 )
-            same[batch.cells[0]] += self._contraction.same(blocks, 0)
+            same[batch.cells[0]] += self._contraction.within_side(blocks, 0)
 
-    def _jets(self, batch: Batch, field: Array) -> Array:
+    def _jets(self, batch: EntityBatch, field: Array) -> Array:
         """(cells, points, 4, 3) of a field."""
         return batch.rule.tables[0].jets(field.reshape(-1, 3)[self._dofs[batch.cells[0]]])
 
@@ -147,7 +153,7 @@ class Site:
 
 
 def make_sites(
-    body: Body,
+    body: BodyMesh,
     X: fem.Function,
     terms: Sequence[Term],
     log: KernelLog,
@@ -180,11 +186,11 @@ def make_sites(
     return sites
 
 
-def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> Rule:
-    table = Table(
+def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> EntityRule:
+    table = ShapeTable(
         np.ascontiguousarray(V.element.basix_element.tabulate(1, points)[..., 0].transpose(1, 0, 2))
     )
-    return Rule((points,), (table,), weights)
+    return EntityRule((points,), (table,), weights)
 
 
 def _on_facet(points: Array, facet: int) -> Array:
@@ -194,7 +200,7 @@ def _on_facet(points: Array, facet: int) -> Array:
     return np.asarray(corners[0] + points @ (corners[1:3] - corners[0]))
 
 
-def _cells_at(body: Body, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _cells_at(body: BodyMesh, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Owned cells with one of these facets, and its number in each."""
     topology = body.mesh.topology
     links = topology.connectivity(2, 3)

@@ -11,10 +11,16 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import PointField, at_quadrature
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.terms import Counted, DensityTerm
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, WHOLE, Body, face_measure
+from magshell_fenicsx.assembly.memo import PointField, at_quadrature
+from magshell_fenicsx.assembly.terms import AngleTerm, DensityTerm
+from magshell_fenicsx.mesh.hexahedra import (
+    MIDSURFACE_HEIGHT,
+    OUTER_FACE,
+    QUADRATURE_DEGREE,
+    BodyMesh,
+    face_measure,
+)
 from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -65,7 +71,7 @@ class Density:
     of: Callable[..., Expr]
     parameters: tuple[fem.Constant | fem.Function, ...]
     parts: tuple[int, ...] = GRADIENT
-    degree: int = WHOLE
+    degree: int = QUADRATURE_DEGREE
     where: Literal["body", "outer", "end"] = "body"
     facets: Facets = field(default_factory=lambda: np.empty(0, dtype=np.int32))
     upper: bool = False
@@ -84,7 +90,7 @@ class SolidTerm(DensityTerm[Density]):
     """A term of a solid."""
 
 
-class EndMoment(Counted, SolidTerm):
+class EndMoment(AngleTerm, SolidTerm):
     """A moment on an end."""
 
 
@@ -92,7 +98,7 @@ class EndMoment(Counted, SolidTerm):
 class TermFactory:
     """Makes the terms of one body."""
 
-    body: Body
+    body: BodyMesh
     u: fem.Function
     material: MooneyRivlin
     h: float
@@ -141,7 +147,7 @@ class TermFactory:
         if of.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
-            applied = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
+            applied = AppliedField(of.in_space, X, self.u, QUADRATURE_DEGREE, of.driven)
             self.fields.append(applied)
         if of.soft is None:
             return self.remanent(of, applied)
@@ -203,7 +209,7 @@ class TermFactory:
     ) -> PointField:
         """What is known of a material that saturates, at the points of cells."""
         V = self.u.function_space
-        known, X = PointField(V.mesh, WHOLE, 2 * SIZE), fem.Function(V)
+        known, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
         table, followed = V.element.basix_element.tabulate(1, known.points)[..., 0], (X, self.u)
         before = at_quadrature(n0, known.points)
@@ -338,7 +344,7 @@ class TermFactory:
             )
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
-        return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
+        return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER_FACE])
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points
@@ -358,7 +364,7 @@ class TermFactory:
         length = self.log.compile(
             "end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1)
         )
-        term.count_from(
+        term.set_reference_turn(
             past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
         )
         return term
@@ -382,15 +388,15 @@ class TermFactory:
             (None, None) if potential else (densities.following, densities.following_end)
         )
         of_faces = {
-            "pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)
+            "pressure": Density(of, parameters, ON_FACE, QUADRATURE_DEGREE, "outer", faces[OUTER_FACE], work=work)
         }
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
             links = self.body.mesh.topology.connectivity(2, 3)
-            low, high = self.body.between[links.array[links.offsets[facets]]].T
+            low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
             parts = {
-                "whole": low > MIDDLE - ROUNDING,
-                "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING),
+                "whole": low > MIDSURFACE_HEIGHT - ROUNDING,
+                "upper": (low < MIDSURFACE_HEIGHT - ROUNDING) & (high > MIDSURFACE_HEIGHT + ROUNDING),
             }
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
@@ -399,7 +405,7 @@ class TermFactory:
                         on_end,
                         parameters,
                         VALUE + GRADIENT,
-                        WHOLE,
+                        QUADRATURE_DEGREE,
                         "end",
                         facets_of_part,
                         upper,

@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.connected import CellsOfAll, add_own, whole
-from magshell_fenicsx.assembly.coupled import Entries, pairs_of
+from magshell_fenicsx.assembly.global_mesh import GlobalCells, add_to_owners, global_values
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
 from magshell_fenicsx.assembly.point_kernels import (
     PointKernel,
-    Points,
+    PointStorage,
+    full_hessian,
     point_gradient,
     point_values,
-    whole_hessian,
 )
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError, place_text
@@ -62,7 +62,7 @@ AROUND_E3 = np.array(
 
 class Tie:
     """Points of an edge tied to places of another shell: an `assembly.terms.Term` and
-    `assembly.coupled.Coupled`.
+    `assembly.nonlocal_terms.NonlocalTerm`.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Tie:
             stiffness[:, 0],
         )
         self._turns = bool(joint.rigid or joint.stiffness)
-        self._points = Points(max(len(unknowns), 1))
+        self._points = PointStorage(max(len(unknowns), 1))
         self._present, self._moved = self._points.field(PARTS), self._points.field(PARTS)
         # direction along the edge, sine and cosine of the placement, stiffness
         self._fixed = fixed = self._points.field(5)
@@ -116,12 +116,12 @@ class Tie:
             "angle": point_values("T-junction angle", angle, log),
             "energy": point_values("T-junction energy", W, log),
             "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
-            "hessian": whole_hessian("T-junction Hessian", W, self._moved, log),
+            "hessian": full_hessian("T-junction Hessian", W, self._moved, log),
         }
-        self._placed = self._times(tangents, whole(r0))
+        self._placed = self._times(tangents, global_values(r0))
         values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]
         values[:, :2], values[:, 4] = along, stiffness[:, 1]
-        values[:, 2:4] = self._at("angle", 0 * whole(r0))
+        values[:, 2:4] = self._at("angle", 0 * global_values(r0))
 
     # as a term
 
@@ -132,12 +132,12 @@ class Tie:
         """Its kernels are compiled."""
 
     def energy(self) -> float:
-        u = whole(self._u)
+        u = global_values(self._u)
         tied = float(self._tie @ np.sum(self._times(self._gaps, u) ** 2, axis=1)) / 2
         return tied + (float(self._at("energy", u).sum()) if self._turns else 0.0)
 
     def add_residual(self, b: Array, factor: float) -> None:
-        u = whole(self._u)
+        u = global_values(self._u)
         residual = np.zeros(u.size)
         forces = np.einsum(
             "nc,nck->nk", self._tie[:, None] * self._times(self._gaps, u), self._gaps
@@ -145,7 +145,7 @@ class Tie:
         if self._turns:
             forces += np.einsum("nc,nck->nk", self._at("gradient", u), self._tangents)
         np.add.at(residual, self._unknowns, factor * forces)
-        add_own(b, residual, self._own, self._comm)
+        add_to_owners(b, residual, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
         """None here: what assembles the others adds `entries`."""
@@ -153,20 +153,20 @@ class Tie:
     def entries(self) -> Entries:
         return _entries(self._unknowns, self._second(self._gaps, self._tangents))
 
-    def around(self) -> tuple[Longs, Longs]:
-        """See `Coupled`: those that act on each other always do."""
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """See `NonlocalTerm`: those that act on each other always do."""
         return pairs_of(self._unknowns[:, :: self._size] // self._size)
 
     @property
-    def since(self) -> float:
-        """See `Coupled`."""
+    def pattern_key(self) -> float:
+        """See `NonlocalTerm`."""
         return 0.0
 
     def _second(self, gap: Array, tangents: Array) -> Array:
         """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
         collective.
         """
-        H, u = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True), whole(self._u)
+        H, u = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True), global_values(self._u)
         if self._turns and len(H):
             of_parts = np.zeros((len(H), PARTS, PARTS))
             upper = np.triu_indices(PARTS)
@@ -226,7 +226,7 @@ class Tee(Tie):
         at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
         nodes = surfaces.cells.nodes
         both = np.concatenate([nodes[at.cell], nodes[at.other_cell]], axis=1)
-        of_cells = surfaces.cells.gathered(stiffness)
+        of_cells = surfaces.cells.gather_values(stiffness)
         half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
         on_other = surfaces.shapes(at.Y)
         D = np.zeros((len(at.x), 4, both.shape[1]))
@@ -317,13 +317,13 @@ class Surfaces:
     """
 
     V: fem.FunctionSpace
-    cells: CellsOfAll
+    cells: GlobalCells
     r0: Array
 
     @classmethod
     def of(cls, r0: fem.Function) -> Self:
         """Those of a placement; collective."""
-        return cls(r0.function_space, CellsOfAll.of(r0.function_space), whole(r0))
+        return cls(r0.function_space, GlobalCells.gather(r0.function_space), global_values(r0))
 
     @property
     def _element(self) -> basix.finite_element.FiniteElement:
@@ -343,8 +343,8 @@ class Surfaces:
         on
             Which local cells are of the other shell.
         """
-        first, nodes = self.cells.own.start, self.cells.nodes
-        cells, ends = _sides(self.V, facets, len(self.cells.own))
+        first, nodes = self.cells.own_range.start, self.cells.nodes
+        cells, ends = _sides(self.V, facets, len(self.cells.own_range))
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
         along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
@@ -354,7 +354,7 @@ class Surfaces:
         tangent = np.einsum("na,ank,nki->ni", along, on_edge[1:], self.r0[nodes[cell]])
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
-        shell = np.flatnonzero(self.cells.gathered(on))
+        shell = np.flatnonzero(self.cells.gather_values(on))
         other, Y, apart = self.nearest_places(x, shell)
         beside = self.r0[nodes[first + cells]]
         far = self.nearest_places(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
@@ -462,7 +462,7 @@ class MeridianTee(Tie):
 
 def _ends_of_cells(V: fem.FunctionSpace) -> Array:
     """Return the parameters (cells, 2) of the ends of a meridian's cells."""
-    return np.asarray(V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0])
+    return np.asarray(V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0])
 
 
 def _rings(
@@ -596,7 +596,7 @@ def _tee_joints(
         *tied,
         *(
             (Joint((name, "the sheet"), rigid=True), "shell.file", on)
-            for name, on in surface.feet.items()
+            for name, on in surface.t_junctions.items()
         ),
     ]
 

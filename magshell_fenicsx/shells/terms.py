@@ -10,8 +10,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.carriers import Carrier, Energy, Facets, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
@@ -119,7 +119,7 @@ class EnergyFactory:
         if energy.counted is None:
             return make(ShellTerm, energy.density)
         moment = make(MomentTerm, energy.density)
-        moment.count_from(*energy.counted)
+        moment.set_reference_turn(*energy.counted)
         return moment
 
     def membrane(self) -> Energy:

@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from magshell_fenicsx.assembly.connected import pieces
+from magshell_fenicsx.assembly.global_mesh import component_numbers
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.carriers import on_meridian, on_surface
 from magshell_fenicsx.models.shell.patterns import carried, cells_of
@@ -78,7 +78,7 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
 
     surfaces, V = Surfaces.of(r0), r0.function_space
     nodes = surfaces.cells.nodes
-    part = pieces(V)[V.dofmap.list[: len(nodes), 0]]
+    part = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
     for number in np.unique(part)[1:]:
         own = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)

@@ -21,7 +21,7 @@ Numbers = dict[str, list[Array]]
 
 @dataclass
 class _InPlace:
-    """The numbers in the terms of a model, by a value of what they depend on; a `Settable`."""
+    """The numbers in the terms of a model, by a value of what they depend on; a `SettableNumber`."""
 
     places: Numbers
     of_values: dict[float, Numbers] = field(default_factory=dict)

@@ -88,7 +88,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
     if of in points:
         point, i = points[of]
         by_u = scene.problem.length * (_turned(scene) @ model.probe(point))[i]
-        return Functional(scene.observe(state)[of], system.held(by_u))
+        return Functional(scene.observe(state)[of], system.zero_at_supports(by_u))
     if of in (of_loads := conjugates(scene)):
         name, unit = of_loads[of]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
@@ -99,7 +99,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         by_normal = {"pole": -1 / scene.problem.material.h}
         return Functional(
-            scene.observe(state)["w_pole_over_h"], system.held(by_u), deflections=by_normal
+            scene.observe(state)["w_pole_over_h"], system.zero_at_supports(by_u), deflections=by_normal
         )
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
@@ -175,7 +175,7 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
     way = rotation(problem.azimuth)[:, axis]
     e = force_unit(scene) * weights(scene.model, name, way, problem.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
-    return Functional(value, system.held(system.at(state).stiffness_along(e)), reaction=e)
+    return Functional(value, system.zero_at_supports(system.at_state(state).stiffness_along(e)), reaction=e)
 
 
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
@@ -227,7 +227,7 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     one = fem.Constant(model.V.mesh, 1.0)
     square = FormTerm("misfit", over(ufl.dot(gap, gap)), system.u, log)
     whole = FormTerm("area", over(one), system.u, log)
-    at = system.at(state)
+    at = system.at_state(state)
     area = at.integral(whole.energy_form)
     slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
     value = at.integral(square.energy_form) / area

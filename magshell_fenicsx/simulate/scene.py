@@ -34,7 +34,7 @@ from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.motion import UNHELD
 from magshell_fenicsx.platform.compiler import check_compiler
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
@@ -113,7 +113,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     solid = problem.body
     assert solid
     body = sweep(
-        from_first(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor
+        on_first_rank(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor
     )
     return SolidModel(
         body,
@@ -127,7 +127,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
 
 def build_midsurface(problem: Problem, comm: MPI.Comm) -> Midsurface:
     """Triangulate on rank 0, distribute to all."""
-    return distribute(from_first(comm, problem.triangulated), comm)
+    return distribute(on_first_rank(comm, problem.triangulated), comm)
 
 
 class Scene:
@@ -165,7 +165,7 @@ class Scene:
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
             )
         self.problem, self.comm = problem, comm
-        from_first(comm, check_compiler)
+        on_first_rank(comm, check_compiler)
         self.warnings = [
             said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said
         ]

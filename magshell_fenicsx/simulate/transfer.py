@@ -9,8 +9,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.mesh.patch import Deviated
-from magshell_fenicsx.mesh.shapes import DiscShape, sphere
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding
+from magshell_fenicsx.mesh.shapes import DiscShape, sphere_embedding
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
                 moved[own] = scale * _interpolated(
                     nodes[inside], values[inside], wanted[own], np.inf
                 )
-    return system.held(moved.ravel())
+    return system.zero_at_supports(moved.ravel())
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
@@ -163,7 +163,7 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
-        spherical = isinstance(embedding, Deviated) and embedding.perfect is sphere
+        spherical = isinstance(embedding, DeviatedEmbedding) and embedding.perfect is sphere_embedding
         if (
             not spherical
             or not isinstance(shape, DiscShape)

@@ -26,7 +26,7 @@ from magshell_fenicsx.input.source import CaseError, Source, override, read_sour
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
@@ -189,8 +189,8 @@ def boundary(
         If the disk is full; solved points are kept.
     """
     span = parse_range(over)
-    source = from_first(comm, lambda: read_source(Path(file), settings))
-    begun_at, source = from_first(comm, lambda: start_from(start, source))
+    source = on_first_rank(comm, lambda: read_source(Path(file), settings))
+    begun_at, source = on_first_rank(comm, lambda: start_from(start, source))
     for setting in settings if start else ():
         override(source, setting)
     folder, name = given_folder(out), Path(file).name

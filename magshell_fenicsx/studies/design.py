@@ -25,7 +25,7 @@ from magshell_fenicsx.output.store.durable import write_object, write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
@@ -93,7 +93,7 @@ class Design:
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
-        evaluation = from_first(
+        evaluation = on_first_rank(
             self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine)
         )
         if evaluation is None:
@@ -101,7 +101,7 @@ class Design:
             evaluation = self._new(x, vectors)
             self.seconds.append(time.perf_counter() - begun)
             content = {**self._mine, "evaluation": asdict(evaluation)}
-            from_first(self.comm, lambda: keep(file, content))
+            on_first_rank(self.comm, lambda: keep(file, content))
         self._add(x, evaluation, name)
         return evaluation
 
@@ -210,7 +210,7 @@ def design(
         After everything is written: if a target is not reached, a constraint not kept, or no
         optimum found.
     """
-    source = from_first(comm, lambda: read_source(Path(file), settings))
+    source = on_first_rank(comm, lambda: read_source(Path(file), settings))
     case, folder = made(source), given_folder(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
@@ -337,7 +337,7 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
     wanted, say, file, settings = made.wanted, made.say, made.folder / "best.yaml", list[str]()
 
     def best_case() -> Case:
-        return made.variables.made(from_first(comm, lambda: read_source(file, settings)))
+        return made.variables.made(on_first_rank(comm, lambda: read_source(file, settings)))
 
     case = best_case()
     if case.several or case.shell.geometry != "mesh":

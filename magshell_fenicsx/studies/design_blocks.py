@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.section import si_size
-from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -198,7 +198,7 @@ class Between(Bounded):
 
     controls: Controls
     length: float = 1.0
-    shells: Mapping[str, tuple[Place, float]] = field(default_factory=dict)
+    shells: Mapping[str, tuple[ShellPose, float]] = field(default_factory=dict)
 
     def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
         if not isinstance(by := gradients.get(self.name), FieldGradient):
@@ -231,10 +231,10 @@ class Between(Bounded):
             new = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), new]
 
-    def _own(self, place: Place, ratio: float) -> tuple[Controls, float]:
+    def _own(self, place: ShellPose, ratio: float) -> tuple[Controls, float]:
         """The points in the frame of one of several shells, over its own length."""
         at = self.controls.places
-        x = place.own(np.insert(at, 1, 0.0, axis=1) if self.controls.around else at)
+        x = place.to_shell_frame(np.insert(at, 1, 0.0, axis=1) if self.controls.around else at)
         own = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
         return Controls(own, self.controls.width / place.scale), ratio
 

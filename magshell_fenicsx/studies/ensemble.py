@@ -20,7 +20,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.platform.environment import code_version
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.rows import RowMaker
 from magshell_fenicsx.runs.running import run
@@ -128,7 +128,7 @@ def ensemble(
             make_samples(source, seed, numbers, made, less) for less in sorted({0, delete_weakest})
         ]
 
-    variants = from_first(comm, drawn)
+    variants = on_first_rank(comm, drawn)
     every = {sample.key: sample for variant in variants for sample in variant}
     folder, name = given_folder(out), Path(file).name
     parts = [Path(place) for place in merge]

@@ -19,7 +19,7 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.simulate.readings import Reading
 from magshell_fenicsx.simulate.record import Stopped
@@ -119,7 +119,7 @@ def identify(
     Stopped
         If the path of the case is lost.
     """
-    source = from_first(comm, lambda: read_source(Path(file), settings))
+    source = on_first_rank(comm, lambda: read_source(Path(file), settings))
     case, folder, name = made(source), given_folder(out), Path(file).name
     section: IdentifySection | None = case.identify
     if section is None:
@@ -127,9 +127,9 @@ def identify(
     try:
         parameters = parameters_of(source, case, section)
         field, wider = field_of(source, case, section.remanence, len(parameters))
-        wider, rows, shape = from_first(comm, lambda: with_shape(Path(data), wider))
+        wider, rows, shape = on_first_rank(comm, lambda: with_shape(Path(data), wider))
         case = made(wider)
-        table = from_first(comm, lambda: table_of(Path(data), case, section, rows, shape))
+        table = on_first_rank(comm, lambda: table_of(Path(data), case, section, rows, shape))
         names = Names(case)
         others = [
             candidate(names, each, f"identify.candidates.{i}")

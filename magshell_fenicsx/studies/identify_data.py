@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import GREATEST, TableError, TableRows, column_size, read_rows
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import NAMES

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import VECTORS, write_vectors
 from magshell_fenicsx.models.shell.controls import Controls

@@ -17,7 +17,7 @@ from magshell_fenicsx.input.source import CaseError, Source, override
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.platform.environment import code_version
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.readings import NotRead, Outside, Reading, read
 from magshell_fenicsx.simulate.scene import Scene
@@ -86,7 +86,7 @@ class Predictor:
         file = (
             self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
         )
-        seen = from_first(
+        seen = on_first_rank(
             self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version())
         )
         if seen is None:
@@ -95,7 +95,7 @@ class Predictor:
                 by_first(self.comm, lambda: self.write(x, vectors))
             seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
             self.count += 1
-            from_first(
+            on_first_rank(
                 self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)})
             )
         return seen

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.input.tables import TableError, column_size, read_rows
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, Row, write_csv
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem.columns import extra_columns, sizes_in_units
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.runs.running import run

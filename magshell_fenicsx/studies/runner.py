@@ -46,7 +46,7 @@ Task = TypeVar("Task")
 Found = Literal["path", "fold"]
 FAILED = "failed: "  # what `stopped` begins with if an error ended the run
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
-EACH = terminal.EACH  # s
+EACH = terminal.STATUS_SECONDS  # s
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform.environment import code_version, fingerprint
-from magshell_fenicsx.platform.processes import mpirun_itself
+from magshell_fenicsx.platform.environment import code_version, machine_fingerprint
+from magshell_fenicsx.platform.processes import mpirun_path
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.measured import Timings, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
@@ -103,7 +103,7 @@ def study(
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
     points = make_points(swept_source(Path(file), axes, settings), axes, made)
-    folder, machine = given_folder(out), fingerprint()
+    folder, machine = given_folder(out), machine_fingerprint()
     with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
@@ -167,7 +167,7 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
         raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
     if repeat < 1 or not ranks or min(ranks) < 1:
         raise CaseError("--repeat and --ranks must be at least 1")
-    if max(ranks) > 1 and not mpirun_itself():
+    if max(ranks) > 1 and not mpirun_path():
         raise CaseError("--ranks: there is no mpirun to start more than one")
     if reference is not None and not isfinite(reference):
         raise CaseError(f"--reference {reference}: must be a finite number")

@@ -8,7 +8,7 @@ from typing import Any
 
 from scipy.optimize import brentq
 
-from magshell_fenicsx.platform.environment import described
+from magshell_fenicsx.platform.environment import describe_machine
 from magshell_fenicsx.studies.measured import TIMES, Timings
 from magshell_fenicsx.studies.points import SweepPoint, short
 from magshell_fenicsx.studies.results import Scalar
@@ -261,7 +261,7 @@ def write_table(
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     file.write_text(
         f"# {content['result']} of {content['case']}: error against run time\n\n"
-        f"{content['reference_said']} {repeated(content['repeat'])} on {described(content['machine'])}.\n"
+        f"{content['reference_said']} {repeated(content['repeat'])} on {describe_machine(content['machine'])}.\n"
         f"{LEGEND}\n![](study.png)\n\n{table}\n",
         encoding="utf-8",
     )

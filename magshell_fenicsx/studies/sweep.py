@@ -23,7 +23,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import COLUMNS, write_csv
-from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.runs.running import Result, run
@@ -143,8 +143,8 @@ def sweep(
     """
     axes, scalar = parse_axes(over), parse_scalar(result) if result else None
     full_paths = full_paths or not (scalar is None or scalar.name == "knockdown")
-    source = from_first(comm, lambda: swept_source(Path(file), axes, settings))
-    asked = from_first(comm, lambda: make_points(source, axes, made))
+    source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
+    asked = on_first_rank(comm, lambda: make_points(source, axes, made))
     share = share_of(part, len(asked))
     folder = FOLDER.prepare(given_folder(out), comm)
     points = by_first(comm, lambda: with_earlier(folder, source, axes, asked, made))
@@ -285,7 +285,7 @@ def _chains_of(
 
 def _symmetry(case: Case) -> str:
     problem = case.problem()
-    return "axisymmetric" if problem.axisymmetric else "half" if problem.half else "none"
+    return "axisymmetric" if problem.axisymmetric else "half" if problem.is_half else "none"
 
 
 @dataclass

@@ -14,13 +14,13 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import (
-    Pairs,
-    Points,
+    BlockPairs,
+    PointStorage,
     point_gradient,
     point_hessian,
     point_values,
 )
-from magshell_fenicsx.assembly.scalars import Scalars, terminals_of
+from magshell_fenicsx.assembly.scalar_graph import ScalarGraph, terminals_of
 
 Array = np.ndarray
 i, j, k = ufl.indices(3)
@@ -82,7 +82,7 @@ CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
 def test_against_numpy(name: str, count: int) -> None:
     """Also where the number of points is no multiple of four, and after a constant has changed."""
     expression, expected = CASES[name]
-    points, random = Points(11), np.random.default_rng(1)
+    points, random = PointStorage(11), np.random.default_rng(1)
     a, b, constant = points.field(2), points.field(1), fem.Constant(points._mesh, 0.4)
     a.x.array[:], b.x.array[:] = random.random(22), 1 + random.random(11)
     here = points.constant(constant)
@@ -127,7 +127,7 @@ def test_derivatives_against_ufl(name: str) -> None:
     """Every rule of differentiation, for gradient and Hessian, by dolfinx's own evaluation of UFL's
     derivatives.
     """
-    points, log = Points(7), KernelLog()
+    points, log = PointStorage(7), KernelLog()
     z = points.field(6)
     z.x.array[:] = np.random.default_rng(2).random(42)
     W, cells = ENERGIES[name](z), np.arange(7, dtype=np.int32)
@@ -148,7 +148,7 @@ def test_derivatives_against_ufl(name: str) -> None:
     gradient = points.evaluate(point_gradient(name, [(W, z)], log), 7).copy()
     assert gradient == pytest.approx(by_dolfinx(first), rel=1e-12, abs=1e-12)
     blocks = points.evaluate(
-        point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, at_zero=False), 7
+        point_hessian(name, W, z, 2, BlockPairs(((0, 0), (0, 1), (1, 1))), log, at_zero=False), 7
     )
     wanted = by_dolfinx(second).reshape(7, 2, 3, 2, 3)
     whole = blocks[:, :18].reshape(
@@ -166,25 +166,25 @@ def test_derivatives_against_ufl(name: str) -> None:
 
 def test_what_is_not_picked_needs_no_derivative() -> None:
     """The root of a negative number has none."""
-    points, log = Points(4), KernelLog()
+    points, log = PointStorage(4), KernelLog()
     z = points.field(3)
     z.x.array[:] = [-1, 0, 0, 4, 0, 0, 0, 0, 0, 9, 0, 0]
     W = ufl.conditional(ufl.gt(z[0], 0), ufl.sqrt(z[0]), 0.0) ** 2
     gradient = points.evaluate(point_gradient("root", [(W, z)], log), 4).copy()
     assert gradient[:, 0] == pytest.approx([0, 1, 0, 1])
     hessian = points.evaluate(
-        point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, at_zero=False), 4
+        point_hessian("root", W, z, 1, BlockPairs(((0, 0),)), log, at_zero=False), 4
     )
     assert hessian == pytest.approx(0, abs=1e-15)
 
 
 def test_at_zero() -> None:
     """The Hessian of a form that is quadratic in z but for terms that vanish at z = 0."""
-    points, log = Points(3), KernelLog()
+    points, log = PointStorage(3), KernelLog()
     z, a = points.field(3), points.field(1)
     z.x.array[:], a.x.array[:] = 0.3, [1, 2, 3]
     W = a[0] * z[0] ** 2 / 2 + z[1] * z[2] * ufl.exp(z[0])
-    found = points.evaluate(point_hessian("zero", W, z, 1, Pairs(((0, 0),)), log, at_zero=True), 3)
+    found = points.evaluate(point_hessian("zero", W, z, 1, BlockPairs(((0, 0),)), log, at_zero=True), 3)
     assert found == pytest.approx(
         np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]])
     )
@@ -192,12 +192,12 @@ def test_at_zero() -> None:
 
 def test_each_operation_occurs_once() -> None:
     """Sums and products in either order, numbers and what is multiplied by them."""
-    s = Scalars()
+    s = ScalarGraph()
     x, y = s.node("field", 0, 0), s.node("field", 0, 1)
     assert s.add(x, y) == s.add(y, x)
     assert s.times(s.number(2), s.times(y, s.number(3))) == s.times(s.number(6), y)
     assert s.add(x, x) == s.times(s.number(2), x)
-    assert s.times(x, s.zero) == s.over(s.zero, y) == s.zero
+    assert s.times(x, s.zero) == s.divide(s.zero, y) == s.zero
     assert s.power(x, s.number(0.5)) == s.node("sqrt", x)
 
 
@@ -207,18 +207,18 @@ def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) 
     """
     translated = list[Expr]()
     components, new = (
-        Scalars.components,
+        ScalarGraph.components,
         np.random.default_rng().uniform(),
     )  # an earlier run may have left a kernel
 
-    def counted(self: Scalars, e: Expr, *others: Any) -> Any:
+    def counted(self: ScalarGraph, e: Expr, *others: Any) -> Any:
         translated.append(e)
         return components(self, e, *others)
 
-    monkeypatch.setattr(Scalars, "components", counted)
+    monkeypatch.setattr(ScalarGraph, "components", counted)
 
     def value(W: Callable[..., Expr], *given: float) -> float:
-        points = Points(1)
+        points = PointStorage(1)
         a, b, c = points.field(2), points.field(2), fem.Constant(points._mesh, float(given[4]))
         a.x.array[:], b.x.array[:] = given[:2], given[2:4]
         kernel = point_values("once", W(a, b, ufl.variable(c)), KernelLog())
@@ -244,6 +244,6 @@ def test_equal_expressions_are_translated_once(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_what_no_point_has_is_refused() -> None:
-    x = ufl.SpatialCoordinate(Points(1)._mesh)
+    x = ufl.SpatialCoordinate(PointStorage(1)._mesh)
     with pytest.raises(NotImplementedError, match="SpatialCoordinate"):
-        Scalars().components(x[0], *terminals_of([x[0]], ufl.Coefficient, ufl.Constant))
+        ScalarGraph().components(x[0], *terminals_of([x[0]], ufl.Coefficient, ufl.Constant))

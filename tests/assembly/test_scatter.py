@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.point_kernels import COMPONENTS, SKEW
 from magshell_fenicsx.assembly.scatter import BlockMatrix
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 
 def space(degree: int) -> fem.FunctionSpace:
@@ -95,7 +95,7 @@ def test_code_that_cannot_be_compiled_is_named(
     source = tmp_path / "wrong.c"
     source.write_text("int f(void) { return nothing; }")
     with pytest.raises(subprocess.CalledProcessError):
-        native(source, "int f(void);", MPI.COMM_SELF)
+        load_native(source, "int f(void);", MPI.COMM_SELF)
     assert "wrong.c:1:" in capfd.readouterr().err
 
 
@@ -103,5 +103,5 @@ def test_changed_code_is_compiled_anew(tmp_path: Path) -> None:
     source, found = tmp_path / "number.c", []
     for number in (1, 2):
         source.write_text(f"int f(void) {{ return {number}; }}")
-        found.append(native(source, "int f(void);", MPI.COMM_SELF)[1].f())
+        found.append(load_native(source, "int f(void);", MPI.COMM_SELF)[1].f())
     assert found == [1, 2]

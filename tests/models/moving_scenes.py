@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Move
 
@@ -32,7 +32,7 @@ CLAMPED = {"left": "clamped", "right": "clamped"}
 def move(name: str, *edges: str, shift: Any = NONE, turn: Any = NONE, centre: Any = NONE) -> Move:
     """A motion of edges; lengths over R, the rotation vector in radians."""
     return Move(
-        edges, Motion(name, np.array(shift, float), np.array(turn, float), np.array(centre, float))
+        edges, RigidMotion(name, np.array(shift, float), np.array(turn, float), np.array(centre, float))
     )
 
 

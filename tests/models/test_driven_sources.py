@@ -98,7 +98,7 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
     amplitude.
     """
     system, step = scene(kind).model.system, 1e-4
-    u = system.held(2e-4 * np.random.default_rng(1).standard_normal(system.size))
+    u = system.zero_at_supports(2e-4 * np.random.default_rng(1).standard_normal(system.size))
     start = scene(kind).unloaded().mu
     driven, found = list(scene(kind).sources), []
     others = ("lambda_m", *driven)
@@ -136,7 +136,7 @@ def test_tangent(kind: str) -> None:
     with a magnet.
     """
     system, rng, e = scene(kind).model.system, np.random.default_rng(2), 1e-5
-    u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
+    u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
     moved = []
     for size in (0.1, 0.7):
         mu = dict.fromkeys(scene(kind).unloaded().mu, size) | {"lambda_m": 2.0}
@@ -150,7 +150,7 @@ def test_tangent(kind: str) -> None:
         assert 2.0 * system.load(u, mu, "lambda_m") @ v == pytest.approx(slope, rel=1e-6)
         whole = _times(system.tangent(u, mu), v) - _times(system.tangent(u, none), v)
         difference = rate(lambda u, mu=mu: 2.0 * system.load(u, mu, "lambda_m"))
-        whole, difference = system.held(whole), system.held(difference)
+        whole, difference = system.zero_at_supports(whole), system.zero_at_supports(difference)
         assert np.linalg.norm(whole - difference) <= 1e-6 * np.linalg.norm(difference)
         moved.append(whole)
     assert np.linalg.norm(moved[1] - moved[0]) > 1e-2 * np.linalg.norm(moved[0])

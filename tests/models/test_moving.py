@@ -7,7 +7,7 @@ import pytest
 from models.moving_scenes import CLAMPED, PLATE, RING, move, moving_scene
 
 from magshell_fenicsx import Scene
-from magshell_fenicsx.assembly.moving import in_space
+from magshell_fenicsx.assembly.prescribed_motion import in_space
 from magshell_fenicsx.continuation.system import State
 
 SHORT = {**PLATE, "width": 0.4}
@@ -64,14 +64,14 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
     """
     system, step = scene(kind).model.system, 1e-5
     rng = np.random.default_rng(1)
-    u = system.held(1e-3 * rng.standard_normal(system.size))
+    u = system.zero_at_supports(1e-3 * rng.standard_normal(system.size))
     start = scene(kind).unloaded().mu
     moving, found = [name for name in start if name in system.coordinates], []
     for size in (0.02, 0.05 if "solid" in kind else 0.4):  # coarse hexahedra turn inside out
         mu = {name: size * (1 + i) * (-1) ** i for i, name in enumerate(start)}
 
         def energy(mu: dict[str, float]) -> float:
-            placed = system.placed(State(u, mu)).u
+            placed = system.with_moved_supports(State(u, mu)).u
             return sum(
                 (mu[t.amplitude] if t.amplitude else 1.0) * system.energies(placed, mu)[t.name]
                 for t in system.terms
@@ -84,7 +84,7 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
             column = system.load(u, mu, name)
             difference = (system.residual(u, high) - system.residual(u, low)) / (2 * step)
             np.testing.assert_allclose(column, difference, atol=1e-6 * np.abs(column).max())
-            np.testing.assert_array_equal(column, system.held(column))
+            np.testing.assert_array_equal(column, system.zero_at_supports(column))
             found.append((slope, np.abs(column).max()))
             for other in mu:
                 bend = system.curvature(u, mu, name, other)
@@ -116,9 +116,9 @@ def test_rigid_motion_of_everything(kind: str) -> None:
     u = (
         (places - both.motion.centre) @ Q.T + both.motion.centre + both.motion.shift - places
     ).ravel()
-    state = model.system.placed(State(u, mu))
+    state = model.system.with_moved_supports(State(u, mu))
     np.testing.assert_allclose(state.u, u, atol=1e-14)
-    bent = model.system.placed(State(0.0 * u, mu))
+    bent = model.system.with_moved_supports(State(0.0 * u, mu))
     energy = sum(model.system.energies(bent.u, mu).values())
     assert abs(sum(model.system.energies(u, mu).values())) < 1e-12 * energy
     assert np.abs(model.system.forces(u, mu)).max() < 1e-11

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import spsolve
 from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.follow import follow
 
@@ -83,12 +83,12 @@ def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
     system, rng = model.system, np.random.default_rng(angle)
     u = 1e-4 * h * rng.standard_normal((system.size // 3, 3))
     u[:, 2] -= (GAP + 3e-3) * h * (model.r0.x.array.reshape(-1, 3)[:, 2] > 0)
-    u = system.held(u.ravel())
-    v = system.held(1e-8 * h * rng.standard_normal(system.size))
-    at = system.at(State(u, mu))
-    Kv = times([(1.0, at.of(term.entries))], v)
+    u = system.zero_at_supports(u.ravel())
+    v = system.zero_at_supports(1e-8 * h * rng.standard_normal(system.size))
+    at = system.at_state(State(u, mu))
+    Kv = times([(1.0, at.evaluate(term.entries))], v)
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
-    assert at.of(term.penetration) > 2e-3 * h
+    assert at.evaluate(term.penetration) > 2e-3 * h
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
     energies = [system.energies(u + side * 100 * v, mu)[term.name] for side in (-0.5, 0.5)]
     assert energies[1] - energies[0] == pytest.approx(
@@ -115,9 +115,9 @@ def test_a_corner(tmp_path: Path) -> None:
     u[of_strip, 2] -= GAP * h + deep
     assert (r + u)[of_strip, 2].min() == pytest.approx(h - deep)
     u, v = u.ravel()[: system.size], 1e-8 * h * rng.standard_normal(system.size)
-    at = system.at(State(u, mu))
-    assert at.of(term.penetration) == pytest.approx(deep, abs=0.015 * h * np.sin(tilt))
-    Kv = times([(1.0, at.of(term.entries))], v)
+    at = system.at_state(State(u, mu))
+    assert at.evaluate(term.penetration) == pytest.approx(deep, abs=0.015 * h * np.sin(tilt))
+    Kv = times([(1.0, at.evaluate(term.entries))], v)
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
 
@@ -138,7 +138,7 @@ def test_a_steep_edge(tmp_path: Path) -> None:
     assert 2 * np.pi * seen["contact_force"] / WIDTH == pytest.approx(expected["force"], rel=2e-3)
     assert seen["tip_ux"] == pytest.approx(expected["tip"], rel=2e-3)
     system, exact, mu = scene.model.system, last.point.state.u, last.point.state.mu
-    rough = system.held(np.random.default_rng(0).standard_normal(system.size))
+    rough = system.zero_at_supports(np.random.default_rng(0).standard_normal(system.size))
     u, errors = exact + 1e-5 * h * rough, list[float]()
     for _ in range(5):
         u = u - spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))

@@ -234,9 +234,9 @@ def test_law_of_each() -> None:
         nodes = np.unique(V.dofmap.list[scene.model.midsurface.patches[name]])
         assert np.linalg.norm(u[nodes]) == pytest.approx(np.linalg.norm(its.u), rel=1e-10)
     v, e, system = np.random.default_rng(3).standard_normal(state.u.size), 1e-7, scene.model.system
-    v = system.held(v)
+    v = system.zero_at_supports(v)
     ahead, back = (system.residual(state.u + way * e * v, state.mu) for way in (1, -1))
-    Kv = system.held(csr(system.tangent(state.u, state.mu)) @ v)
+    Kv = system.zero_at_supports(csr(system.tangent(state.u, state.mu)) @ v)
     assert np.linalg.norm(Kv - (ahead - back) / (2 * e)) < 1e-6 * np.linalg.norm(Kv)
     drawn = SurfaceGatherer(scene.model).gather(state.u, state.mu).fields
     of_rubber = np.isfinite(
@@ -304,7 +304,7 @@ def test_remanence_of_each() -> None:
         np.broadcast_to([0, 0, -2], Br[patches["upper"]].shape), abs=1e-12
     )
     assert not Br[patches["plain"]].any()
-    again = scene.problem.again({"shells.upper.shell.thickness": 1e-4})
+    again = scene.problem.with_values({"shells.upper.shell.thickness": 1e-4})
     assert again.thickness.patches["upper"] == pytest.approx(0.5)
 
 

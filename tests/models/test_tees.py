@@ -11,7 +11,7 @@ import pytest
 from sheets import Sheet, write
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
@@ -136,9 +136,9 @@ def test_derivatives() -> None:
     system, mu = scene.model.system, scene.unloaded().mu
     (term,) = (each for each in system.terms if isinstance(each, Tee))
     rng = np.random.default_rng(0)
-    u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-3, 1.0))
-    at = system.at(State(u, mu))
-    Kv = times([(1.0, at.of(term.entries))], v)
+    u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-3, 1.0))
+    at = system.at_state(State(u, mu))
+    Kv = times([(1.0, at.evaluate(term.entries))], v)
     low, high = (system.forces(u + side * 1e-7 * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs((high - low) / 1e-7 - Kv).max() < 1e-6 * np.abs(Kv).max()
     below, above = (system.energies(u + side * 1e-6 * v, mu)[term.name] for side in (-0.5, 0.5))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.coupled import times
+from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.parts.touching.mirrored import Mirrored
@@ -66,7 +66,7 @@ def flattened(
         np.tanh(far / 0.2) * width - far + (1 - across) * (1 - np.tanh(1 / 0.2) * half * h)
     )
     rough = np.random.default_rng(seed).standard_normal(u.size)
-    return model.system.held((u.ravel() + noise * h * rough)[: model.system.size])
+    return model.system.zero_at_supports((u.ravel() + noise * h * rough)[: model.system.size])
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -81,11 +81,11 @@ def test_derivatives(seed: int) -> None:
     if seed:
         r = ring().model.r0.x.array.reshape(-1, 3)
         slid = u.reshape(-1, 3) + 0.7 * seed * h * np.outer(np.tanh(r[:, 1] / 0.2), [1, 0, 0])
-        mu = mu | {term.pair.cuts: system.at(State(slid.ravel(), mu)).of(term.recut)}
-        assert system.at(State(u, mu)).of(lambda: len(term._pressed()[0].point)) > 2000
-    v = system.held(1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size))
-    at = system.at(State(u, mu))
-    entries = at.of(term.entries)
+        mu = mu | {term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.recut)}
+        assert system.at_state(State(u, mu)).evaluate(lambda: len(term._pressed()[0].point)) > 2000
+    v = system.zero_at_supports(1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size))
+    at = system.at_state(State(u, mu))
+    entries = at.evaluate(term.entries)
     forces = [system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5)]
     Kv = times([(1.0, entries)], v)
     assert np.abs(forces[1] - forces[0] - Kv).max() < 1e-6 * np.abs(Kv).max()
@@ -93,23 +93,23 @@ def test_derivatives(seed: int) -> None:
     assert energies[1] - energies[0] == pytest.approx(
         100 * system.forces(u, mu, term.name) @ v, rel=1e-5
     )
-    other = system.held(np.random.default_rng(seed).standard_normal(system.size))
+    other = system.zero_at_supports(np.random.default_rng(seed).standard_normal(system.size))
     assert other @ Kv == pytest.approx(
         v @ times([(1.0, entries)], other), rel=1e-9
     )  # it is symmetric
-    assert at.of(term.least_gap) < 0
+    assert at.evaluate(term.least_gap) < 0
 
 
 def test_the_tangent_holds_what_couples() -> None:
     """The assembled tangent of all terms, also where nothing touched at first."""
     system, h, mu = ring().model.system, ring().model.material.h, ring().unloaded().mu
-    v = system.held(1e-8 * h * np.random.default_rng(1).standard_normal(system.size))
+    v = system.zero_at_supports(1e-8 * h * np.random.default_rng(1).standard_normal(system.size))
     for half in (0.6, 0.499, 0.6):
         u = flattened(half, 0.02)
         K = system.tangent(u, mu)
         given = K.createVecRight()
         given.array[:] = v
-        Kv = (K * given).array * (system.held(np.ones(system.size)) != 0)
+        Kv = (K * given).array * (system.zero_at_supports(np.ones(system.size)) != 0)
         low, high = (system.residual(u + side * v, mu) for side in (-0.5, 0.5))
         assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
 
@@ -118,7 +118,7 @@ def test_states_with_the_same_cuts_share_a_pattern() -> None:
     """The matrix is one object, which is analysed once, and its values are of the state alone."""
     system, mu, term = ring().model.system, ring().unloaded().mu, touching()
     u, deeper = (flattened(half, 0.02) for half in (0.499, 0.498))
-    mu = mu | {term.pair.cuts: system.at(State(u, mu)).of(term.recut)}
+    mu = mu | {term.pair.cuts: system.at_state(State(u, mu)).evaluate(term.recut)}
     K = system.tangent(u, mu)
     first = K.getValuesCSR()[2]
     assert system.tangent(deeper, mu).handle == K.handle
@@ -152,7 +152,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
     assert plane is not None
     assert isinstance(other, AntisymmetricModes)
     places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
-    beyond = plane.beyond(all_places) < -1e-9
+    beyond = plane.signed_distance(all_places) < -1e-9
     far, node = cKDTree(places).query(
         np.where(beyond[:, None], plane.image(all_places), all_places)
     )
@@ -167,7 +167,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         State(flattened(0.497, of=whole, **pressed), whole.unloaded().mu),
     )
     force, force_of_whole = (
-        scene.model.system.at(at).of(each.force) / scene.model.force_unit
+        scene.model.system.at_state(at).evaluate(each.force) / scene.model.force_unit
         for scene, at, each in ((half, state, own), (whole, state_of_whole, of_whole))
     )
     assert force == pytest.approx(force_of_whole, rel=1e-9)
@@ -181,11 +181,11 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         for each, at in ((system, state), (system_of_whole, state_of_whole))
     )
     for of, sign in ((system, 1.0), (other.system, -1.0)):
-        v = of.held(np.random.default_rng(4).standard_normal(of.size))
+        v = of.zero_at_supports(np.random.default_rng(4).standard_normal(of.size))
         image = sign * v.reshape(-1, 3)[node] @ plane.reflection
         v_of_whole = np.where(beyond[:, None], image, v.reshape(-1, 3)[node]).ravel()
         (term,) = (each for each in of.terms if isinstance(each, Mirrored))
-        second = v @ times([(1.0, of.at(state).of(term.entries))], v)
+        second = v @ times([(1.0, of.at_state(state).evaluate(term.entries))], v)
         assert v_of_whole @ times([(1.0, entries_of_whole)], v_of_whole) == pytest.approx(
             2 * second, rel=1e-9
         )
@@ -200,17 +200,17 @@ def test_the_material_around_a_point_does_not_touch_it() -> None:
     system, mu = ring().model.system, ring().unloaded().mu
     assert system.energies(0 * flattened(0.6, 0.0), mu)[touching().name] == 0
     assert system.energies(flattened(0.6, 0.0), mu)[touching().name] == 0
-    at = system.at(State(0 * flattened(0.6, 0.0), mu))
-    assert np.isnan(at.of(touching().least_gap))  # the farthest place of a ring is no nearest one
+    at = system.at_state(State(0 * flattened(0.6, 0.0), mu))
+    assert np.isnan(at.evaluate(touching().least_gap))  # the farthest place of a ring is no nearest one
 
 
 def test_nearest_places() -> None:
     """Against a search over a fine lattice of all cells that are not beside a point."""
     model, term = ring().model, touching()
-    at = model.system.at(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
+    at = model.system.at_state(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
     h, cells, points = model.material.h, term._cells, term._rule
-    places = at.of(lambda: term._facing.found(term._now(), 4 * h))
-    r = at.of(lambda: term._r0 + term._now())
+    places = at.evaluate(lambda: term._facing.found(term._now(), 4 * h))
+    r = at.evaluate(lambda: term._r0 + term._now())
     x, n = term._facing.x_of(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
@@ -255,11 +255,11 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
     scene = Scene(Case.model_validate(case | {"symmetry": 6}))
     (term,), system = scene.model.touchings, scene.model.system
     assert isinstance(term, Mirrored)
-    u = system.held(2e-3 * np.random.default_rng(3).standard_normal(system.size))
-    at = system.at(State(u, scene.unloaded().mu))
-    facing, far, points = term._facing, term._far, at.of(lambda: term._pressed() and term._points)
+    u = system.zero_at_supports(2e-3 * np.random.default_rng(3).standard_normal(system.size))
+    at = system.at_state(State(u, scene.unloaded().mu))
+    facing, far, points = term._facing, term._far, at.evaluate(lambda: term._pressed() and term._points)
     every, few = (
-        at.of(lambda least=least: facing.found(term._now(), far, points, least=least))
+        at.evaluate(lambda least=least: facing.found(term._now(), far, points, least=least))
         for least in (0, 1)
     )
     assert len(few.point) < 3 * len(points.cell) < len(every.point)
@@ -268,7 +268,7 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
         np.minimum.at(distance, places.point, places.distance)
     assert np.isfinite(nearest).all()
     assert nearest[1] == pytest.approx(nearest[0], abs=1e-13)
-    assert at.of(term.least_gap) == pytest.approx(nearest[0].min() - term._h, abs=1e-13)
+    assert at.evaluate(term.least_gap) == pytest.approx(nearest[0].min() - term._h, abs=1e-13)
 
 
 @pytest.mark.parametrize("deep", [3e-3, 0.2])
@@ -282,12 +282,12 @@ def test_folds_between_cells_have_no_jump(deep: float) -> None:
     system, h, r = model.system, model.material.h, model.r0.x.array.reshape(-1, 3)
     u = np.zeros_like(r)
     u[:, 1] = np.tanh(r[:, 1] / 0.3) * ((1 - deep) * h / 2 + 0.4 * r[:, 0] ** 2) - r[:, 1]
-    u = system.held(u.ravel()[: system.size])
-    v = system.held(1e-8 * h * np.random.default_rng(0).standard_normal(system.size))
+    u = system.zero_at_supports(u.ravel()[: system.size])
+    v = system.zero_at_supports(1e-8 * h * np.random.default_rng(0).standard_normal(system.size))
     mu = scene.unloaded().mu
-    at = system.at(State(u, mu))
-    Kv = times([(1.0, at.of(term.entries))], v)
-    _, joined, _ = at.of(term._pressed)
+    at = system.at_state(State(u, mu))
+    Kv = times([(1.0, at.evaluate(term.entries))], v)
+    _, joined, _ = at.evaluate(term._pressed)
     assert joined.several.any()
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()

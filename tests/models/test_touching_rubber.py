@@ -82,7 +82,7 @@ def test_gap_of_stretched_sheets() -> None:
     scene = sheets(laws=("koiter", "neo-hookean"), thick=1.5)
     model, r0 = scene.model, scene.model.r0.x.array.reshape(-1, 3)
     u = (r0 * [0.3, 0.2, 0.1]).ravel()
-    gap = model.system.at(State(u, scene.unloaded().mu)).of(model.touchings[0].least_gap)
+    gap = model.system.at_state(State(u, scene.unloaded().mu)).evaluate(model.touchings[0].least_gap)
     assert gap == pytest.approx(1.1 * 1.25 * h - h / 2 - 0.75 * h / (1.3 * 1.2), abs=1e-14)
 
 
@@ -102,7 +102,7 @@ def test_pressed_sheets() -> None:
     guess = r0 * (g * np.array([1.14, 1.15, 1.0]) - [1, 1, g])
     guess[upper, 2] = (0.75 * g - 1) * h
     mu = scene.unloaded().mu | {"load": 1.0, "natural_stretch": 1.0}
-    u, steps = system.held(guess.ravel()), list[float]()
+    u, steps = system.zero_at_supports(guess.ravel()), list[float]()
     for _ in range(12):
         step = spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
         u, steps = u - step, [*steps, float(np.abs(step).max())]
@@ -114,7 +114,7 @@ def test_pressed_sheets() -> None:
     assert np.ptp(r[upper, 2]) < 1e-9 * h
     stretch, d = r[upper, 0].max() / g, r[upper, 2].mean() - r[~upper, 2].mean()
     assert stretch > 1.1
-    q = system.at(State(u, mu)).of(term.force)  # over E h/R, of an area of one
+    q = system.at_state(State(u, mu)).evaluate(term.force)  # over E h/R, of an area of one
     assert q == pytest.approx(
         PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h, rel=1e-9
     )
@@ -176,9 +176,9 @@ def test_derivatives_by_the_natural_stretch() -> None:
     load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]
     scene = ring(natural={"stretch": ["1.2 + 0.1*x", 0.9], "along": [0, 0, 1]}, loading=load)
     system, (term,), flat = scene.model.system, scene.model.touchings, flattened(scene).ravel()
-    u = system.held(flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size))
+    u = system.zero_at_supports(flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size))
     slope, step = system.parameters["natural_stretch"].slopes[-1], 1e-6
-    (twice,) = system.parameters["natural_stretch"].bends(
+    (twice,) = system.parameters["natural_stretch"].second_derivatives(
         system.parameters["natural_stretch"].constant
     )[-1:]
 
@@ -188,17 +188,17 @@ def test_derivatives_by_the_natural_stretch() -> None:
     def differed(of: Any) -> Any:
         return (8 * (of(1) - of(-1)) - (of(2) - of(-2))) / (12 * step)
 
-    at = system.at(State(u, mu(0)))
-    assert at.of(term.penetration) > 0.05 * h
+    at = system.at_state(State(u, mu(0)))
+    assert at.evaluate(term.penetration) > 0.05 * h
     force = np.zeros_like(u)
-    at.of(lambda: slope.add_residual(force, 1.0))
-    assert at.of(slope.energy) == pytest.approx(
+    at.evaluate(lambda: slope.add_residual(force, 1.0))
+    assert at.evaluate(slope.energy) == pytest.approx(
         differed(lambda n: system.energies(u, mu(n))[term.name]), rel=1e-6
     )
     forces = differed(lambda n: system.forces(u, mu(n), term.name))
     assert np.abs(force - forces).max() < 1e-6 * np.abs(forces).max()
-    assert at.of(twice.energy) == pytest.approx(
-        differed(lambda n: system.at(State(u, mu(n))).of(slope.energy)), rel=1e-6
+    assert at.evaluate(twice.energy) == pytest.approx(
+        differed(lambda n: system.at_state(State(u, mu(n))).evaluate(slope.energy)), rel=1e-6
     )
 
 

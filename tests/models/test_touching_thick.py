@@ -49,7 +49,7 @@ def sheets(factors: tuple[str | None, str | None], apart: float = h, thick: floa
 
 
 def gap_of(scene: Scene) -> float:
-    return float(scene.model.system.at(scene.unloaded()).of(scene.model.touchings[0].least_gap))
+    return float(scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.touchings[0].least_gap))
 
 
 def test_gap_of_wedges() -> None:
@@ -81,7 +81,7 @@ def test_pressed_wedges() -> None:
     upper = r0[:, 2] > h / 2
     guess = np.zeros_like(r0)
     guess[upper, 2] = -2e-3 * h
-    u, steps = system.held(guess.ravel()), list[float]()
+    u, steps = system.zero_at_supports(guess.ravel()), list[float]()
     for _ in range(14):
         step = spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))
         u, steps = u - step, [*steps, float(np.abs(step).max())]
@@ -90,9 +90,9 @@ def test_pressed_wedges() -> None:
     assert np.ptp(r[upper, 2]) < 5e-5 * h
     d = r[upper, 2].mean() - r[~upper, 2].mean()
     q = (PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h) / inclined
-    force = system.at(State(u, mu)).of(term.force)
+    force = system.at_state(State(u, mu)).evaluate(term.force)
     assert force == pytest.approx(q, rel=1e-5)
-    p = system.at(State(u, mu)).of(term.of_cells)[0]
+    p = system.at_state(State(u, mu)).evaluate(term.of_cells)[0]
     assert np.ptp(p) < 1e-3 * p.mean()
     s = np.sqrt(2 * SOFT * h * q / term.stiffness.value)
     assert s < SOFT * h  # the penalty is k s^2/(2 SOFT h)

@@ -60,8 +60,8 @@ def pressed(
     scene = Scene(Case.model_validate(data))
     *_, last = follow(scene)
     (touching,) = scene.model.touchings
-    at = scene.model.system.at(last.point.state)
-    return scene, scene.observe(last.point.state), at.of(touching.of_cells)[0], last
+    at = scene.model.system.at_state(last.point.state)
+    return scene, scene.observe(last.point.state), at.evaluate(touching.of_cells)[0], last
 
 
 def test_patch_test_of_equal_meshes(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_newton_is_quadratic(tmp_path: Path) -> None:
     exact = exact - spsolve(
         csr(system.tangent(exact, mu)).tocsc(), system.residual(exact, mu)
     )  # which was near enough
-    rough = system.held(np.random.default_rng(0).standard_normal(system.size))
+    rough = system.zero_at_supports(np.random.default_rng(0).standard_normal(system.size))
     u, errors = exact + 2e-5 * h * rough, list[float]()
     for _ in range(5):
         u = u - spsolve(csr(system.tangent(u, mu)).tocsc(), system.residual(u, mu))

@@ -13,7 +13,7 @@ from scipy.special import airy
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.mesh.mirror import Y0
+from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.shells.modes import ShellModes
@@ -140,7 +140,7 @@ def test_tangent(symmetry: str) -> None:
     system, mu = scene.model.system, scene.unloaded().mu
     assert mu == {"foundation": pytest.approx(15.0)}
     u, v = (
-        system.held(1e-3 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(1e-3 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
     )
 
     def along(stiffness: float) -> np.ndarray:
@@ -281,7 +281,7 @@ def test_narrow_springs(y: float, r: float, model: str) -> None:
         foundation={"stiffness": 1, "factor": factor},
         loading=PRESSED,
     )
-    assert make_problem(case).mirror is (None if y else Y0)
+    assert make_problem(case).mirror is (None if y else Y0_PLANE)
     of = ms.Scene(case).model
     up = np.tile([0.0, 0.0, 1.0], of.system.size // 3)
     energy = of.multiplicity * of.system.potential(up, {}, "foundation")

@@ -15,13 +15,13 @@ from mpi4py import MPI
 mode, rank, *words = sys.argv[1:]
 import magshell_fenicsx.case.planner as planner  # on all ranks: PETSc begins on them together
 if MPI.COMM_WORLD.rank == int(rank):
-    from magshell_fenicsx.platform import reading
+    from magshell_fenicsx.platform import input_files
     if mode == "unreadable":
         def refused(file, largest=0):
             raise PermissionError(13, "Permission denied", str(file))
-        reading.read_whole = refused
+        input_files.read_bounded = refused
         import magshell_fenicsx.input.source as source
-        source.read_whole = refused
+        source.read_bounded = refused
     if mode == "another":
         words += ["--set", "shell.poisson_ratio=0.31"]
     if mode == "alone":

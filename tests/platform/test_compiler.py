@@ -19,9 +19,9 @@ from conftest import CASES
 from mpi4py import MPI
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.platform import compiler, kept
+from magshell_fenicsx.platform import compiler, disk_cache
 from magshell_fenicsx.platform.compiler import NoCompiler
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 LIKE_CLANG = """#!/bin/sh
 for word; do
@@ -37,7 +37,7 @@ SOURCE = "int seven(void) { return 7; }\n"
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(kept, "_usual", lambda: tmp_path / "cache")
+    monkeypatch.setattr(disk_cache, "_usual_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 
@@ -99,7 +99,7 @@ def test_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program.chmod(0o755)
     monkeypatch.setenv("CC", shlex.quote(str(program)))
     told = list[int]()
-    compiler.side_by_side(libraries("a", "b", "c", "d"), told.append)
+    compiler.compile_libraries(libraries("a", "b", "c", "d"), told.append)
     assert max(map(int, seen.read_text(encoding="utf-8").split())) == 2
     assert told == sorted(told)
     assert told[0] == 0
@@ -112,9 +112,9 @@ def test_in_opposite_orders() -> None:
     """
     orders = ["abcdef", "fedcba", "cfaebd"]
     with ThreadPoolExecutor(len(orders)) as pool:
-        for done in [pool.submit(compiler.side_by_side, libraries(*order)) for order in orders]:
+        for done in [pool.submit(compiler.compile_libraries, libraries(*order)) for order in orders]:
             done.result(timeout=60)
-    assert all(library.there for library in libraries(*orders[0]))
+    assert all(library.is_compiled for library in libraries(*orders[0]))
 
 
 @pytest.mark.usefixtures("two_cores")
@@ -123,13 +123,13 @@ def test_what_has_not_begun_is_given_up(cache: Path) -> None:
     broken = libraries("broken", source="int seven(void) { return")
     others = libraries(*map(str, range(12)))
     with pytest.raises(subprocess.CalledProcessError):
-        compiler.side_by_side([*broken, *others])
-    for work in [library.work for library in others]:
+        compiler.compile_libraries([*broken, *others])
+    for work in [library.running_compilation for library in others]:
         if work:
             work.result()
     assert not list(cache.glob("*.lock"))
-    assert not all(library.there for library in others)
-    compiler.side_by_side(others)
+    assert not all(library.is_compiled for library in others)
+    compiler.compile_libraries(others)
 
 
 @pytest.mark.telling
@@ -207,7 +207,7 @@ def test_a_compiler_that_is_not_gcc(
         "CC", shlex.quote(str(program(tmp_path / "a place", "cc", LIKE_CLANG.format(gcc))))
     )
     (tmp_path / "seven.c").write_text(SOURCE, encoding="utf-8")
-    assert native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)[1].seven() == 7
+    assert load_native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)[1].seven() == 7
     assert ctypes.CDLL(str(compiler.Library("seven", lambda: SOURCE, ("-O0",)).path())).seven() == 7
 
 
@@ -225,8 +225,8 @@ def test_a_compiler_that_compiles_nothing(
     with pytest.raises(NoCompiler, match=said):
         compiler.check_compiler()
     with pytest.raises(NoCompiler, match=said):
-        native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)
-    kept.keep(compiler.CHECKED, b"yes")
+        load_native(tmp_path / "seven.c", "int seven(void);", MPI.COMM_SELF)
+    disk_cache.save_cached(compiler.COMPILER_CHECKED, b"yes")
     compiler.check_compiler()
 
 

@@ -14,7 +14,7 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.platform import environment
-from magshell_fenicsx.problem.limits import Memory
+from magshell_fenicsx.problem.memory import Memory
 
 DIMPLE, BRACKET = CASES / "dimple_buckling.yaml", CASES / "bracket.yaml"
 FULL = ["--set", "symmetry=none"]

@@ -24,7 +24,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.platform import terminal
-from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
+from magshell_fenicsx.platform.terminal import LAUNCHER_VARIABLES, live_line
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
 
@@ -157,7 +157,7 @@ def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setenv("COLUMNS", "10")
     monkeypatch.setenv("TERM", "xterm")
-    for name in LAUNCHERS:
+    for name in LAUNCHER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     with live_line(1, print) as (say, tell):
         assert tell
@@ -185,7 +185,7 @@ def test_a_pipe_gets_a_line_each_half_minute(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_pipe_gets_the_last_status_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also while long work tells nothing new, such as 90 s for one point; nothing before the first
     status."""
-    monkeypatch.setattr(terminal, "EACH", 0.1)
+    monkeypatch.setattr(terminal, "STATUS_SECONDS", 0.1)
     printed: list[str] = []
     with live_line(2, printed.append) as (say, tell):
         time.sleep(0.25)

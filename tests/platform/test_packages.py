@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from conftest import CASES
 
-from magshell_fenicsx.platform.packages import Unusable, gmsh_module, missing
+from magshell_fenicsx.platform.packages import Unusable, import_gmsh, install_hint
 
 
 @pytest.mark.parametrize(
@@ -56,11 +56,11 @@ def test_gmsh_without_the_libraries_of_a_display(
     with pytest.raises(
         Unusable, match=r"^gmsh cannot be loaded: libGLU\.so\.1: .* apt install libglu1-mesa"
     ):
-        gmsh_module()
+        import_gmsh()
 
 
 def test_a_package_that_pip_installs() -> None:
-    assert missing(ImportError("no x", name="pandas.x")) is None
+    assert install_hint(ImportError("no x", name="pandas.x")) is None
 
 
 def test_complex_numbers_are_refused() -> None:

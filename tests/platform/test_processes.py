@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
-from magshell_fenicsx.platform.processes import from_first, raised_by_all
+from magshell_fenicsx.platform.processes import on_first_rank, raise_on_all_ranks
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.files import AlreadyComplete
@@ -49,7 +49,7 @@ def raised(kind: type[Exception], said: str) -> Iterator[None]:
 
 
 def what_rank_0_gets() -> None:
-    found = from_first(COMM, lambda: COMM.rank + 7)
+    found = on_first_rank(COMM, lambda: COMM.rank + 7)
     assert found == 7
     assert by_first(COMM, lambda: {"rank": COMM.rank}) == {"rank": 0}
 
@@ -61,7 +61,7 @@ def any_error() -> None:
         AlreadyComplete({"a bug": 1}),
         MeshError("a bug"),
     ):
-        for share in (from_first, by_first):
+        for share in (on_first_rank, by_first):
             with raised(type(error), str(error)):
                 share(COMM, failing(error))
     with raised(ValueError, "a bug"):
@@ -77,18 +77,18 @@ def files() -> None:
 
 def what_cannot_be_sent() -> None:
     with raised(RuntimeError if COMM.rank else _Unsendable, "1 and 2"):
-        from_first(COMM, failing(_Unsendable(1, 2)))
+        on_first_rank(COMM, failing(_Unsendable(1, 2)))
     with raised(Exception, "local"):
-        from_first(COMM, lambda: lambda: None)
+        on_first_rank(COMM, lambda: lambda: None)
 
 
 def what_one_rank_cannot() -> None:
     """All ranks raise, also where the first has no error."""
     with raised(OSError, "of the last"):
-        raised_by_all(
+        raise_on_all_ranks(
             COMM, failing(OSError("of the last")) if COMM.rank == COMM.size - 1 else lambda: None
         )
-    raised_by_all(COMM, lambda: None)
+    raise_on_all_ranks(COMM, lambda: None)
 
 
 def reads() -> None:
@@ -111,7 +111,7 @@ def a_folder(out: Path) -> None:
         raised(RuntimeError, "a bug"),
     ):
         ms.run(ms.Case.load(PLATE), out / "run", COMM)
-    from_first(COMM, (out / "run" / "mesh.json").mkdir)
+    on_first_rank(COMM, (out / "run" / "mesh.json").mkdir)
     case = ms.Case.load(PLATE, ["mesh={tolerance: 0.01}"])
     with (
         patch("magshell_fenicsx.runs.running.open_folder"),

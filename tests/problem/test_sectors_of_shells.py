@@ -87,7 +87,7 @@ def symmetric(scene: Scene, size: float) -> np.ndarray:
     u = size * h * ((1 + 0.1 * wave) * rho)[:, None] * (0.2 * out + [0, 0, 1])
     upper = x[:, 2] > 0.5 * h
     u[upper] = -u[upper]
-    return np.asarray(model.system.held(u.ravel()))
+    return np.asarray(model.system.zero_at_supports(u.ravel()))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_copies_make_the_half(name: str) -> None:
     way = symmetric(scene, 1.0) * (
         1 + np.arange(model.system.size) % 2
     )  # of no meaning, and not along u
-    way = u if name == "gripper" else model.system.held(way)
+    way = u if name == "gripper" else model.system.zero_at_supports(way)
     works = [
         model.system.residual(u, mu) @ way,
         half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way),
@@ -121,7 +121,7 @@ def test_copies_make_the_half(name: str) -> None:
     if name == "joined":
         return
     ours, theirs = (
-        system.at(State(v, mu)) for system, v in ((model.system, u), (half.system, copies))
+        system.at_state(State(v, mu)) for system, v in ((model.system, u), (half.system, copies))
     )
     forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)

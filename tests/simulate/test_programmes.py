@@ -97,7 +97,7 @@ def unstable_at_constant_volume(scene: Scene, state: State) -> int:
     )  # its array lives no longer than it
     upper = np.triu(whole.getDenseArray())
     dense = upper + np.triu(upper, 1).T
-    free = np.array(system.held(np.ones(system.size)), dtype=bool)
+    free = np.array(system.zero_at_supports(np.ones(system.size)), dtype=bool)
     normal = system.load(state.u, state.mu, "pressure")[free]
     keep = scipy.linalg.null_space(normal[None])
     return int((np.linalg.eigvalsh(keep.T @ dense[np.ix_(free, free)] @ keep) < 0).sum())
@@ -182,7 +182,7 @@ def test_forces_at_two_places() -> None:
     for steps in ((first, other), (other, first)):
         scene, records = history(case(*steps, **coarse))
         found = columns(scene, records)
-        assert scene.problem.half
+        assert scene.problem.is_half
         ends.append(
             {
                 name: found[name][-1]

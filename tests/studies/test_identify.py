@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import read_rows
-from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.readings import Reading, read
 from magshell_fenicsx.studies.laplace import Measured, fitted
 
@@ -202,7 +202,7 @@ class Interpolated:
 
     def exact(self, x: Array) -> Array:
         changed = {KEYS[0]: float(1e3 * x[0]), KEYS[1]: float(x[1])}
-        return read(ms.Scene(self.case.problem().again(changed)), readings(), []).values
+        return read(ms.Scene(self.case.problem().with_values(changed)), readings(), []).values
 
     def values(self, x: Array) -> Array:
         """(n, ...) at parameters (2, ...)."""

@@ -66,11 +66,11 @@ def test_every_file_of_the_package_counts(copied: Path) -> None:
     compiles do not.
     """
     package = copied / PACKAGE.name
-    known = [environment.version_of(package)]
+    known = [environment.source_version(package)]
     assert known == [environment.code_version()]
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "cli.cpython-313.pyc").write_bytes(b"compiled")
-    assert known == [environment.version_of(package)]
+    assert known == [environment.source_version(package)]
     for file in (
         "continuation/newton.py",
         "assembly/scatter.c",
@@ -78,13 +78,13 @@ def test_every_file_of_the_package_counts(copied: Path) -> None:
     ):
         with (package / file).open("a", encoding="utf-8") as stream:
             stream.write("\n")
-        known.append(environment.version_of(package))
+        known.append(environment.source_version(package))
     (package / "continuation" / "newton.py").rename(package / "continuation" / "newtons.py")
-    known.append(environment.version_of(package))
+    known.append(environment.source_version(package))
     (package / "new.py").touch()
-    known.append(environment.version_of(package))
+    known.append(environment.source_version(package))
     (package / "models" / "shell" / "edges.py").unlink()
-    known.append(environment.version_of(package))
+    known.append(environment.source_version(package))
     assert len(set(known)) == 7
 
 

@@ -11,8 +11,8 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.distinct import lines_of
-from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation, Embedding, MeshError
+from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
 from magshell_fenicsx.models.shell.patterns import places
 from magshell_fenicsx.platform import compat
 
@@ -39,11 +39,11 @@ class Meridian:
     points
         Name -> parameter s and azimuth (rad) of a place whose displacement is observed.
     curvature
-        See `shape.turning.Span`.
+        See `shape.meridian_chart.MeridianChart`.
     patches
         Name of each of several shells -> which cells; none of one.
     tied
-        Of each joint the parameters that it ties, see `shape.turning.Span`.
+        Of each joint the parameters that it ties, see `shape.meridian_chart.MeridianChart`.
     """
 
     mesh: mesh.Mesh
@@ -120,7 +120,7 @@ class Meridian:
     @property
     def _ends(self) -> Array:
         """The same in the order of the cells' numbers."""
-        return np.sort(self.mesh.geometry.x[compat.corner_numbers(self.mesh), 0], axis=1)
+        return np.sort(self.mesh.geometry.x[compat.geometry_dofs(self.mesh), 0], axis=1)
 
     def _at(self, facets: NDArray[np.int32]) -> Array:
         """Parameters of facets, of which dolfinx wants one at least."""
@@ -155,7 +155,7 @@ class Meridian:
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement in the same space."""
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
-        assert isinstance(self.embedding, Deviated)
+        assert isinstance(self.embedding, DeviatedEmbedding)
         growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[
             :, [0, 2]
         ].ravel()
@@ -220,7 +220,7 @@ def make_meridian(
             highest = np.argmax(np.where(on_axis if on_axis.any() else free, places[:, 2], -inf))
         s = float(vertices[highest]) if pieces else 0.0
         points = {**(points or {}), "pole": (s, 0.0)}
-    middles = domain.geometry.x[compat.corner_numbers(domain), 0].mean(axis=1)
+    middles = domain.geometry.x[compat.geometry_dofs(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in pieces}
     return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
 
@@ -278,7 +278,7 @@ def graded_vertices(
             )
         return sizes
 
-    lines = lines_of(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))
+    lines = line_coordinates(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))
     corners = [0.0, *lines, end]
     return _equidistributed(corners, size)
 

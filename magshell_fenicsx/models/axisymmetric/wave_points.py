@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.batches import Batch, Rule
-from magshell_fenicsx.assembly.following import Follows
+from magshell_fenicsx.assembly.batches import EntityBatch, EntityRule
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, whole_hessian
+from magshell_fenicsx.assembly.memo import Memo
+from magshell_fenicsx.assembly.point_kernels import PointKernel, PointStorage, full_hessian
 from magshell_fenicsx.models.carriers import Carrier, Energy, revolved_by, wave_by
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -94,13 +94,13 @@ class _Site:
         self,
         carrier: Carrier,
         u: fem.Function,
-        batch: Batch,
+        batch: EntityBatch,
         energies: Sequence[Energy],
         log: KernelLog,
     ) -> None:
         self._batch, self._energies, self._log, self._u = batch, energies, log, u
         self._carrier, self._sides = carrier, range(len(batch.cells))
-        self._points = points = Points(batch.size)
+        self._points = points = PointStorage(batch.size)
         sides = len(self._sides)
         self._at_u, self._at_r0, self._drawn = (
             points.field(PLANE * DERIVATIVES * sides) for _ in range(3)
@@ -111,7 +111,7 @@ class _Site:
         )
         fill(self._geometry, batch.geometry)
         fixed = [carrier.r0] if carrier.drawn is None else [carrier.r0, carrier.drawn]
-        self._placed = Follows(self._place, lambda: tuple(field.x.array for field in fixed))
+        self._placed = Memo(self._place, lambda: tuple(field.x.array for field in fixed))
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [
             parameters_at(points, e.density.parameters, sides) for e in energies if e.density
@@ -182,7 +182,7 @@ class _Site:
             for part in range(2):  # the cosine's and the sine's
                 v = [each[part] for each in both]
                 W = W + _added(e.density, start, moved, v, self._edge(r0), parameters)
-            kernels.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log))
+            kernels.append(full_hessian(f"{e.name} waves", W, self._wave, self._log))
         return kernels
 
     def _is_drawn(self, e: Energy) -> bool:
@@ -332,7 +332,7 @@ def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:
     return e.density.sides, e.density.quadrature or 0, facets
 
 
-def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
+def _batches(carrier: Carrier, density: Density | None) -> Iterable[EntityBatch]:
     """The points where a density lives; the geometry of each is the covector and the length of the
     cell, by sides.
     """
@@ -344,7 +344,7 @@ def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
             basix.CellType.interval, density.quadrature or carrier.rule
         )
         every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
-        yield Batch((every,), Rule((X,), (), weights), np.zeros((len(every) * len(X), 2)))
+        yield EntityBatch((every,), EntityRule((X,), (), weights), np.zeros((len(every) * len(X), 2)))
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
@@ -367,13 +367,13 @@ def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
         geometry = [
             np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)
         ]
-        rule = Rule(tuple(np.array([[float(end)]]) for end in kind), (), np.ones(1))
-        yield Batch(cells, rule, np.hstack(geometry))
+        rule = EntityRule(tuple(np.array([[float(end)]]) for end in kind), (), np.ones(1))
+        yield EntityBatch(cells, rule, np.hstack(geometry))
 
 
 def _lengths(V: fem.FunctionSpace) -> Array:
     """(cells,) of the coordinate's change from the first to the second vertex."""
-    ends = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0]
+    ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
     return np.asarray(ends[:, 1] - ends[:, 0])
 
 

@@ -16,8 +16,8 @@ from ufl import Coefficient
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.terms import Counted, DensityTerm
-from magshell_fenicsx.mesh.patch import GivenField, MeshError
+from magshell_fenicsx.assembly.terms import AngleTerm, DensityTerm
+from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
 from magshell_fenicsx.models.shell.own_term import ByPlace, Free, OwnTerm
@@ -149,7 +149,7 @@ class ShellTerm(DensityTerm[Density]):
         return self.points.energy(self.name) if self.points else super().energy()
 
 
-class MomentTerm(Counted, ShellTerm):
+class MomentTerm(AngleTerm, ShellTerm):
     """A moment on an edge of a shell."""
 
 
@@ -209,7 +209,7 @@ def constants_of(
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
     def made(
-        p: float | NDArray[np.float64] | Free | GivenField | ByPlace | Coefficient,
+        p: float | NDArray[np.float64] | Free | UserField | ByPlace | Coefficient,
     ) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
             return constants.setdefault(p.name, constant(p.value))
@@ -218,7 +218,7 @@ def constants_of(
             and p.ufl_function_space().ufl_domain() == domain.ufl_domain()
         ):
             return p
-        if isinstance(p, Coefficient | GivenField):
+        if isinstance(p, Coefficient | UserField):
             raise MeshError(
                 f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on this mesh, "
                 "see ms.Shell"

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.batches import (
-    Batch,
-    Chosen,
-    add_coupled,
-    add_own,
+    CellMask,
+    EntityBatch,
+    add_cell_products,
+    add_coupling_products,
     boundary_batches,
     cell_batches,
     interior_batches,
 )
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.oblique_supports import Constraint
 from magshell_fenicsx.assembly.scatter import BlockMatrix
-from magshell_fenicsx.assembly.sliding import Constraint
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.models.shell.energy import (
     Density,
@@ -47,7 +47,7 @@ class TangentSite(Protocol):
     """
 
     @property
-    def coupling(self) -> Sequence[Batch]: ...
+    def coupling(self) -> Sequence[EntityBatch]: ...
 
     def add(
         self,
@@ -121,10 +121,10 @@ class FastTangent:
 
             def couple(batch: int, K: Array, site: TangentSite = site) -> None:
                 first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)
-                add_coupled(product, K, first, second, x)
+                add_coupling_products(product, K, first, second, x)
 
             site.add(self._u.x.array, factors, same, couple)
-        add_own(
+        add_cell_products(
             product, same[self._moving], self._nodes[self._moving], x
         )  # others have no node that moves
         return product.ravel()
@@ -139,7 +139,7 @@ def make_sites(
     terms: Iterable[Term],
     log: KernelLog,
     prestress: Density | None = None,
-    chosen: Chosen = None,
+    chosen: CellMask = None,
 ) -> list[Site]:
     """The sites of some terms: all cells and all interior edges together, boundary edges term by
     term. Collective.

@@ -18,11 +18,11 @@ from ufl.algorithms import extract_coefficients
 from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import Follows, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.memo import Memo, memo_input
 from magshell_fenicsx.assembly.point_kernels import (
     PointKernel,
-    Points,
+    PointStorage,
     point_gradient,
     point_values,
 )
@@ -77,7 +77,7 @@ class PointGradient:
         parts: Sequence[str],
         each: int,
         count: int,
-        r0: Follows[Array],
+        r0: Memo[Array],
         geometry: Array,
         values: Callable[[fem.Function], Array],
         log: KernelLog,
@@ -85,11 +85,11 @@ class PointGradient:
         self._size = terms[0].density.sides * len(parts) * 3
         chunk = max(CHUNK // each, 1) * each
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
-        points = self._points = Points(max(min(count, chunk), 1))
+        points = self._points = PointStorage(max(min(count, chunk), 1))
         self._u, placement, place = (
             points.field(size) for size in (self._size, self._size, geometry.shape[1])
         )
-        self._given = [_Given(placement, r0), _Given(place, Follows(lambda: geometry, tuple))]
+        self._given = [_Given(placement, r0), _Given(place, Memo(lambda: geometry, tuple))]
         self._names, self._log = [term.name for term in terms], log
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
@@ -164,7 +164,7 @@ class _Given:
     """
 
     room: fem.Function
-    values: Follows[Array]
+    values: Memo[Array]
     filled: tuple[slice, int] | None = None
 
     def fill(self, chunk: slice) -> None:
@@ -174,8 +174,8 @@ class _Given:
             self.filled = chunk, self.values.version
 
 
-def _following(field: fem.Function, values: Callable[[fem.Function], Array]) -> Follows[Array]:
-    return Follows(lambda: values(field), lambda: (values_of(field),))
+def _following(field: fem.Function, values: Callable[[fem.Function], Array]) -> Memo[Array]:
+    return Memo(lambda: values(field), lambda: (memo_input(field),))
 
 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:

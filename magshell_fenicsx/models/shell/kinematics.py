@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from magshell_fenicsx.platform.later import later
+from magshell_fenicsx.platform.lazy_import import lazy_import
 
 if TYPE_CHECKING:
     import ufl
     from ufl.core.expr import Expr
 else:
-    ufl = later("ufl")
+    ufl = lazy_import("ufl")
 
 Vectors: TypeAlias = Any  # several expressions (3,), or arrays (..., 3)
 FIRST = ("r1", "r2")

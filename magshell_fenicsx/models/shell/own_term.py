@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import function
-from magshell_fenicsx.mesh.mirror import Y0, Mirror, rotation
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror, rotation
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
-from magshell_fenicsx.platform.later import later
-from magshell_fenicsx.shape.symmetry import Leaves, mirrors_formula
-from magshell_fenicsx.shape.turning import scalar_turns
+from magshell_fenicsx.platform.lazy_import import lazy_import
+from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, mirrors_formula
 
 if TYPE_CHECKING:
     import ufl
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from magshell_fenicsx.shape.outline import Outline
 else:
-    ufl = later("ufl")
+    ufl = lazy_import("ufl")
 
 Array = NDArray[np.float64]
 Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
@@ -94,7 +94,7 @@ class ByPlace:
 
     def turns(self, outline: Outline) -> bool:
         """Whether it is the same all around e3."""
-        return outline.span is not None and scalar_turns(self.text, outline.span)
+        return outline.meridian is not None and scalar_is_axisymmetric(self.text, outline.meridian)
 
     def mirrored(self, mirror: Mirror, outline: Outline) -> bool:
         """Whether a plane mirrors it."""
@@ -149,7 +149,7 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr] | None
-    parameters: tuple[float | Array | Free | GivenField | ByPlace | Coefficient, ...] = ()
+    parameters: tuple[float | Array | Free | UserField | ByPlace | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
@@ -222,7 +222,7 @@ class OwnTerm:
     @property
     def varying(self) -> bool:
         """Whether a parameter is a function of the place."""
-        return any(isinstance(p, GivenField | ufl.Coefficient) for p in self.parameters)
+        return any(isinstance(p, UserField | ufl.Coefficient) for p in self.parameters)
 
     @property
     def by_place(self) -> tuple[ByPlace, ...]:
@@ -232,7 +232,7 @@ class OwnTerm:
     def with_functions(
         self,
         made: Callable[[ByPlace], Coefficient],
-        carried: Callable[[GivenField], Coefficient] | None = None,
+        carried: Callable[[UserField], Coefficient] | None = None,
     ) -> OwnTerm:
         """With functions of numbers (size,) on a model's mesh in place of formulas and of fields
         that were given.
@@ -241,7 +241,7 @@ class OwnTerm:
         def function_of(p: Any) -> Any:
             if isinstance(p, ByPlace):
                 return made(p)
-            return carried(p) if carried and isinstance(p, GivenField) else p
+            return carried(p) if carried and isinstance(p, UserField) else p
 
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
@@ -337,11 +337,11 @@ class OwnTerm:
         def image(r0: Array, u: Array, m: Array) -> Sample:
             return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S, m[::-1]
 
-        if self.on is not None and mirror.other(self.on) != self.on:
+        if self.on is not None and mirror.image_of_edge(self.on) != self.on:
             return False
         return all(self._same(sample, image(*sample)) for sample in _random_samples())
 
-    def leaves(self, outline: Outline) -> Leaves:
+    def leaves(self, outline: Outline) -> SymmetryConstraint:
         """The symmetry that it leaves."""
         turns = self.turns and all(p.turns(outline) for p in self.by_place)
 
@@ -349,10 +349,10 @@ class OwnTerm:
             return self.mirrored(mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
 
         shared, name = (
-            self.mirrored(Y0) and turns,
+            self.mirrored(Y0_PLANE) and turns,
             self.name + (" or what it observes" if self.observed else ""),
         )
-        return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
+        return SymmetryConstraint(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
     @property
     def digest(self) -> str:
@@ -365,7 +365,7 @@ class OwnTerm:
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
-        text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, GivenField))
+        text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, UserField))
         text += "".join(f" {p.text}" for p in self.by_place)
         text += "" if self.on is None else f" on {self.on}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -499,10 +499,10 @@ def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array | Free | GivenField | ByPlace | Coefficient) -> Expr:
+def _as_expression(value: float | Array | Free | UserField | ByPlace | Coefficient) -> Expr:
     if isinstance(value, ByPlace):  # of any value
         value = 1.0
-    if isinstance(value, GivenField):
+    if isinstance(value, UserField):
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
     if isinstance(value, ufl.Coefficient):  # of any value

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import Rubberlike
 from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, OfShells
@@ -173,7 +173,7 @@ class Move:
     """A motion of supports: edges, points or patches that are held."""
 
     names: tuple[str, ...]
-    motion: Motion
+    motion: RigidMotion
 
 
 def default_penalty(degree: int) -> float:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
-from magshell_fenicsx.assembly.following import Follows
+from magshell_fenicsx.assembly.free_parameters import FreeParameter
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameters import Parameter
+from magshell_fenicsx.assembly.memo import Memo
 from magshell_fenicsx.assembly.point_kernels import PointKernel
 from magshell_fenicsx.assembly.shape_tables import (
-    Sheet,
-    Table,
+    PointSampling,
+    ShapeTable,
     cell_frames,
     cell_rule,
     edge_covector,
@@ -137,13 +137,13 @@ class _Cells:
         V = r0.function_space
         self.names = [term.name for term in terms]
         X, self._weights = cell_rule(degree)
-        table, each = Table.tabulate(V.element.basix_element, X), len(X)
+        table, each = ShapeTable.tabulate(V.element.basix_element, X), len(X)
         parts = [
             name
             for name in NAMES
             if name in FIRST or any(name in term.density.jet_parts for term in terms)
         ]
-        self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
+        self._sheet = PointSampling(table, self._weights, [NAMES.index(part) for part in parts])
         cells, frames = (
             np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32),
             cell_frames(V.mesh),
@@ -153,7 +153,7 @@ class _Cells:
         def placement() -> Array:
             return _placement(r0, table, frames, parts)[cells].reshape(count, 3 * len(parts))
 
-        placed = Follows(placement, lambda: (r0.x.array,))
+        placed = Memo(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
             terms,
             parts,
@@ -205,18 +205,18 @@ class _Edges:
     ) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
-        rules = [edge_rule(degree, edge, backwards=False) for edge in range(3)]
+        rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
         self._weights = rules[0][1]
         each = len(self._weights)
         X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
-        table = Table.tabulate(V.element.basix_element, X)
+        table = ShapeTable.tabulate(V.element.basix_element, X)
         parts = [
             name
             for name in NAMES
             if name in CURVED or any(name in term.density.jet_parts for term in terms)
         ]
         self._width = 3 * len(parts)
-        self._sheet = Sheet(table, w, [NAMES.index(part) for part in parts])
+        self._sheet = PointSampling(table, w, [NAMES.index(part) for part in parts])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
         self._there, self._back = (np.empty((len(cells) * len(X), self._width)) for _ in range(2))
         self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
@@ -229,7 +229,7 @@ class _Edges:
             }
 
         on_terms = {term.name: _where(V, term.density, frames, each) for term in terms}
-        placed = Follows(placements, lambda: (r0.x.array,))
+        placed = Memo(placements, lambda: (r0.x.array,))
 
         def placed_on(name: str) -> Array:
             return placed.renew()[name]
@@ -242,7 +242,7 @@ class _Edges:
                     len(rows), rows.shape[1] * field.ufl_shape[0]
                 )
 
-            at_cells = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
+            at_cells = Memo(partial(placed_on, term.name), lambda: (r0.x.array,))
             points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log)
             self._on[term.name] = rows, points
 
@@ -289,7 +289,7 @@ class _Edges:
             yield numbers, points.evaluate(chunk, kernel)
 
 
-def _placement(r0: fem.Function, table: Table, frames: Array, parts: Sequence[str]) -> Array:
+def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequence[str]) -> Array:
     """(local cells, points, parts, 3) in the cells' own coordinates."""
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
     jet = in_own_coordinates(
@@ -349,7 +349,7 @@ class Slope:
 
 def point_parameters(
     constants: Mapping[str, fem.Constant], terms: Sequence[ShellTerm], serve: Serve
-) -> dict[str, Parameter]:
+) -> dict[str, FreeParameter]:
     """The free parameters of a shell, by name; collective.
 
     Parameters
@@ -364,7 +364,7 @@ def point_parameters(
         of_terms = slopes(p, terms, f"by {name}", serve)
         for served in {id(slope.points): slope.points for slope in of_terms}.values():
             served.begin()
-        parameters[name] = Parameter(
+        parameters[name] = FreeParameter(
             p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve)
         )
     return parameters

@@ -15,11 +15,16 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.batches import Batch, Blocks, Contraction
-from magshell_fenicsx.assembly.following import Follows, PointField, values_of
+from magshell_fenicsx.assembly.batches import Contraction, EntityBatch, HessianBlocks
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Pair, Pairs, Points, point_hessian
-from magshell_fenicsx.assembly.shape_tables import PARTS
+from magshell_fenicsx.assembly.memo import Memo, PointField, memo_input
+from magshell_fenicsx.assembly.point_kernels import (
+    BlockPairs,
+    IndexPair,
+    PointStorage,
+    point_hessian,
+)
+from magshell_fenicsx.assembly.shape_tables import JET_SIZE
 from magshell_fenicsx.models.shell.energy import Density, HessianTerm, Parameter, ShellTerm
 from magshell_fenicsx.models.shell.kinematics import Jet, strain_components
 
@@ -50,7 +55,7 @@ class Site:
     def __init__(
         self,
         r0: fem.Function,
-        batches: list[Batch],
+        batches: list[EntityBatch],
         sides: int,
         terms: Sequence[PointTerm],
         log: KernelLog,
@@ -58,10 +63,10 @@ class Site:
     ) -> None:
         V = r0.function_space
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
-        self._points = Points(max([1, *(batch.size for batch in batches)]))
-        self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
+        self._points = PointStorage(max([1, *(batch.size for batch in batches)]))
+        self._u, self._r0 = (self._points.field(3 * JET_SIZE * sides) for _ in range(2))
         self._geometry = self._points.field(2 * sides + 1)
-        self._placements = Follows(
+        self._placements = Memo(
             lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
         )
         self._kernels = {
@@ -82,7 +87,7 @@ class Site:
             kernel.begin(self._u, self._r0, self._geometry, sides, log)
         self.coupling = batches if sides == 2 else []
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
-        pairs = Pairs(tuple(sorted(pairs.same, key=_neighbours)), pairs.cross)
+        pairs = BlockPairs(tuple(sorted(pairs.within_side, key=_neighbours)), pairs.cross)
         self._coupled = pairs
         self._contractions = {
             rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}
@@ -118,13 +123,13 @@ class Site:
             fill(self._u, self._jets(batch, u))
             fill(self._r0, placements[number])
             fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
-            contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
+            contraction, blocks = self._contractions[batch.rule], HessianBlocks(batch, self._coupled)
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
             if self._replaced and self._prestress:
                 blocks.add(self._prestress.evaluate(number), 1.0, self._prestress.pairs)
             for side, cells in enumerate(batch.cells):
-                same[cells] += contraction.same(blocks, side)
+                same[cells] += contraction.within_side(blocks, side)
             if self._sides == 2:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
@@ -151,7 +156,7 @@ class Site:
         self._prestress.renew()
         self._replaced = True
 
-    def _jets(self, batch: Batch, field: Array) -> Array:
+    def _jets(self, batch: EntityBatch, field: Array) -> Array:
         """(points, sides, 6, 3) of a field."""
         nodes = field.reshape(-1, 3)
         both = [
@@ -165,7 +170,7 @@ class Kernel:
     """The point Hessian of one term on a site."""
 
     def __init__(
-        self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool
+        self, name: str, density: Density, points: PointStorage, batches: list[EntityBatch], *, of_v: bool
     ) -> None:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
@@ -180,7 +185,7 @@ class Kernel:
         """Declare the kernel."""
         density, name, of_v = self._density, self._name, self._of_v
         self.pairs = _pairs(density)
-        z = self._points.field(3 * PARTS) if of_v else u
+        z = self._points.field(3 * JET_SIZE) if of_v else u
         jets = [
             [_jet(field, side) for side in range(sides)]
             for field in ((r0, u, z) if of_v else (r0, u))
@@ -193,7 +198,7 @@ class Kernel:
             density.work
         ):  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
             W = ufl.dot(ufl.diff(W, u), z) / 2
-        self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, at_zero=of_v)
+        self._hessian = point_hessian(name, W, z, JET_SIZE, self.pairs, log, at_zero=of_v)
 
     def vary(self, number: int, values: Array) -> None:
         """Give the first parameter that varies its values at the points of a batch."""
@@ -213,33 +218,33 @@ class Kernel:
 
 def _strain(r0: Array, u: Array) -> Array:
     """(points, 3): E_11, E_12, E_22 from jets (..., 6, 3)."""
-    first0, first = (np.moveaxis(jets.reshape(-1, PARTS, 3)[:, 1:3], 1, 0) for jets in (r0, u))
+    first0, first = (np.moveaxis(jets.reshape(-1, JET_SIZE, 3)[:, 1:3], 1, 0) for jets in (r0, u))
     return np.stack(strain_components(first0, first, partial(np.einsum, "pc,pc->p")), axis=1)
 
 
-def _pairs(density: Density) -> Pairs:
+def _pairs(density: Density) -> BlockPairs:
     """Those of the parts that the density depends on, without those in which it is linear."""
     parts = [NAMES.index(name) for name in density.parts]
     linear = [NAMES.index(name) for name in density.linear]
 
-    def coupled(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+    def coupled(pairs: Iterable[IndexPair]) -> tuple[IndexPair, ...]:
         return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
 
     same = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
-    return Pairs(same, coupled(product(parts, parts)) if density.sides == 2 else ())
+    return BlockPairs(same, coupled(product(parts, parts)) if density.sides == 2 else ())
 
 
-def _neighbours(pair: Pair) -> tuple[int, Pair]:
+def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:
     return max(RANK[pair[0]], RANK[pair[1]]), pair
 
 
 def _jet(field: fem.Function, side: int) -> Jet:
-    parts = range(side * PARTS, (side + 1) * PARTS)
+    parts = range(side * JET_SIZE, (side + 1) * JET_SIZE)
     return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
 
 
 def parameters_at(
-    points: Points, parameters: Sequence[Parameter], sides: int
+    points: PointStorage, parameters: Sequence[Parameter], sides: int
 ) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
     """A density's parameters at points; those that vary, to be filled, are told with the fields
     that they stand for.
@@ -262,7 +267,7 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
     it.
     """
     if isinstance(field, PointField):
-        return field.at(cells)
+        return field.at_cells(cells)
     Q, size = field.function_space, field.ufl_shape[0]
     values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
     nodal = field.x.array.reshape(-1, size)[Q.dofmap.list[cells]]
@@ -270,16 +275,16 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
 
 
 def on_batches(
-    field: fem.Function, batches: Sequence[Batch], sides: int = 1
-) -> Follows[list[Array]]:
+    field: fem.Function, batches: Sequence[EntityBatch], sides: int = 1
+) -> Memo[list[Array]]:
     """The values of a field that varies over the cells, at the points of each batch."""
-    return Follows(
+    return Memo(
         lambda: [_on_sides(field, batch, range(sides)) for batch in batches],
-        lambda: (values_of(field),),
+        lambda: (memo_input(field),),
     )
 
 
-def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:
+def _on_sides(field: fem.Function, batch: EntityBatch, sides: range) -> Array:
     """(points, sides * components) on the edges, or in the cells, of a batch."""
     values = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
     return np.hstack(values) if len(values) > 1 else values[0]

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.patch import Deviated
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import (
     PointFields,
@@ -77,7 +77,7 @@ class RevolvedGatherer:
         self._fields = PointFields(r, model.material, loads.magnetic, thick, *others, made_of)
         self._stresses = Stresses(inner, model.material, thick_inside, loads.natural, made_of)
         self._at_ends = Stresses(r, model.material, thick).frame
-        if isinstance(model.meridian.embedding, Deviated):
+        if isinstance(model.meridian.embedding, DeviatedEmbedding):
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
             deviations = (*embedding.deviations, *grown(loads.growing, mu))
             w0 = (
@@ -108,7 +108,7 @@ class RevolvedGatherer:
         if self.comm.rank:
             return None
         state = State(u, dict(mu or {}))
-        return self._model.system.at(state).of(lambda: self._drawn(state))
+        return self._model.system.at_state(state).evaluate(lambda: self._drawn(state))
 
     def _drawn(self, state: State) -> Surface:
         """The surface at the displacement and the placement that are set."""

@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.law import Law, OfShells
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape.drawn_bodies import Solid
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -140,8 +140,8 @@ class SurfaceGatherer:
             local.shape
         )
         self._recovered: RecoveredShell | None = None
-        undeformed = model.system.at(State(model.zero(), {}))
-        undeformed.of(lambda: self._take_placement({}, self._gathered(numbers)))
+        undeformed = model.system.at_state(State(model.zero(), {}))
+        undeformed.evaluate(lambda: self._take_placement({}, self._gathered(numbers)))
 
     def _take_placement(
         self, mu: Mapping[str, float], numbers: NDArray[np.int64] | None = None
@@ -212,7 +212,7 @@ class SurfaceGatherer:
         ranks.
         """
         state = State(u, dict(mu or {}))
-        return self._model.system.at(state).of(lambda: self._drawn(state))
+        return self._model.system.at_state(state).evaluate(lambda: self._drawn(state))
 
     def _drawn(self, state: State) -> Surface | None:
         """The surface at the displacement and the placement that are set."""
@@ -497,6 +497,6 @@ def _moved(surface: Surface, Q: Array) -> Surface:
 
     fields = {name: moved(f) for name, f in surface.fields.items()}
     lines = tuple(line @ Q for line in surface.outlines)
-    solids = tuple(solid.moved(Q.T, np.zeros(3)) for solid in surface.solids)
+    solids = tuple(solid.transformed(Q.T, np.zeros(3)) for solid in surface.solids)
     r0, u, n0 = (moved(f) for f in (surface.r0, surface.u, surface.n0))
     return replace(surface, r0=r0, u=u, n0=n0, fields=fields, outlines=lines, solids=solids)

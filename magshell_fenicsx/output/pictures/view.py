@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellated
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.colors import Colormap
 from collections.abc import Sequence
 
-from magshell_fenicsx.problem.wanted import OutputSection
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -220,7 +220,7 @@ def in_pixels(drawn: NDArray[np.bool_]) -> Array:
 @cache
 def library() -> tuple[Any, Any]:
     """The cffi objects of raster.c, compiled on first use."""
-    return native(Path(__file__).with_name("raster.c"), FUNCTIONS, MPI.COMM_SELF)
+    return load_native(Path(__file__).with_name("raster.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:

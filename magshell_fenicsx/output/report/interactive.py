@@ -27,7 +27,7 @@ from magshell_fenicsx.output.pictures.lines import (
     axes_for,
     drawn_parts,
     is_unstable,
-    lines_of,
+    line_coordinates,
     named,
     of_load,
 )
@@ -35,10 +35,10 @@ from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, fr
 from magshell_fenicsx.output.pictures.view import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
-from magshell_fenicsx.platform.kept import keep, recall
+from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude, quantity
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
 SAME = 1e-7  # places over R that are one vertex
@@ -279,7 +279,7 @@ def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:
                 "in_time": it.in_time,
                 "level": it.level,
             }
-            for it in lines_of(part)
+            for it in line_coordinates(part)
         ],
     }
 
@@ -425,8 +425,8 @@ def _kept(file: Path) -> str:
     """A file, packed once for all runs."""
     about = file.stat()
     name = f"packed_{file.name}_{about.st_size}_{about.st_mtime_ns}_{LEVEL}"
-    if kept := recall(name):
+    if kept := load_cached(name):
         return kept.decode()
     packed_file = packed(file.read_bytes())
-    keep(name, packed_file.encode())
+    save_cached(name, packed_file.encode())
     return packed_file

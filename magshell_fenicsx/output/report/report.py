@@ -30,7 +30,7 @@ from magshell_fenicsx.output.report.verdict import (
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import headline, is_flat, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
-from magshell_fenicsx.platform.kept import keep, recall
+from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.registry import amplitude, shown
 
 NAME, TEMPLATE = "report.html", "report_template.html"
@@ -100,11 +100,11 @@ def report(folder: Path, *, playable: bool = True) -> str:
         """
 
         def load_bytecode(self, bucket: Bucket) -> None:
-            if code := recall(f"template_{bucket.key}"):
+            if code := load_cached(f"template_{bucket.key}"):
                 bucket.bytecode_from_string(code)
 
         def dump_bytecode(self, bucket: Bucket) -> None:
-            keep(f"template_{bucket.key}", bucket.bytecode_to_string())
+            save_cached(f"template_{bucket.key}", bucket.bytecode_to_string())
 
     loader = FileSystemLoader(Path(__file__).parent)
     made = Environment(

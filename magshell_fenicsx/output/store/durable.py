@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.reading import open_regular, read_whole
+from magshell_fenicsx.platform.input_files import open_regular, read_bounded
 
 # s between two waits for the disk: on a busy one each takes as long as a point of a small model
 EACH = 1.0
@@ -24,7 +24,7 @@ class Damaged(CaseError):
 def read_result(file: Path) -> bytes:
     """The content of a file of results; see `open_result`."""
     try:
-        return read_whole(file)
+        return read_bounded(file)
     except OSError as e:
         raise _special(e) from None
 

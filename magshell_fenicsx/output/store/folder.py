@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.processes import from_first
-from magshell_fenicsx.platform.reading import read_whole
+from magshell_fenicsx.platform.processes import on_first_rank
+from magshell_fenicsx.platform.input_files import read_bounded
 
 if TYPE_CHECKING:  # a refused case does without
     from mpi4py import MPI
@@ -100,7 +100,7 @@ def refuse_others(
 def _object(file: Path) -> dict[str, Any]:
     """The JSON object in a file; empty if there is none."""
     try:
-        content = json.loads(read_whole(file))
+        content = json.loads(read_bounded(file))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -130,7 +130,7 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
             ) from None
         return out
 
-    return from_first(comm, made)
+    return on_first_rank(comm, made)
 
 
 @contextmanager
@@ -178,7 +178,7 @@ def by_first(
     do: Callable[[], T],
     failed: Literal["cannot be written", "cannot be read"] = "cannot be written",
 ) -> T:
-    """Let rank 0 write or read; return its result on every rank, see `from_first`. Collective.
+    """Let rank 0 write or read; return its result on every rank, see `on_first_rank`. Collective.
 
     Raises
     ------
@@ -192,4 +192,4 @@ def by_first(
         except OSError as e:
             raise DiskError(f"{e.filename or 'the results'} {failed}: {e.strerror or e}") from e
 
-    return from_first(comm, done)
+    return on_first_rank(comm, done)

@@ -21,7 +21,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
+from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
 from magshell_fenicsx.parts.gap import SOFT, Thinning, expanded, mean_pressure, penalty, thinned
@@ -251,7 +251,7 @@ class Pressing:
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, SIZE)
         self._points, self._degree = self.polynomial.points, degree
-        self._r0 = Follows(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
+        self._r0 = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
         thick = [] if thickness is None else [thickness.x.array]
 
         thins = thinning and thinning(self._points)
@@ -262,7 +262,7 @@ class Pressing:
             )
             return given if thins is None else given * thins.renew()
 
-        self._factor = Follows(factor, lambda: (*thick, *([thins.renew()] if thins else [])))
+        self._factor = Memo(factor, lambda: (*thick, *([thins.renew()] if thins else [])))
         self._face = (
             None if thickness is None and thins is None else PointField(V.mesh, degree, FACE)
         )
@@ -293,11 +293,11 @@ class Pressing:
         def forces() -> tuple[Array, ...]:
             return *places(), self.stiffness.value, *self._mean, *self._about
 
-        self._gaps = Follows(lambda: self._gap_at(self.place, self.factor), places)
-        self._pressed = Follows(self._expanded, forces)
-        self.polynomial.follow(self._polynomials, forces)
+        self._gaps = Memo(lambda: self._gap_at(self.place, self.factor), places)
+        self._pressed = Memo(self._expanded, forces)
+        self.polynomial.compute_by(self._polynomials, forces)
         if self._face is not None:
-            self._face.follow(self._by_thickness, forces)
+            self._face.compute_by(self._by_thickness, forces)
 
     @property
     def history(self) -> tuple[str, tuple[fem.Constant, float]]:

@@ -184,7 +184,7 @@ def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, 
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
     near = (
-        np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
+        np.linalg.norm(V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[:owned]] - x, axis=2) < 1e-9
     )
     near = near if beside is None else near & beside[:owned, None]
     return gradients, near, np.einsum("dvk,cki->dcvi", gradients, nodes)
@@ -193,7 +193,7 @@ def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
     """A load as the model takes it; `name` is for its energy, if it has one."""
     mirror = modelled.mirror
-    shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
+    shared = mirror is not None and (load.edge is None or mirror.image_of_edge(load.edge) == load.edge)
     Q, scales = rotation(modelled.turn), context.scales
     E, t, R = scales.E, scales.h, scales.R
     if load.potential is not None:
@@ -413,4 +413,4 @@ class SurfaceMeasures:
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         surface = self._midsurface
-        return point_entries(self._V, surface.points[name], force, surface.beside(name))
+        return point_entries(self._V, surface.points[name], force, surface.cells_of_point(name))

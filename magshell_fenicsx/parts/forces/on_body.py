@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, face_measure
+from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyMesh, face_measure
 from magshell_fenicsx.models.shell.patterns import (
     Pattern,
     cells_of_body,
@@ -32,7 +32,7 @@ class BodyMeasures:
     Resultants are the shell's where the mid-surface is flat, else to the order of (h/R)^2.
     """
 
-    def __init__(self, body: Body, V: fem.FunctionSpace, log: KernelLog) -> None:
+    def __init__(self, body: BodyMesh, V: fem.FunctionSpace, log: KernelLog) -> None:
         self._body, self._V, self._log = body, V, log
         J = ufl.Jacobian(body.mesh)
         m = ufl.cross(J[:, 0], J[:, 1])
@@ -56,7 +56,7 @@ class BodyMeasures:
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
         nodes, normals = places_in_body(self._V)
-        z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[
+        z = self._body.at_nodes(self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness)[
             self._V.dofmap.list
         ]
         field = fem.Function(
@@ -89,7 +89,7 @@ class BodyMeasures:
 
     def _reach(self, x: Array, n: Array) -> float:
         """Distance from the normal line at x of the farthest node of the cells around it."""
-        X = self._body.mesh.geometry.x[compat.corner_numbers(self._body.mesh)] - x
+        X = self._body.mesh.geometry.x[compat.geometry_dofs(self._body.mesh)] - x
         around = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
         across = around - (around @ n)[..., None] * n
         return float(
@@ -97,20 +97,20 @@ class BodyMeasures:
         )
 
 
-def thickness_at(body: Body, x: Array) -> float:
+def thickness_at(body: BodyMesh, x: Array) -> float:
     """h over R at a vertex of the mid-surface; collective."""
     near = np.linalg.norm(body.mesh.geometry.x - x, axis=1) < 1e-9
     return float(body.mesh.comm.allreduce(body.thickness[near].max(initial=0.0), MPI.MAX))
 
 
 def outer_patch(
-    body: Body, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
+    body: BodyMesh, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
 ) -> Entries:
     """An inward force averaged over the outer face around a point, with the weight `smooth`."""
     x, normal = body.points[point], body.normals[point]
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)
-    ds = face_measure(body.mesh, [body.faces[OUTER]])(1)
+    ds = face_measure(body.mesh, [body.faces[OUTER_FACE]])(1)
     return averaged(
         V, -normal, Weighted(smooth(ufl.SpatialCoordinate(body.mesh) - centre, a), ds), log, radius
     )

@@ -18,11 +18,11 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
-from magshell_fenicsx.platform.reading import Files
-from magshell_fenicsx.shape.ground import Ground
+from magshell_fenicsx.platform.input_files import Files
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 if TYPE_CHECKING:  # SciPy and the solver take their time, and a case alone does not need them
-    from magshell_fenicsx.mesh.scattered import Scattered
+    from magshell_fenicsx.mesh.scattered_data import ScatteredSpline
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class DataSection(FileKeys, ImperfectionSection):
     def account(self) -> str:
         return f"data of {self.file}"
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`.
 
         Raises
@@ -89,7 +89,7 @@ class DataSection(FileKeys, ImperfectionSection):
 class Factored:
     """A function of place times a factor; both over R."""
 
-    function: "Scattered"
+    function: "ScatteredSpline"
     factor: float
 
     def __call__(self, places: Array) -> Array:
@@ -204,18 +204,18 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
 
 @dataclass(frozen=True)
 class _Fit:
-    function: "Scattered"
+    function: "ScatteredSpline"
     size: float
     account: str
 
 
-def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
+def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
     """The smooth function; `standard` is the standard deviation of the noise over h, None to
     estimate it.
     """
     import scipy
 
-    from magshell_fenicsx.mesh.scattered import scattered
+    from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
     h, surface = ground.h, ground.perfect.sample()
     places, w0 = _on_surface(scan, ground, surface)
@@ -240,7 +240,7 @@ def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
         )
     places, w0 = _merged(places, w0, SAME * spacing)
     noise = None if standard is None else standard * h
-    function = scattered(places, w0, surface, noise=noise)
+    function = fit_scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
         f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, "
@@ -253,7 +253,7 @@ def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
     )
 
 
-def _on_surface(scan: Scan, ground: Ground, surface: Array) -> tuple[Array, Array]:
+def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Array, Array]:
     """Places (n, 3) of the perfect surface and w0 (n,), over R."""
     import scipy
 
@@ -302,7 +302,7 @@ def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     ) / count
 
 
-def _bend(function: "Scattered", x: Array, length: float) -> float:
+def _bend(function: "ScatteredSpline", x: Array, length: float) -> float:
     """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over
     a length over R.
     """

@@ -11,14 +11,14 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Place
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
-from magshell_fenicsx.platform.reading import vtk_data
-from magshell_fenicsx.shape.ground import ON_AXIS, Ground
+from magshell_fenicsx.platform.input_files import read_vtk
+from magshell_fenicsx.shape.reference_shell import ON_AXIS, ReferenceShell
 
 if TYPE_CHECKING:  # SciPy takes its time, and a case alone does not need it
-    from magshell_fenicsx.mesh.scattered import Scattered
+    from magshell_fenicsx.mesh.scattered_data import ScatteredSpline
 
 Array = NDArray[np.float64]
 Shape = Callable[[Array], Array]
@@ -76,7 +76,7 @@ class ModesSection(FileKeys, ImperfectionSection):
     def of_perfect_shell(self) -> bool:
         return self.file is None
 
-    def become(self, modes: "Sequence[Mode]", name: str = "", place: Place | None = None) -> None:
+    def become(self, modes: "Sequence[Mode]", name: str = "", place: ShellPose | None = None) -> None:
         """Take the modes of the perfect shell, or the parts of the shell `name` in those of
         several.
 
@@ -102,7 +102,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             )
         self._shapes = tuple(part or _still for part in parts)
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`; modes that are not yet computed are zero.
 
         Raises
@@ -141,7 +141,7 @@ class Modes:
 class Round:
     """f(rho, z) cos(m theta), f through its values at places (rho, 0, z) of the meridian."""
 
-    f: "Scattered"
+    f: "ScatteredSpline"
     m: int
 
     def __call__(self, places: Array) -> Array:
@@ -161,7 +161,7 @@ class Mirrored:
     sign: float
 
     def __call__(self, places: Array) -> Array:
-        beyond = self.mirror.beyond(places) < 0
+        beyond = self.mirror.signed_distance(places) < 0
         on_this_side = np.where(beyond[:, None], self.mirror.image(places), places)
         return np.asarray(self.shape(on_this_side) * np.where(beyond, self.sign, 1.0))
 
@@ -175,7 +175,7 @@ class Placed:
     """A mode in the frame of a shell that has its place among others."""
 
     shape: Shape
-    place: Place
+    place: ShellPose
 
     def __call__(self, places: Array) -> Array:
         return self.shape(self.place(places))
@@ -196,32 +196,32 @@ class OfShells:
 Mode = Shape | OfShells
 
 
-def on_surface(places: Array, w: Array, cover: Array) -> "Scattered":
+def on_surface(places: Array, w: Array, cover: Array) -> "ScatteredSpline":
     """A mode from its inward displacements (n,), over the largest, at places (n, 3)."""
-    from magshell_fenicsx.mesh.scattered import scattered
+    from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
-    return scattered(places, w, cover, noise=0)
+    return fit_scattered(places, w, cover, noise=0)
 
 
 def on_meridian(places: Array, f: Array, m: int) -> Round:
     """A wave around e3 from these displacements (n,) at places (n, 3) of the meridian, with its
     parity across e3.
     """
-    from magshell_fenicsx.mesh.scattered import scattered
+    from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
     if places[:, 0].min() < ON_AXIS:
         places, f = (
             np.vstack([places, places * [-1.0, 1.0, 1.0]]),
             np.concatenate([f, (-1) ** m * f]),
         )
-    return Round(scattered(places, f, places, noise=0), m)
+    return Round(fit_scattered(places, f, places, noise=0), m)
 
 
-def _read(section: ModesSection, sample: Array, key: str) -> "Scattered":
+def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
     import scipy
 
     try:
-        fields = vtk_data(section.files.content(section.path), section.path.suffix).point_data
+        fields = read_vtk(section.files.content(section.path), section.path.suffix).point_data
         r0, w = (np.asarray(fields[name], dtype=float) for name in ("r0", "mode_w"))
     except Exception as e:  # VTK and pyvista raise many types
         said = getattr(e, "strerror", None) or e

@@ -16,9 +16,9 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
+from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter, derived
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameters import Derivative, Parameter, derived
+from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
@@ -95,15 +95,15 @@ class AppliedField:
         self.lost = ""
         self._here: list[Here] = []
         points = self.polynomial.points
-        self._r0 = Follows(lambda: at_quadrature(r0, points), lambda: (r0.x.array,))
-        self._moved = Follows(lambda: at_quadrature(u, points), lambda: (u.x.array,))
-        self._still = Follows(lambda: of(self.places), lambda: (r0.x.array, u.x.array))
+        self._r0 = Memo(lambda: at_quadrature(r0, points), lambda: (r0.x.array,))
+        self._moved = Memo(lambda: at_quadrature(u, points), lambda: (u.x.array,))
+        self._still = Memo(lambda: of(self.places), lambda: (r0.x.array, u.x.array))
         places = self._r0.renew()
         B, G, H = self._sum(of(places.reshape(-1, 3)), places.reshape(-1, 3))
         differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
         self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
         refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
-        self.polynomial.follow(
+        self.polynomial.compute_by(
             self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values())
         )
 
@@ -131,7 +131,7 @@ class AppliedField:
             there.
         """
         field = PointField(self._u.function_space.mesh, self._degree, SIZE)
-        field.follow(
+        field.compute_by(
             lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),)
         )
         return field
@@ -224,13 +224,13 @@ class Amplitude:
             self._along(t, self.known.slope(self.name, moved=False)) for t in self._quadratic
         ]
 
-    def bends(self, q: Any) -> Sequence[Derivative]:
+    def second_derivatives(self, q: Any) -> Sequence[Derivative]:
         """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its
         own.
         """
         if not isinstance(q, Amplitude):
-            if hasattr(q, "bends"):
-                derivatives: Sequence[Derivative] = q.bends(self)
+            if hasattr(q, "second_derivatives"):
+                derivatives: Sequence[Derivative] = q.second_derivatives(self)
                 return derivatives
             entered = [t for t in self.slopes() if q in t.form.constants()]
             return [self._term(t, derived(t.form, q)) for t in entered]
@@ -266,7 +266,7 @@ class Amplitude:
 
 def field_parameters(
     fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
-) -> dict[str, Parameter]:
+) -> dict[str, FreeParameter]:
     """The amplitudes of driven fields, by name; collective."""
     parameters = {}
     for field in fields:
@@ -280,5 +280,5 @@ def field_parameters(
             slopes = p.slopes()
             for each in slopes:
                 each.compile_residual()
-            parameters[name] = Parameter(p, slopes, p.bends)
+            parameters[name] = FreeParameter(p, slopes, p.second_derivatives)
     return parameters

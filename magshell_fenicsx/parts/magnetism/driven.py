@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.motion import Motion, moved
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion, apply_motions
 
 Array = NDArray[np.float64]
 Velocity = tuple[Array, Array]  # A, v of w(x) = A x + v
@@ -35,7 +35,7 @@ class Driven:
     """
 
     of: FieldInSpace
-    motions: Sequence[Motion] = ()
+    motions: Sequence[RigidMotion] = ()
     factors: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -125,7 +125,7 @@ class Here:
         return A, np.asarray(Q @ v - A @ t)
 
 
-def carried(motions: Sequence[Motion], mu: Mapping[str, float]) -> tuple[Array, Array]:
+def carried(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
     """x -> Q x + t of all motions together."""
-    origin, *ends = moved(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
+    origin, *ends = apply_motions(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
-from magshell_fenicsx.assembly.whole import Singles
+from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
 from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
 from magshell_fenicsx.parts.magnetism.charged import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
@@ -287,7 +287,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class ActingOnEachOther:
-    """Second derivatives of the energy of all charges: an `assembly.whole.Acting`.
+    """Second derivatives of the energy of all charges: an `assembly.dense_tangent.DenseHessian`.
 
     Attributes
     ----------
@@ -309,11 +309,11 @@ class ActingOnEachOther:
     turning: Turning
 
     @cached_property
-    def stored(self) -> bsr_array:
-        """See `assembly.whole.Acting`."""
+    def near_blocks(self) -> bsr_array:
+        """See `assembly.dense_tangent.DenseHessian`."""
         return self.near.matrix(self.sign)
 
-    def turned(self, q: Array) -> Singles | None:
+    def turned(self, q: Array) -> SinglePrecisionBlocks | None:
         """The blocks `beside` where nodes are turned by q (nodes, 4); None of several images."""
         return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept)
 
@@ -321,8 +321,8 @@ class ActingOnEachOther:
     def _kept(self) -> Kept:
         return self.turning.kept(self.near, self.beside)
 
-    def times_others(self, v: Array) -> Array:
-        """See `assembly.whole.Acting`."""
+    def times_far(self, v: Array) -> Array:
+        """See `assembly.dense_tangent.DenseHessian`."""
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
         of_cell, onto = self.far.between(_each(self.B, self.cells.of_copies(v, self.sign)))
         return self.scale * self.cells.summed(

@@ -8,9 +8,9 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.soft import Soft
@@ -76,8 +76,8 @@ class Magnetisation:
     in_space: FieldInSpace | None = None
     axes: tuple[NDArray[np.float64], ...] = ()
     driven: tuple[Driven, ...] = ()
-    turns: tuple[Motion, ...] = ()
-    given: GivenField | None = None
+    turns: tuple[RigidMotion, ...] = ()
+    given: UserField | None = None
     soft: Soft | None = None
     tesla: float = 1.0
     metres: float = 0.0

@@ -106,10 +106,10 @@ class OwnField:
         """
         total = np.zeros_like(places)
         for image in self._images:
-            seen_from, sign = image.back(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
-            total[self._holds(families, seen_from)] = np.nan
+            relative_to, sign = image.apply_inverse(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
+            total[self._holds(families, relative_to)] = np.nan
             out = ~np.isnan(total[:, 0])
-            total[out] += sign * field(families, seen_from[out]) @ image.Q.T
+            total[out] += sign * field(families, relative_to[out]) @ image.Q.T
         return np.asarray(self._model.system.comm.allreduce(total))
 
     def _holds(self, families: Sequence[Family], places: Array) -> NDArray[np.bool_]:
@@ -135,7 +135,7 @@ class OwnField:
             into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
             for image in self._images:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
-                gradient(families, image.back(x), sign * image.Q.T @ e, into)
+                gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, into)
             parts.append(into)
         into = Nodal(parts[0].by_u, parts[-1].by_remanence)
         return into if self._plain else self._to_material(into, mu)
@@ -146,7 +146,7 @@ class OwnField:
         """
         total = np.asarray(self._model.system.comm.allreduce(self._moment(mu)))
         if mirror := self._sight.mirror:
-            total = mirror.summed(total, self.sign_of_images(mu))
+            total = mirror.sum_over_images(total, self.sign_of_images(mu))
         return total
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
@@ -409,13 +409,13 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
             sign = own.sign_of_images(state.mu)
             copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
             all_charged = [
-                (image.of(x), factor * q) for image, factor in copies for x, q in all_charged
+                (image.apply(x), factor * q) for image, factor in copies for x, q in all_charged
             ]
         return all_charged
 
     system = sight.model.system
     all_charged = [
-        each for rank in system.comm.allgather(system.at(state).of(present)) for each in rank
+        each for rank in system.comm.allgather(system.at_state(state).evaluate(present)) for each in rank
     ]
     corners, charges = (np.concatenate([each[i] for each in all_charged]) for i in range(2))
     corners = R * corners @ Q

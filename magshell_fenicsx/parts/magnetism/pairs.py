@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
 from magshell_fenicsx.mesh.mirror import Image
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -73,7 +73,7 @@ class Copies:
 
     def of(self, nodes: Array) -> Array:
         """The nodes (copies * cells, k, 3) of all."""
-        return np.concatenate([image.of(nodes) for image in self.images])
+        return np.concatenate([image.apply(nodes) for image in self.images])
 
 
 ALL = Copies()  # of a shell that is modelled whole
@@ -185,7 +185,7 @@ class Pairs:
         source, *behind = (
             Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c")
         )
-        self._ffi, self._lib = native(source, FUNCTIONS, comm, *behind)
+        self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *behind)
 
     def add(
         self,

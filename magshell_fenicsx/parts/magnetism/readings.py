@@ -63,8 +63,8 @@ class FieldSeen(Seen):
         of = magnetised(sight.loads)
         if of is None or of.absent:
             return {}
-        at = sight.model.system.at(state)
-        moment = at.of(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)
+        at = sight.model.system.at_state(state)
+        moment = at.evaluate(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)
         size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
         unit = "√(E/μ0) R³" if of.soft and of.soft.alone else "|Br| R³/μ0"
         return {
@@ -92,7 +92,7 @@ class SoftSeen(Seen):
         field = sight.loads.magnetic
         if field is None or field.soft is None:
             return {}
-        at, forms = sight.model.system.at(state), sight.model.observed
+        at, forms = sight.model.system.at_state(state), sight.model.observed
         J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(
             forms["induced volume"]
         )
@@ -100,7 +100,7 @@ class SoftSeen(Seen):
             J[:2] = 0.0
         if sight.mirror:
             sign = field.sign_of_images(state.mu, sight.model.r0, sight.mirror)
-            J = sight.mirror.summed(J, sign) / sight.mirror.copies
+            J = sight.mirror.sum_over_images(J, sign) / sight.mirror.copies
         return dict(
             zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True)
         )
@@ -152,7 +152,7 @@ class SensorsSeen(Seen):
         (sensor, i), own = matching[0], own_field(sight)
         e = sensor.own * rotation(sight.azimuth)[:, i]
         system = sight.model.system
-        at, nodes = system.at(state), sight.model.r0.function_space.dofmap.list
+        at, nodes = system.at_state(state), sight.model.r0.function_space.dofmap.list
 
         def derived() -> tuple[Array, Array]:
             into, part = own.slope(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
@@ -160,7 +160,7 @@ class SensorsSeen(Seen):
             np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
             return part, into.by_remanence
 
-        part, by_remanence = at.of(derived)
+        part, by_remanence = at.evaluate(derived)
         by_mu = dict[str, float]()
         applied = sight.loads.magnetic
         if applied and (sensor.total or applied.soft):
@@ -210,7 +210,7 @@ def field_at(
         shell = own_field(sight)
         return own * shell.B(shell.families(state.mu)[1], state.mu, places)
 
-    B, outside = sight.model.system.at(state).of(present), sight.loads.magnetic
+    B, outside = sight.model.system.at_state(state).evaluate(present), sight.loads.magnetic
     if outside and np.any(applied):
         B = B + applied * outside.at(state.mu, places)
     return np.asarray(B @ rotation(sight.azimuth))

@@ -26,7 +26,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import PointField, at_quadrature
+from magshell_fenicsx.assembly.memo import PointField, at_quadrature
 
 Array = NDArray[np.float64]
 ORDERS = [
@@ -178,5 +178,5 @@ def point_field(
         return np.concatenate(polynomials, axis=-1)
 
     own = chi.x.array if isinstance(chi, fem.Function) else chi.value
-    field.follow(values, lambda: (own, *by()))
+    field.compute_by(values, lambda: (own, *by()))
     return field

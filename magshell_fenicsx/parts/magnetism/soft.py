@@ -20,7 +20,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import PointField
+from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.densities import around
 from magshell_fenicsx.models.shell.kinematics import Jet

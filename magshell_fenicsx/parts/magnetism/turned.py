@@ -10,9 +10,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.whole import Singles
+from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
 from magshell_fenicsx.parts.magnetism.pairs import KINDS, Stiffness
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -63,7 +63,7 @@ class Turning:
     """Turns second derivatives with their nodes; the constructor is collective."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        self._ffi, self._lib = native(Path(__file__).with_name("turned.c"), FUNCTIONS, comm)
+        self._ffi, self._lib = load_native(Path(__file__).with_name("turned.c"), FUNCTIONS, comm)
         self._upper = comm.size == 1
 
     def kept(self, stiffness: Stiffness, some: NDArray[np.bool_]) -> Kept:
@@ -74,7 +74,7 @@ class Turning:
 
     def turned(
         self, stiffness: Stiffness, sign: float, number: Ints, q: Array, kept: Kept
-    ) -> Singles | None:
+    ) -> SinglePrecisionBlocks | None:
         """Blocks of `Stiffness.matrix` where the nodes `number` (rows,) are turned by q (all nodes,
         4), scalar last.
 
@@ -96,7 +96,7 @@ class Turning:
         self._lib.turn_blocks(
             len(kept.first), *arrays, sign, p(stiffness.turn[-1]), p(number), p(q), *onto
         )
-        return Singles(kept.onto, kept.columns, values, self._upper)
+        return SinglePrecisionBlocks(kept.onto, kept.columns, values, self._upper)
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous

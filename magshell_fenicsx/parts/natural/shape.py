@@ -27,10 +27,10 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.following import at_quadrature
+from magshell_fenicsx.assembly.memo import at_quadrature
 from magshell_fenicsx.input.expressions import Together
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
-from magshell_fenicsx.mesh.patch import GivenField, MeshError
+from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
+from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
@@ -45,7 +45,7 @@ from magshell_fenicsx.models.shell.patterns import (
 )
 
 Array = NDArray[np.float64]
-Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | GivenField
+Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | UserField
 STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
 SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
 FIELD = (
@@ -87,7 +87,7 @@ class Natural:
         self,
         patches: Mapping[str, NDArray[np.bool_]],
         cells: int,
-        carried: Callable[[GivenField], Pattern] | None = None,
+        carried: Callable[[UserField], Pattern] | None = None,
     ) -> "Natural":
         """The same with a vector for each cell where it is given by patches, and with given fields
         as patterns.
@@ -103,7 +103,7 @@ class Natural:
             for key, value in given.items()
             if isinstance(value, Mapping)
         }
-        varying = {key: value for key, value in given.items() if isinstance(value, GivenField)}
+        varying = {key: value for key, value in given.items() if isinstance(value, UserField)}
         return replace(
             self, **by_cell, **{key: carried(value) for key, value in varying.items() if carried}
         )
@@ -323,7 +323,7 @@ def covariant(r0: Jet, field: Expr, first: int) -> Expr:
 def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
     if value is None:
         return np.zeros_like(r0)
-    assert not isinstance(value, Mapping | GivenField)  # a model knows them in its cells
+    assert not isinstance(value, Mapping | UserField)  # a model knows them in its cells
     return value(r0, n0) if callable(value) else np.broadcast_to(value, r0.shape)
 
 
@@ -347,7 +347,7 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
 
 
 def body_shape(
-    natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[str, fem.Constant]
+    natural: Natural, body: BodyMesh, V: fem.FunctionSpace, free: dict[str, fem.Constant]
 ) -> Shape:
     """The natural shape of a body; collective.
 
@@ -356,10 +356,10 @@ def body_shape(
     MeshError
         As `natural_field`, or if the body has no such patch.
     """
-    natural = natural.on(body.patches, len(body.between))
+    natural = natural.on(body.patches, len(body.layer_bounds))
     _, normals = places_in_body(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
-    z = body.at_nodes(Z, (body.heights - MIDDLE) * body.thickness)[Z.dofmap.list]
+    z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
     numbers = natural_field(natural, cells_of_body(V), V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
     field = fem.Function(Q, name="natural")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.course import Now, Target, Until
@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -130,10 +130,10 @@ class EdgeSection(PathStep):
                         f"can move: {', '.join(held) or 'nothing'}"
                     )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         R = context.shell.reference
         return [
-            Leaves(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))
+            SymmetryConstraint(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))
         ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
@@ -147,14 +147,14 @@ class EdgeSection(PathStep):
         }
 
 
-def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> Motion:
+def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMotion:
     """A motion with the amplitude `name`, over the length R."""
     Q, about, zero = rotation(turn), move.rotation, np.zeros(3)
     shift = Q @ (np.array(move.translation) / R) if move.translation else zero
     if about is None:
-        return Motion(name, shift, zero, zero)
+        return RigidMotion(name, shift, zero, zero)
     axis = np.array(about.axis) / np.linalg.norm(about.axis)
-    return Motion(name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R))
+    return RigidMotion(name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R))
 
 
 def sideways(load: EdgeSection) -> str | None:
@@ -178,12 +178,12 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
     """Whether a plane maps the motions onto themselves."""
     motions = {name: motion(one, "", R) for one in load.moves for name in one.supports}
     return all(
-        mirror.other(name) in motions and _is_image(one, motions[mirror.other(name)], mirror)
+        mirror.image_of_edge(name) in motions and _is_image(one, motions[mirror.image_of_edge(name)], mirror)
         for name, one in motions.items()
     )
 
 
-def _is_image(one: Motion, other: Motion, mirror: Mirror) -> bool:
+def _is_image(one: RigidMotion, other: RigidMotion, mirror: Mirror) -> bool:
     """A mirrored rotation runs the other way about the mirrored axis."""
     S, along = mirror.reflection, other.turn / (np.linalg.norm(other.turn) or 1.0)
     apart = mirror.image(one.centre) - other.centre

@@ -8,8 +8,15 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.assembly.moving import Body, Curve, Lid, Moving, Pressed, ends
+from magshell_fenicsx.assembly.prescribed_motion import (
+    EdgeCurve,
+    EdgePressure,
+    Lid,
+    PrescribedMotion,
+    RigidBody,
+    end_corners,
+)
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.parts.loads import Loads
 
 PRESSURE = "pressure"  # its amplitude
@@ -53,7 +60,7 @@ class Support:
         return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, kind)
 
 
-def motions_of(loads: Loads, name: str) -> Sequence[Motion]:
+def motions_of(loads: Loads, name: str) -> Sequence[RigidMotion]:
     """The motions of a support, in the order of the loads."""
     return [move.motion for move in loads.moves if name in move.names]
 
@@ -65,14 +72,14 @@ def rotation_of(loads: Loads, name: str, V: fem.FunctionSpace) -> fem.Constant |
 
 
 def moving(
-    r0: fem.Function, supports: Mapping[str, Support], loads: Loads, pressed: Pressed | None = None
-) -> Moving | None:
+    r0: fem.Function, supports: Mapping[str, Support], loads: Loads, pressed: EdgePressure | None = None
+) -> PrescribedMotion | None:
     """The nodes that move; None without motions."""
     moved = {name: motions_of(loads, name) for name in supports}
     bodies = [
-        Body(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]
+        RigidBody(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]
     ]
-    return Moving(r0, bodies, pressed) if bodies else None
+    return PrescribedMotion(r0, bodies, pressed) if bodies else None
 
 
 def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collection[str]) -> bool:
@@ -88,12 +95,12 @@ def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collect
 
 def pressed_edges(
     r0: fem.Function,
-    curves: Mapping[str, Curve],
+    curves: Mapping[str, EdgeCurve],
     planes: Collection[str],
     loads: Loads,
     unit: float,
     closing: NDArray[np.float64] | None,
-) -> Pressed:
+) -> EdgePressure:
     """What a live pressure does at the edges that move, of a shell that lids close; collective.
 
     Edges that move alike have one lid, if together they are closed or end on planes of symmetry.
@@ -124,10 +131,10 @@ def pressed_edges(
     lids = []
     for names in alike.values():
         of_lid = [curves[name] for name in names]
-        open_at = ends(of_lid, comm)
+        open_at = end_corners(of_lid, comm)
         if not len(open_at) or (closing is not None and np.isin(open_at, on_any).all()):
             origin = np.zeros(3) if closing is None else closing
-            lids.append(Lid.over(of_lid, x, motions_of(loads, names[0]), origin, comm))
-    return Pressed(
+            lids.append(Lid.cone(of_lid, x, motions_of(loads, names[0]), origin, comm))
+    return EdgePressure(
         PRESSURE, unit, lids, [curves[name] for names in alike.values() for name in names]
     )

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.moving import in_space
+from magshell_fenicsx.assembly.prescribed_motion import vectors_in_space
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.supports.moved import PRECEDENCE
@@ -43,7 +43,7 @@ class Reaction:
 
     def whole(self, mirror: Mirror) -> "Reaction":
         """What a support does that is its own image, the point too."""
-        return Reaction(mirror.summed(self.force), mirror.summed(self.moment, -1.0), self.point)
+        return Reaction(mirror.sum_over_images(self.force), mirror.sum_over_images(self.moment, -1.0), self.point)
 
 
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
@@ -61,7 +61,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     system, comm = model.system, model.system.comm
     R, shares = system.forces(state.u, state.mu), _shares(model)
     axes = system.u.function_space.dofmap.index_map_bs
-    r = in_space(
+    r = vectors_in_space(
         model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes
     )
     by_support: dict[str, Reaction] = {}
@@ -69,15 +69,15 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
         dofs = support.dofs[support.dofs < system.size]
         box = _box(
             r[np.unique(dofs // axes)],
-            mirror if mirror and mirror.other(name) == name else None,
+            mirror if mirror and mirror.image_of_edge(name) == name else None,
             comm,
         )
         point = box.mean(axis=0)
-        F, arm = in_space(shares[name] * R, axes), r - point
+        F, arm = vectors_in_space(shares[name] * R, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
         if support.edge:
             M = M - np.cross(
-                arm, in_space(system.forces(state.u, state.mu, support.edge), axes)
+                arm, vectors_in_space(system.forces(state.u, state.mu, support.edge), axes)
             ).sum(axis=0)
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
         if axes == 2:  # around the axis
@@ -92,10 +92,10 @@ def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = No
 
     As in `reactions`, of the whole shell.
     """
-    if mirror and name in mirror.lost:
-        name, way = mirror.lost[name], mirror.reflection @ way
-    elif mirror and mirror.other(name) == name:
-        way = mirror.summed(way)
+    if mirror and name in mirror.removed_edges:
+        name, way = mirror.removed_edges[name], mirror.reflection @ way
+    elif mirror and mirror.image_of_edge(name) == name:
+        way = mirror.sum_over_images(way)
     system = model.system
     axes = system.u.function_space.dofmap.index_map_bs
     along = (
@@ -129,11 +129,11 @@ def _shares(model: "Observed") -> dict[str, Array]:
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
     """The reactions of the whole shell from those of a half."""
     whole, S = dict(half), mirror.reflection
-    for lost, kept in mirror.lost.items():
+    for lost, kept in mirror.removed_edges.items():
         if kept in half:
             whole[lost] = half[kept].image(S, mirror.image(half[kept].point))
     for name, one in half.items():
-        if mirror.other(name) == name:
+        if mirror.image_of_edge(name) == name:
             whole[name] = one.whole(mirror)
     return whole
 
@@ -141,7 +141,7 @@ def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reactio
 def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
     """Corners (2, 3) of a box around places (n, 3) of all ranks, and around their mirror images."""
     if mirror:
-        places = mirror.everywhere(places)
+        places = mirror.with_images(places)
     corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
     all_corners = np.array(comm.allgather(corners))
     return np.array([all_corners[:, 0].min(axis=0), all_corners[:, 1].max(axis=0)])

@@ -14,12 +14,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.connected import pieces
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.sliding import Constraint, held_along
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.global_mesh import component_numbers
+from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
 from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, symmetric_part
-from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
-from magshell_fenicsx.mesh.mirror import STRAIGHT, Mirror
+from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
+from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.parts.loads import Loads
@@ -139,16 +139,16 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
     conormals = (
         _conormals(r0, facets) if on_edge else axes[2:]
     )  # the thickness stands at right angles
-    if spread[1] > STRAIGHT * spread[0]:
+    if spread[1] > PLANARITY_TOLERANCE * spread[0]:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
         upright = np.array([-centre[1], centre[0], 0.0])
         fitted = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
         candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted]
     for normal in candidates:
-        plane = Mirror.of(normal, float(normal @ centre))
+        plane = Mirror.with_normal(normal, float(normal @ centre))
         crossing = np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
-        if np.ptp(plane.beyond(places)) < STRAIGHT and crossing > RIGHT:
+        if np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE and crossing > RIGHT:
             return plane
     raise MeshError(no_mirror(name))
 
@@ -166,7 +166,7 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
-    if spread[1] <= STRAIGHT * spread[0] or np.ptp(vertices @ axes[2]) > STRAIGHT:
+    if spread[1] <= PLANARITY_TOLERANCE * spread[0] or np.ptp(vertices @ axes[2]) > PLANARITY_TOLERANCE:
         return
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
     off = (x[dofs] - centre) @ axes[2]
@@ -182,8 +182,8 @@ def closing_point(planes: Sequence[Mirror]) -> Array | None:
     if not planes:
         return np.zeros(3)
     normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])
-    point = np.linalg.lstsq(normals, offsets, rcond=STRAIGHT)[0]
-    return np.asarray(point) if np.abs(normals @ point - offsets).max() < STRAIGHT else None
+    point = np.linalg.lstsq(normals, offsets, rcond=PLANARITY_TOLERANCE)[0]
+    return np.asarray(point) if np.abs(normals @ point - offsets).max() < PLANARITY_TOLERANCE else None
 
 
 def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
@@ -243,7 +243,7 @@ def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amp
 
 def _pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
     """Which nodes of this rank each piece of the shell has; collective."""
-    piece = pieces(r0.function_space)[: system.size // 3]
+    piece = component_numbers(r0.function_space)[: system.size // 3]
     return [
         piece == n for n in range(1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX))
     ]
@@ -263,7 +263,7 @@ def _loose(
         motions[3 + i] = np.cross(axis, x - centre) * own[:, None]
     return unresisted(
         motions.reshape(6, -1),
-        system.held,
+        system.zero_at_supports,
         lambda: system.tangent(np.zeros(system.size), amplitudes),
         system.comm,
     )
@@ -317,7 +317,7 @@ def _sums_of_rows(K: PETSc.Mat) -> Array:
 
 
 def supports(
-    body: Body, r0: fem.Function, conditions: Mapping[str, Condition]
+    body: BodyMesh, r0: fem.Function, conditions: Mapping[str, Condition]
 ) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
     """What is held, the planes of symmetry but the mirror plane of a half model, and each support;
     collective.
@@ -340,7 +340,7 @@ def supports(
         nodes = None if condition == "clamped" else middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
-            held.append(held_along(V, 2, body.faces[name], plane.normal))
+            held.append(support_along(V, 2, body.faces[name], plane.normal))
             on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), kind="plane")
             continue
         if name in body.faces:
@@ -358,6 +358,6 @@ def supports(
     return held, planes, named | on_planes
 
 
-def in_middle(body: Body, V: fem.FunctionSpace) -> NDArray[np.bool_]:
+def in_middle(body: BodyMesh, V: fem.FunctionSpace) -> NDArray[np.bool_]:
     """Which nodes, ghosts included, lie in the middle of the thickness."""
-    return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING)
+    return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDSURFACE_HEIGHT) < ROUNDING)

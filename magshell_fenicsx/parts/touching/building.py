@@ -7,7 +7,7 @@ import numpy as np
 from dolfinx import fem, mesh
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.connected import CellsOfAll, over_ranks, whole
+from magshell_fenicsx.assembly.global_mesh import GlobalCells, gather_rows, global_values
 from magshell_fenicsx.mesh.mirror import Image, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import Grown
@@ -71,8 +71,8 @@ def touchings(
         return []
     V = r0.function_space
     domain, comm, index, element = V.mesh, V.mesh.comm, V.dofmap.index_map, V.element.basix_element
-    topology, cells_of_all = domain.topology, CellsOfAll.of(V)
-    count, first = len(cells_of_all.own), cells_of_all.own.start
+    topology, cells_of_all = domain.topology, GlobalCells.gather(V)
+    count, first = len(cells_of_all.own_range), cells_of_all.own_range.start
     for dims in ((2, 0), (0, 2), (1, 0)):
         topology.create_connectivity(*dims)
 
@@ -80,8 +80,8 @@ def touchings(
     corners = topology.index_map(0).local_to_global(
         topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
     )
-    cells = Cells(element, cells_of_all.nodes, cells_of_all.gathered(corners.reshape(-1, 3)))
-    placed = whole(r0)
+    cells = Cells(element, cells_of_all.nodes, cells_of_all.gather_values(corners.reshape(-1, 3)))
+    placed = global_values(r0)
     local = first, count + topology.index_map(2).num_ghosts
     times, thinning = (
         np.ones(nodes.shape),
@@ -97,13 +97,13 @@ def touchings(
         rates[:, ~thinning] = np.eye(4)[0][:, None, None]
         powers, grown = times * rates[:, :count], natural.stretch
     powers, keeps_volume = (
-        np.array([cells_of_all.gathered(each) for each in powers]),
-        cells_of_all.gathered(thinning),
+        np.array([cells_of_all.gather_values(each) for each in powers]),
+        cells_of_all.gather_values(thinning),
     )
-    named = {name: cells_of_all.gathered(inside) for name, inside in patches.items()}
+    named = {name: cells_of_all.gather_values(inside) for name, inside in patches.items()}
     named[WHOLE] = np.ones(len(cells.nodes), dtype=bool)
     own = 3 * index.local_range[0], 3 * index.size_local
-    moved: Callable[[], Array] = partial(whole, u)
+    moved: Callable[[], Array] = partial(global_values, u)
     kind: Callable[..., Touching] = Touching
     same = np.arange(len(placed))
     if images:
@@ -119,7 +119,7 @@ def touchings(
         kind, own, moved = (
             partial(Mirrored, copies, own),
             (0, placed.size),
-            lambda: copies.moved(whole(u)),
+            lambda: copies.moved(global_values(u)),
         )
     varies = thickness is not None or keeps_volume.any()
     faces = Faces(cells, placed, h, powers, keeps_volume, same, grown) if varies else None
@@ -168,7 +168,7 @@ def _nodes(V: fem.FunctionSpace, sides: Sequence[NDArray[np.int32]]) -> Longs:
         V, 1, np.concatenate([*sides, np.empty(0, np.int32)]), remote=False
     )
     numbers = V.dofmap.index_map.local_to_global(local)
-    return np.asarray(np.unique(over_ranks(V.mesh.comm, numbers)))
+    return np.asarray(np.unique(gather_rows(V.mesh.comm, numbers)))
 
 
 def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Longs:
@@ -178,4 +178,4 @@ def _vertices(topology: mesh.Topology, sides: Sequence[NDArray[np.int32]]) -> Lo
     numbers = of_all.local_to_global(
         np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32)
     )
-    return np.asarray(np.unique(over_ranks(topology.comm, numbers)))
+    return np.asarray(np.unique(gather_rows(topology.comm, numbers)))

@@ -20,8 +20,8 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import Entries
-from magshell_fenicsx.assembly.parameters import Derivative, Parameter
+from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
 from magshell_fenicsx.parts.touching.faces import Faces, Meshed, on_nodes, slope_of
 from magshell_fenicsx.parts.touching.nearest import Joined, Longs, Places
 from magshell_fenicsx.parts.touching.segments import Points
@@ -161,14 +161,14 @@ class ByGrowth:
 
 
 def with_growth(
-    grows: Parameter, of: Callable[[], Present], add: Callable[[Array, Array], None]
-) -> Parameter:
+    grows: FreeParameter, of: Callable[[], Present], add: Callable[[Array, Array], None]
+) -> FreeParameter:
     """A parameter with the derivatives of a contact by it among its own."""
 
     def twice(q: object) -> Sequence[Derivative]:
-        return [*grows.twice(q), *([ByGrowth(of, add, 2)] if q is grows.constant else [])]
+        return [*grows.differentiate_slopes(q), *([ByGrowth(of, add, 2)] if q is grows.constant else [])]
 
-    return replace(grows, slopes=[*grows.slopes, ByGrowth(of, add)], twice=twice)
+    return replace(grows, slopes=[*grows.slopes, ByGrowth(of, add)], differentiate_slopes=twice)
 
 
 def _grown(now: Present) -> Array:

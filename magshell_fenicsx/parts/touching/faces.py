@@ -19,8 +19,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import Entries
-from magshell_fenicsx.assembly.parameters import Settable
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
 from magshell_fenicsx.parts.touching.nearest import (
     SIGNS,
     Cells,
@@ -102,7 +102,7 @@ class Faces:
         thickness: Array,
         thins: NDArray[np.bool_],
         same: Longs,
-        grown: Settable | None = None,
+        grown: SettableNumber | None = None,
     ) -> None:
         self._cells, self._r0, self._thins, self._thin = cells, r0, thins, np.flatnonzero(thins)
         self._same, self.grown, self._places = same, grown, same[cells.nodes]
@@ -221,7 +221,7 @@ class Faces:
         i, j, v = scipy.sparse.find(by_u.T @ K @ by_u + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
 
-    def around(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
+    def coupled_pairs(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
         """Pairs of nodes that act on each other, where places and thickness at pairs of nodes do."""
         if self.constant:
             return rows, columns

@@ -16,8 +16,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import Entries
-from magshell_fenicsx.assembly.parameters import Parameter
+from magshell_fenicsx.assembly.free_parameters import FreeParameter
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
 from magshell_fenicsx.parts.gap import ROUNDING, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, with_growth
 from magshell_fenicsx.parts.touching.faces import Faces, on_nodes
@@ -244,11 +244,11 @@ class ContactTerm:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
-        """See `Coupled`."""
+        """See `NonlocalTerm`."""
         rows, columns, values = zip(*of_each(self, self._entries, tangent=True), strict=True)  # type: ignore[arg-type]
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
-    def entered(self, parameters: Mapping[str, Parameter]) -> dict[str, Parameter]:
+    def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
         """The parameters that the thickness of its faces depends on, with its derivatives among
         theirs.
         """

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import Entries
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.parts.touching.nearest import Cells, Longs
 from magshell_fenicsx.parts.touching.touching import Touching
@@ -56,7 +56,7 @@ class Images:
 
     def placed(self, r0: Array) -> Array:
         """Places (copies count, 3) of all nodes."""
-        return np.concatenate([image.of(r0) for image in self.images])
+        return np.concatenate([image.apply(r0) for image in self.images])
 
     def each(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values of cells, of all copies."""
@@ -85,7 +85,7 @@ class Images:
         """Numbers (copies, n) of the places (n, 3) of all copies, which share those on their
         planes.
         """
-        images, extent = [image.of(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
+        images, extent = [image.apply(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
             for before in range(k - 1, -1, -1):
@@ -143,8 +143,8 @@ class Mirrored(Touching):
     def entries(self) -> Entries:
         return self._images.entries(super().entries())
 
-    def around(self) -> tuple[Longs, Longs]:
-        rows, columns = super().around()
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        rows, columns = super().coupled_pairs()
         return rows % self._images.count, columns % self._images.count
 
     def _of_copies(self, u: Array) -> Array:

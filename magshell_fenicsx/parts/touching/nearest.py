@@ -22,7 +22,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from magshell_fenicsx.platform.native import native
+from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -379,7 +379,7 @@ def _padded(vectors: Array) -> Array:
 @cache
 def library() -> tuple[Any, Any]:
     """The cffi objects of nearest.c, compiled on first use."""
-    return native(Path(__file__).with_name("nearest.c"), FUNCTIONS, MPI.COMM_SELF)
+    return load_native(Path(__file__).with_name("nearest.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
 def followed(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -> Array:

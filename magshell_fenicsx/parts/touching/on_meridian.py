@@ -25,7 +25,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import Entries, pairs_of
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.gap import SOFT, Grown, expanded, penalty
 from magshell_fenicsx.parts.touching.building import WITHIN
@@ -43,11 +43,11 @@ from magshell_fenicsx.parts.touching.curves import (
 )
 from magshell_fenicsx.parts.touching.faces import slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import STEEP, between_held
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 from magshell_fenicsx.parts.touching.nearest import FOLLOWING, Joined, highest
 from magshell_fenicsx.parts.touching.rings import IN_PLANE, Rings
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
 from magshell_fenicsx.parts.touching.touching import EVERYWHERE, NEARER, PART, REACH
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -56,7 +56,7 @@ Inside = NDArray[np.bool_]
 
 class MeridianTouching(ContactTerm):
     """The energy of the contact of a pair on the meridian; an `assembly.terms.Term` and
-    `assembly.coupled.Coupled`.
+    `assembly.nonlocal_terms.NonlocalTerm`.
 
     Parameters
     ----------
@@ -153,14 +153,14 @@ class MeridianTouching(ContactTerm):
         return rows.ravel(), columns.ravel(), H[:, which[:, None], which].ravel()
 
     @property
-    def since(self) -> float:
-        """See `Coupled`: a number of the cells that touch."""
+    def pattern_key(self) -> float:
+        """See `NonlocalTerm`: a number of the cells that touch."""
         return float(crc32(self._touching_cells().tobytes()))
 
-    def around(self) -> tuple[Longs, Longs]:
-        """See `Coupled`: the nodes of cells that touch."""
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """See `NonlocalTerm`: the nodes of cells that touch."""
         nodes = np.concatenate([self._nodes[cells] for cells in self._touching_cells().T], axis=1)
-        return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
+        return self._faces.coupled_pairs(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
     def _touching_cells(self) -> Longs:
         both = [
@@ -189,7 +189,7 @@ class MeridianTouching(ContactTerm):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Of thickness and placement; see `assembly.coupled.KnowsFields` and `by_fields`."""
+        """Of thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable` and `by_fields`."""
         field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
         if field is None:
             return None

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.parameters import Settable
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
 from magshell_fenicsx.parts.touching.curves import SAME, Curves
 from magshell_fenicsx.parts.touching.faces import Faces
 
@@ -39,7 +39,7 @@ class Rings(Faces):
         h: float,
         thickness: Array,
         thins: NDArray[np.bool_],
-        grown: Settable | None = None,
+        grown: SettableNumber | None = None,
     ) -> None:
         self._along, rho = curves.at_nodes, r0[curves.nodes, 0]
         slope = np.einsum("qk,ck->cq", self._along, rho)

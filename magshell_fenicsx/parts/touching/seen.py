@@ -81,8 +81,8 @@ class TouchingSeen(Seen):
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         model, values = sight.model, dict[str, float]()
         for each in model.touchings:
-            at = model.system.at(state)
-            force, gap = at.of(each.force), at.of(each.least_gap)
+            at = model.system.at_state(state)
+            force, gap = at.evaluate(each.force), at.evaluate(each.least_gap)
             numbers = force / model.force_unit, gap / sight.h, each.stiffness.value
             values |= dict(zip(_columns(each.pair), numbers, strict=True))
         return values

@@ -26,8 +26,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.connected import add_own, whole
-from magshell_fenicsx.assembly.coupled import Entries, pairs_of
+from magshell_fenicsx.assembly.global_mesh import add_to_owners, global_values
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
 from magshell_fenicsx.parts.gap import SOFT, penalty
 from magshell_fenicsx.parts.touching.by_fields import Present, Shape, Weights, by_factor, by_place
 from magshell_fenicsx.parts.touching.expanded import Expanded
@@ -40,10 +40,10 @@ from magshell_fenicsx.parts.touching.faces import (
     unknowns,
 )
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments, divisions_of
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for
@@ -61,7 +61,7 @@ NEARER = 0.5
 
 
 class Touching(ContactTerm):
-    """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.coupled.Coupled`.
+    """The energy of the contact of a pair; an `assembly.terms.Term` and `assembly.nonlocal_terms.NonlocalTerm`.
 
     Parameters
     ----------
@@ -152,12 +152,12 @@ class Touching(ContactTerm):
         return entries
 
     @property
-    def since(self) -> float:
-        """See `Coupled`: the number of the cuts."""
+    def pattern_key(self) -> float:
+        """See `NonlocalTerm`: the number of the cuts."""
         return self.cuts.value
 
-    def around(self) -> tuple[Longs, Longs]:
-        """See `Coupled`: the nodes of cells that touched, or nearly did, where the cuts were made."""
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """See `NonlocalTerm`: the nodes of cells that touched, or nearly did, where the cuts were made."""
         self._pressed()
         number, u = len(self._cells.nodes), self._cuts.displacement(self.cuts.value)
         ahead = self._h + AHEAD * (self._far - self._h) / (REACH - 1)
@@ -166,16 +166,16 @@ class Touching(ContactTerm):
         nodes = np.concatenate(
             [self._cells.nodes[keys // number], self._cells.nodes[keys % number]], axis=1
         )
-        return self._faces.around(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
+        return self._faces.coupled_pairs(*pairs_of(nodes)) if self._faces else pairs_of(nodes)
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Of thickness and placement; see `assembly.coupled.KnowsFields`; collective."""
+        """Of thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`; collective."""
         field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
         if field is None:
             return None
-        now, weights = self._present(), Weights(self._of_copies(whole(direction)), energy, force)
+        now, weights = self._present(), Weights(self._of_copies(global_values(direction)), energy, force)
         if name == "thickness":
             of_cells = self._comm.allreduce(self._in_modelled(by_factor(now, weights)))
             return field, of_cells[self._shape.own, :, None]
@@ -191,17 +191,17 @@ class Touching(ContactTerm):
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 3) of this rank's points; collective."""
-        add_own(b, forces, self._own, self._comm)
+        add_to_owners(b, forces, self._own, self._comm)
 
     def _by_parts(self) -> Entries:
         """Those of the second derivative by place and thickness."""
-        whole, joined, (_, of_group, bend) = self._pressed()
+        global_values, joined, (_, of_group, bend) = self._pressed()
         number, several = len(self._cells.nodes), joined.several
         first = of_group[joined.group]
         second = np.where(several[joined.group], first / (BLUR * self._h), bend[joined.group])
-        weight = joined.weight * self._points.weight[whole.point] / 2
-        order = np.argsort(self._points.cell[whole.point] * number + whole.cell, kind="stable")
-        at, first, second, weight = whole.of(order), first[order], second[order], weight[order]
+        weight = joined.weight * self._points.weight[global_values.point] / 2
+        order = np.argsort(self._points.cell[global_values.point] * number + global_values.cell, kind="stable")
+        at, first, second, weight = global_values.of(order), first[order], second[order], weight[order]
         keys = self._points.cell[at.point] * number + at.cell
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         rows, columns, values = list[Longs](), list[Longs](), list[Array]()
@@ -227,10 +227,10 @@ class Touching(ContactTerm):
             return nothing, nothing, np.zeros(0)
         if several.any():
             jointly = several[joined.group]
-            _, n, beta, nodes = self._geometry(whole.of(jointly))
+            _, n, beta, nodes = self._geometry(global_values.of(jointly))
             slopes = joined.weight[jointly, None, None] * slope_of(n, beta, self._parts)
             of_joined = (
-                self._points.weight[whole.point[joined.first]]
+                self._points.weight[global_values.point[joined.first]]
                 / 2
                 * (bend - of_group / (BLUR * self._h))
             )
@@ -445,10 +445,10 @@ class Touching(ContactTerm):
         where triangles are divided less often than in the zone of contact."""
         elsewhere = points.faces[at.point] != at.cell
         other = at.of(elsewhere | (points.divisions[at.point] < self._divisions))
-        whole, part = self._comm.allreduce(
+        global_values, part = self._comm.allreduce(
             np.array([self._force(points, at), self._force(points, other) + turned])
         )
-        return float(part / whole) if whole else float(part > 0)
+        return float(part / global_values) if global_values else float(part > 0)
 
     def _force(self, points: Points, at: Places) -> float:
         """Twice that of this rank on the nearest of some places."""

@@ -18,9 +18,9 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.coupled import KnowsFields
-from magshell_fenicsx.assembly.forms import FieldGradient, Share
-from magshell_fenicsx.assembly.forms import by_field as summed
+from magshell_fenicsx.assembly.field_gradient import FieldGradient, WeightedTerm
+from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
+from magshell_fenicsx.assembly.nonlocal_terms import FieldDifferentiable
 from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
@@ -92,7 +92,7 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         raise CaseError(
             f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude"
         )
-    knowing = [term for term in model.system.terms if isinstance(term, KnowsFields)]
+    knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
     if name == "deviation" and (
         model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
     ):
@@ -142,7 +142,7 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
 
     def of(chosen: str | OfPlacement) -> tuple[fem.Function, Array]:
         parts = [
-            model.system.at(place.state).of(partial(part, number, place, chosen))
+            model.system.at_state(place.state).evaluate(partial(part, number, place, chosen))
             for number, place in enumerate(adjoint.places)
         ]
         return parts[-1][0], np.sum([each for _, of_place in parts for each in of_place], axis=0)
@@ -169,13 +169,13 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     return FieldGradient(f, forces, places, normals)
 
 
-def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Share]:
+def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[WeightedTerm]:
     """What the terms give at a place."""
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
     of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
     shares = [
-        Share(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0)
+        WeightedTerm(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0)
         for t, m in of_terms
     ]
     shares += _of_parameters(scene, place, name)
@@ -187,17 +187,17 @@ def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Shar
             * scene.model.system.potential(place.state.u, mu, held)
             / scene.model.load_size[held]
         )
-        shares += [Share(t, share, 0.0) for t in scene.model.size_terms(held)]
+        shares += [WeightedTerm(t, share, 0.0) for t in scene.model.size_terms(held)]
     if not number:
         shares += [
-            Share(t, c * factor_of(t.amplitude, mu), 0.0)
+            WeightedTerm(t, c * factor_of(t.amplitude, mu), 0.0)
             for t, c in (*along(scene, adjoint), *adjoint.forms)
         ]
     return shares
 
 
 def _known(
-    term: KnowsFields, place: Place, w: fem.Function, name: str
+    term: FieldDifferentiable, place: Place, w: fem.Function, name: str
 ) -> tuple[fem.Function, Array] | None:
     """What a term gives that knows its derivatives by a field itself."""
     mu = factor_of(term.amplitude, place.state.mu)
@@ -220,16 +220,16 @@ def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
     return replace(adjoint, scene=other, places=places, directions=directions)
 
 
-def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
+def _of_parameters(scene: Scene, place: Place, name: str) -> list[WeightedTerm]:
     """The shares of the conjugates of free parameters of terms."""
-    system, c, shares = scene.model.system, place.conjugates, list[Share]()
+    system, c, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
             if isinstance(slope, Slope) and not slope.density.on_edges:
                 slope = _as_form(scene, slope)
             if not isinstance(slope, FormTerm):
                 raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
-            shares.append(Share(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
+            shares.append(WeightedTerm(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
     return shares
 
 
@@ -241,7 +241,7 @@ def _as_form(scene: Scene, slope: Slope) -> FormTerm:
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
 
-def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Function) -> Array:
+def _of_starts(scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function) -> Array:
     """By the thickness at the places where bodies start from the shell's face, which lifts them;
     collective.
 

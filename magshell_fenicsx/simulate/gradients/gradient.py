@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.system import State, dot
@@ -80,7 +80,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
             own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
             state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
-            state = other.model.system.placed(state)
+            state = other.model.system.with_moved_supports(state)
             if other is not scene:
                 expand(scene, other, place.state)
             total += _at(scene, other, place, state) + (
@@ -89,7 +89,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         if adjoint.by_itself:
             total += adjoint.by_itself(other, state)
         terms = [(c * factor_of(t.amplitude, state.mu), t) for t, c in along(other, adjoint)]
-        energies = other.model.system.at(state).of(lambda: sum(c * t.energy() for c, t in terms))
+        energies = other.model.system.at_state(state).evaluate(lambda: sum(c * t.energy() for c, t in terms))
         return float(total + other.model.system.comm.allreduce(energies))
 
     return _slope(contracted, value, size_of(scene.problem.context, key))
@@ -133,7 +133,7 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     problem = adjoint.scene.problem
     value, size = number_of(problem.context, key), size_of(problem.context, key)
     return _slope(
-        lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value, size
+        lambda p: sizes_of(problem.with_values({key: p}).context).of[adjoint.scale], value, size
     )
 
 

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
@@ -78,7 +78,7 @@ def adjoint_of_barrier(
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
     system, step, whole = scene.model.system, scene.problem.programme[-1], scene.model.multiplicity
-    before, after = (system.placed(record.point.state) for record in (begin, end))
+    before, after = (system.with_moved_supports(record.point.state) for record in (begin, end))
     held, change = held_at(scene, end, after), dict[str, float]()
     for name, conjugate in held.items():
         if callable(conjugate):
@@ -161,7 +161,7 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
         return None
     assert history.end
     scene = history.end.scene or scene
-    state = rigid(scene, scene.model.system.placed(history.end.point.state))
+    state = rigid(scene, scene.model.system.with_moved_supports(history.end.point.state))
     return frequency(scene.problem, of, vibration(scene, state, of).value)
 
 

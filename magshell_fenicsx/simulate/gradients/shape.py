@@ -18,8 +18,8 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.forms import Share, broken
-from magshell_fenicsx.assembly.forms import by_field as summed
+from magshell_fenicsx.assembly.field_gradient import WeightedTerm, broken_space
+from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.patterns import OfPlacement
@@ -33,10 +33,10 @@ STEP = 1e-4  # of h: of a node
 
 
 def of_measures(
-    model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function
-) -> list[Share]:
+    model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
+) -> list[WeightedTerm]:
     """What terms add that have been divided by an integral over what they act on; collective."""
-    added, comm, v = list[Share](), model.V.mesh.comm, fem.Function(model.V)
+    added, comm, v = list[WeightedTerm](), model.V.mesh.comm, fem.Function(model.V)
     for share in shares:
         if share.term.over is None:
             continue
@@ -46,12 +46,12 @@ def of_measures(
         )
         over = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
         value, size = (comm.allreduce(each) for each in (fem.assemble_scalar(along), over.energy()))
-        added.append(Share(over, -value / size, 0.0))
+        added.append(WeightedTerm(over, -value / size, 0.0))
     return added
 
 
 def of_widths(
-    model: ShellModel | MeridianModel, shares: Sequence[Share], w: fem.Function
+    model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
 ) -> Array | None:
     """The derivatives (cells, vertices, 3) by the vertices of flat cells, whose widths are in
     energies of edges.
@@ -64,13 +64,13 @@ def of_widths(
     jet, (volume, side) = kin.jet(x, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
     length = kin.conormal(jet, kin.facet_covector(domain))[2]
     moved = {volume: volume * kin.area_ratio(jet), side: side * length}
-    wide = list[Share]()
+    wide = list[WeightedTerm]()
     for share in shares:
         form = share.term.form
         on_edges = any(each.integral_type() != "cell" for each in form.integrals())
         if on_edges and (other := ufl.replace(form, moved)) != form:
             wide.append(
-                Share(
+                WeightedTerm(
                     FormTerm(share.term.name, other, model.u, model.kernels),
                     share.energy,
                     share.work,
@@ -95,7 +95,7 @@ def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
         v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(
             place.w, point
         )
-        at = model.midsurface.points[point], v, model.midsurface.beside(point)
+        at = model.midsurface.points[point], v, model.midsurface.cells_of_point(point)
         total = total + by_vertex_normal(model.r0, *at)
     return total
 
@@ -113,7 +113,7 @@ def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array)
     `normals` (own cells, nodes, 3) are those of own cells.
     """
     V, step = model.V, STEP * model.material.h
-    r = fem.Function(broken(V))
+    r = fem.Function(broken_space(V))
     nodes = r.x.array.reshape(-1, V.dofmap.bs)
     drawn = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
     at, dofs = r.function_space.dofmap.list, field.function_space.dofmap.list[: len(normals)]

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magshell_fenicsx.assembly.evaluated import CENTRAL
+from magshell_fenicsx.assembly.evaluation import DIFFERENCE_WEIGHTS
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
@@ -194,7 +194,7 @@ def adjoints_of_vibrations(
         If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave
         where shells touch.
     """
-    state = rigid(scene, scene.model.system.placed(record.point.state))
+    state = rigid(scene, scene.model.system.with_moved_supports(record.point.state))
     if bodies := pressing(scene, state):
         raise CaseError(
             f"{of}: has no gradient where a body touches the shell ({bodies[0].body}): where it touches changes within "
@@ -234,7 +234,7 @@ def _adjoint(scene: Scene, state: State, of: str, vibration: Vibration, held: He
             directions.append(Direction(mode.vector, m, stiffness=c, inertia=-c * mode.eigenvalue))
             continue
         step = scene.model.system.step_along(mode.vector, away)
-        for way, weight in CENTRAL.items():
+        for way, weight in DIFFERENCE_WEIGHTS.items():
             moved = State(state.u + way * step * mode.vector, state.mu)
             places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
@@ -268,7 +268,7 @@ def _slopes(
         np.zeros(system.size),
         dict.fromkeys(held, 0.0),
     )
-    for way, weight in CENTRAL.items():
+    for way, weight in DIFFERENCE_WEIGHTS.items():
         u, part = state.u + way * step * phi, weight / step
         K = symmetric_part(system.tangent(u, state.mu))
         x, y = K.createVecs()
@@ -277,4 +277,4 @@ def _slopes(
         by_u += part * y.array_r
         for name in held:
             by_mu[name] += float(part * dot(system.comm, phi, system.load(u, state.mu, name)))
-    return Functional(mode.eigenvalue, system.held(by_u), by_mu)
+    return Functional(mode.eigenvalue, system.zero_at_supports(by_u), by_mu)

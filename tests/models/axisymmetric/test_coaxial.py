@@ -185,7 +185,7 @@ def pressed(scene: Scene, down: float) -> State:
     model, r = scene.model, scene.model.r0.x.array.reshape(-1, 2)
     u = 1e-2 * h * np.sin(5 * r + 1)
     u[np.unique(model.V.dofmap.list[model.meridian.patches["upper"]]), 1] -= down * h
-    return State(model.system.held(u.ravel()), scene.unloaded().mu)
+    return State(model.system.zero_at_supports(u.ravel()), scene.unloaded().mu)
 
 
 @pytest.mark.parametrize(
@@ -207,20 +207,20 @@ def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]
     )
     scene = touching(upper, z, PRESSURE, **shell)
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
-    at = system.at(state)
-    assert at.of(contact.force) > 0
-    v = system.held(np.random.default_rng(1).standard_normal(state.u.size))
+    at = system.at_state(state)
+    assert at.evaluate(contact.force) > 0
+    v = system.zero_at_supports(np.random.default_rng(1).standard_normal(state.u.size))
     step = 1e-7 * h
     ahead, back = (State(state.u + way * step * v, state.mu) for way in (1, -1))
     energies = [sum(scene.energies(each).values()) for each in (ahead, back)]
-    residuals = [system.held(system.residual(each.u, each.mu)) for each in (ahead, back)]
+    residuals = [system.zero_at_supports(system.residual(each.u, each.mu)) for each in (ahead, back)]
     slope = system.residual(state.u, state.mu) @ v
     assert slope == pytest.approx((energies[0] - energies[1]) / (2 * step), rel=1e-6)
-    Kv = system.held(csr(system.tangent(state.u, state.mu)) @ v)
+    Kv = system.zero_at_supports(csr(system.tangent(state.u, state.mu)) @ v)
     assert np.linalg.norm(Kv - (residuals[0] - residuals[1]) / (2 * step)) < 1e-6 * np.linalg.norm(
         Kv
     )
-    waves, plane = at.of(lambda: contact.entries_of_waves(0.0)), at.of(contact.entries)
+    waves, plane = at.evaluate(lambda: contact.entries_of_waves(0.0)), at.evaluate(contact.entries)
     n = state.u.size // 2
     Q = scipy.sparse.coo_array((waves[2], waves[:2]), (3 * n, 3 * n))
     K = scipy.sparse.coo_array((plane[2], plane[:2]), (2 * n, 2 * n))
@@ -258,8 +258,8 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
     u = np.zeros((model.system.size // model.V.dofmap.bs, model.V.dofmap.bs))
     of_shells = model.meridian.patches if model.axisymmetric else model.midsurface.patches
     u[np.unique(model.V.dofmap.list[of_shells["tube"]]), -1] = 0.02 * h
-    (contact,), at = model.touchings, model.system.at(State(u.ravel(), scene.unloaded().mu))
-    pressure, force = at.of(contact.of_cells)[0], at.of(contact.force)
+    (contact,), at = model.touchings, model.system.at_state(State(u.ravel(), scene.unloaded().mu))
+    pressure, force = at.evaluate(contact.of_cells)[0], at.evaluate(contact.force)
     points = contact._rule if model.axisymmetric else contact._points
     area = np.bincount(points.cell, points.weight, len(pressure))
     assert force > 0
@@ -277,8 +277,8 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
     shell, thick = ({"thickness_factor": factor}, 1.25) if factor else ({}, 1.0)
     scene = touching(cap(radius=1.3), 2.3 + (thick + 1e-4) * h, PRESSURE, **shell)
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
-    at = system.at(state)
-    faced, (H, nodes) = at.of(contact._pressed), at.of(lambda: contact._second(m))
+    at = system.at_state(state)
+    faced, (H, nodes) = at.evaluate(contact._pressed), at.evaluate(lambda: contact._second(m))
     r = scene.model.r0.x.array.reshape(-1, 2)
     U, V, W, T = (
         100 * r[:, 0] ** 2 * np.cos(k * r[:, 0] + r[:, 1]) for k in (1, 2, 3, 4)
@@ -413,7 +413,7 @@ def test_ridges_that_are_highest_between_nodes() -> None:
     scene = Scene(Case.from_source(data))
     (touching,) = scene.model.touchings
     assert scene.model.axisymmetric
-    assert scene.model.system.at(scene.unloaded()).of(touching.least_gap) == pytest.approx(
+    assert scene.model.system.at_state(scene.unloaded()).evaluate(touching.least_gap) == pytest.approx(
         0.2 * 0.03, rel=1e-2
     )
 

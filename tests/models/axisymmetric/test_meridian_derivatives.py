@@ -6,7 +6,7 @@ import scipy.sparse
 from meridian_scenes import ALONG_AXIS, E3, hemisphere
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Material

@@ -30,7 +30,7 @@ def test_on_the_meridian_and_its_waves(law: RemanenceLaw) -> None:
     models = [
         hemisphere(20, 0.3, Loads(magnetic=field), refinement=0.15) for field in (known, built_in)
     ]
-    u = models[0].system.held(
+    u = models[0].system.zero_at_supports(
         1e-2 * np.random.default_rng(0).standard_normal(models[0].system.size)
     )
     found = []

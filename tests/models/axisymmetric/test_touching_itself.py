@@ -115,7 +115,7 @@ def test_derivatives_of_what_has_grown() -> None:
     system, (term,), step = scene.model.system, scene.model.touchings, 1e-6
     slope, u = (
         system.parameters["natural_stretch"].slopes[-1],
-        system.held(stretched(scene, 0.4 * h).ravel()),
+        system.zero_at_supports(stretched(scene, 0.4 * h).ravel()),
     )
 
     def mu(n: int) -> dict[str, float]:
@@ -124,12 +124,12 @@ def test_derivatives_of_what_has_grown() -> None:
     def differed(of: Any) -> Any:
         return (8 * (of(1) - of(-1)) - (of(2) - of(-2))) / (12 * step)
 
-    at, force = system.at(State(u, mu(0))), np.zeros_like(u)
-    assert at.of(term.penetration) > 0.02 * h
-    assert at.of(slope.energy) == pytest.approx(
+    at, force = system.at_state(State(u, mu(0))), np.zeros_like(u)
+    assert at.evaluate(term.penetration) > 0.02 * h
+    assert at.evaluate(slope.energy) == pytest.approx(
         differed(lambda n: system.energies(u, mu(n))[term.name]), rel=1e-6
     )
-    at.of(lambda: slope.add_residual(force, 1.0))
+    at.evaluate(lambda: slope.add_residual(force, 1.0))
     forces = differed(lambda n: system.forces(u, mu(n), term.name))
     assert np.abs(force - forces).max() < 1e-6 * np.abs(forces).max()
 
@@ -152,7 +152,7 @@ def test_a_pair_of_all_shells_is_that_of_two() -> None:
     seen = list[tuple[float, Array]]()
     for scene in (one, all_of):
         system, (term,) = scene.model.system, scene.model.touchings
-        u, mu = system.held(stretched(scene, 0.4 * h).ravel()), scene.unloaded().mu
+        u, mu = system.zero_at_supports(stretched(scene, 0.4 * h).ravel()), scene.unloaded().mu
         seen.append((system.energies(u, mu)[term.name], system.forces(u, mu, term.name)))
     assert seen[0][0] > 0
     assert seen[1][0] == pytest.approx(seen[0][0], rel=1e-12)

@@ -12,8 +12,8 @@ from dolfinx import fem
 from test_fast_tangent import RANKS as TANGENTS
 from test_fast_tangent import pattern
 
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.models.shell import gradients
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Material
 from magshell_fenicsx.models.shell.patterns import tangential
@@ -175,7 +175,7 @@ def test_no_residual_forms_are_compiled() -> None:
 
 
 RANKS = """
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.system import dot, max_abs
 
 system = model.system

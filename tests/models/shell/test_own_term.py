@@ -15,7 +15,7 @@ from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import dot
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.mesh.mirror import Y0
+from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.law import Koiter
@@ -88,7 +88,7 @@ DENSITIES: dict[
 def test_what_is_found_from_a_density(name: str) -> None:
     of, parameters, parts, linear, turns, mirrors = DENSITIES[name]
     term = OwnTerm("own", of, parameters)
-    assert (term.parts, term.linear, term.turns, term.mirrored(Y0)) == (
+    assert (term.parts, term.linear, term.turns, term.mirrored(Y0_PLANE)) == (
         parts,
         linear,
         turns,
@@ -109,7 +109,7 @@ def test_density_that_is_not_defined_everywhere() -> None:
     """Has no symmetry that could be relied on."""
     term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
     assert not term.turns
-    assert not term.mirrored(Y0)
+    assert not term.mirrored(Y0_PLANE)
 
 
 OBSERVED: dict[str, tuple[Density, bool, bool]] = {
@@ -126,7 +126,7 @@ def test_symmetry_of_what_is_observed(name: str) -> None:
     """Beside an energy that turns and mirrors."""
     of, turns, mirrors = OBSERVED[name]
     term = OwnTerm("own", winkler, (), observed={"seen": of})
-    assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
+    assert (term.turns, term.mirrored(Y0_PLANE)) == (turns, mirrors)
 
 
 def test_another_observed_density_is_another_term() -> None:
@@ -190,7 +190,7 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
     fields = [(E3, E1 + E3, False, True), (E3, E3, True, True), (E3, E2 + E3, False, False)]
     for Br, Ba, turns, mirrors in fields if energy == "magnetic" else fields[:1]:
         term = OwnTerm("own", of, (Br, Ba))
-        assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
+        assert (term.turns, term.mirrored(Y0_PLANE)) == (turns, mirrors)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     loads = Loads(own=(OwnTerm("own", of, parameters),))
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
     model_u, v = (
-        system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
     )
     step = 1e-3
     slope = (
@@ -271,7 +271,7 @@ def test_the_shells_own_pressure_as_ones_own(file: str, symmetry: str, size: flo
 
     scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
     system = scene.model.system
-    u = system.held(size * np.random.default_rng(0).standard_normal(system.size))
+    u = system.zero_at_supports(size * np.random.default_rng(0).standard_normal(system.size))
     assert system.potential(u, {}, "own") == pytest.approx(
         system.potential(u, {}, "pressure"), rel=1e-11
     )
@@ -309,7 +309,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
     (dead,) = make_problem(case).loads.all_dead
     assert isinstance(dead, AreaForce)
     system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
-    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
+    u = system.zero_at_supports(1e-2 * np.random.default_rng(0).standard_normal(system.size))
     ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "load")
     assert np.abs(theirs).max() > 0
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
@@ -340,7 +340,7 @@ def test_half_model_of_another_plane() -> None:
     assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
     within = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.5])
     problem = make_problem(case, [OwnTerm("own", weight, (within,))])
-    assert problem.half
+    assert problem.is_half
     assert problem.azimuth == pytest.approx(np.radians(20))
 
 

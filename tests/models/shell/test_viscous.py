@@ -104,7 +104,7 @@ def test_viscous_plies_are_as_stiff() -> None:
     x, y, _ = model.r0.x.array.reshape(-1, 3).T
     v = np.column_stack([x * y, x**2 - x * y, x**2 * (1 + y)]).ravel()
     elastic = csr(model.system.tangent(u, {})) @ v
-    free = np.flatnonzero(model.system.held(np.ones(v.size)))
+    free = np.flatnonzero(model.system.zero_at_supports(np.ones(v.size)))
     force = Viscosity(model, {}, 2.0, []).force(u, u, v, 1.0, 0.0)  # type: ignore[arg-type]
     assert force[free] == pytest.approx(2 * elastic[free], abs=1e-5 * np.abs(elastic).max())
 
@@ -122,7 +122,7 @@ def test_tangent_of_viscous_rubber() -> None:
     )
     viscous, rate = Viscosity(model, {}, 2.0, []), 3.0  # type: ignore[arg-type]
     added = csr(viscous.tangent(u, {}, 0.1, rate)) @ v - csr(model.system.tangent(u, {})) @ v
-    free = np.flatnonzero(model.system.held(np.ones(v.size)))
+    free = np.flatnonzero(model.system.zero_at_supports(np.ones(v.size)))
     force = viscous.force(u, u, v, 1.0, 0.0)
     assert added[free] / rate == pytest.approx(force[free], abs=1e-4 * np.abs(force[free]).max())
 
@@ -223,7 +223,7 @@ def test_damped_vibration_of_a_natural_shape() -> None:
         csr(A).toarray()
         for A in (system.tangent(last.point.state.u, last.point.state.mu), mass(still.model))
     )
-    free = np.flatnonzero(system.held(np.ones(system.size)))
+    free = np.flatnonzero(system.zero_at_supports(np.ones(system.size)))
     omega = float(
         np.sqrt(
             scipy.linalg.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[0]

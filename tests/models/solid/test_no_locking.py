@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from bodies import plate
 
-from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
-from magshell_fenicsx.shells.solid_terms import WHOLE, SolidTerm, TermFactory
+from magshell_fenicsx.shells.solid_terms import QUADRATURE_DEGREE, SolidTerm, TermFactory
 
 H = 0.05
 
@@ -31,7 +31,7 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
     system = model.system
     if whole:
         factory = TermFactory(model.body, model.u, material, H, model.kernels)
-        density = replace(factory.compression().density, degree=WHOLE)
+        density = replace(factory.compression().density, degree=QUADRATURE_DEGREE)
         terms = [
             factory._bulk(t.name, density)
             if isinstance(t, SolidTerm) and t.name == "compression"

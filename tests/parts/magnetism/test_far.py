@@ -108,7 +108,7 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     acting = ActingOnEachOther(
         stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning
     )
-    product = acting.stored @ v.ravel() + acting.times_others(v.reshape(-1, 1))[:, 0]
+    product = acting.near_blocks @ v.ravel() + acting.times_far(v.reshape(-1, 1))[:, 0]
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     moved = [(w / step, charges.evaluate(nodes + k * step * v, own)) for k, w in ways]
     assert charges.boxes(nodes, own)[0] is far, "cells stay in their boxes"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.assembly.whole import WholeMatrix
+from magshell_fenicsx.assembly.dense_tangent import DenseTangent
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
@@ -99,7 +99,7 @@ def gradient(scene: Scene, u: Vector) -> Array:
         term.add_residual(b, 1.0)
         return b
 
-    return system.at(State(u, {"interaction": 1.0})).of(add)
+    return system.at_state(State(u, {"interaction": 1.0})).evaluate(add)
 
 
 def force(scene: Scene, h: float) -> Array:
@@ -179,7 +179,7 @@ def bent(model: Any, tmp_path: Path) -> tuple[Scene, Vector]:
     )
     x, y, z = scene.model.r0.x.array.reshape(-1, 3).T
     u = [0.01 * np.sin(5 * y + z), 0.02 * np.cos(6 * x), 0.03 * np.sin(7 * x + 3 * y + 5 * z)]
-    return scene, scene.model.system.held(np.column_stack(u).ravel()[: scene.model.system.size])
+    return scene, scene.model.system.zero_at_supports(np.column_stack(u).ravel()[: scene.model.system.size])
 
 
 def test_derivatives(bent: tuple[Scene, Vector]) -> None:
@@ -189,13 +189,13 @@ def test_derivatives(bent: tuple[Scene, Vector]) -> None:
     scene, u = bent
     system, mu = scene.model.system, {"interaction": 1.0}
     (term,) = (each for each in system.terms if each.name == "interaction")
-    v, step = system.held(np.cos(3.0 * np.arange(system.size))), 1e-4
+    v, step = system.zero_at_supports(np.cos(3.0 * np.arange(system.size))), 1e-4
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     moved = [(w / step, u + k * step * v) for k, w in ways]
-    slope = sum(w * system.at(State(each, mu)).of(term.energy) for w, each in moved)
+    slope = sum(w * system.at_state(State(each, mu)).evaluate(term.energy) for w, each in moved)
     assert slope == pytest.approx(gradient(scene, u) @ v, rel=1e-6)
-    matrix = WholeMatrix(system.u.function_space, system.clamped)
-    rows = system.at(State(u, mu)).of(lambda: matrix.rows(term))
+    matrix = DenseTangent(system.u.function_space, system.clamped)
+    rows = system.at_state(State(u, mu)).evaluate(lambda: matrix.rows(term))
     change = sum(w * gradient(scene, each) for w, each in moved)
     assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
     assert np.abs(rows - rows.T).max() < 1e-12 * np.abs(rows).max()
@@ -713,11 +713,11 @@ def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, 
     v = np.where(upper, -((x / 4) ** 2), 0.0)[:, None] * [0, 0, 1]
     u, v, step = u.ravel(), v.ravel(), 1e-4 * h / 5
     sides = [u + side * step * v for side in (1, -1)]
-    energies = [system.at(State(each, mu)).of(term.energy) for each in sides]
+    energies = [system.at_state(State(each, mu)).evaluate(term.energy) for each in sides]
     assert (energies[0] - energies[1]) / (2 * step) == pytest.approx(
         gradient(scene, u) @ v, rel=1e-5
     )
-    acting = system.at(State(u, mu)).of(term.acting)
-    bend = v @ (acting.stored @ v + acting.times_others(v[:, None]).ravel())
+    acting = system.at_state(State(u, mu)).evaluate(term.hessian)
+    bend = v @ (acting.near_blocks @ v + acting.times_far(v[:, None]).ravel())
     slopes = [gradient(scene, each) @ v for each in sides]
     assert (slopes[0] - slopes[1]) / (2 * step) == pytest.approx(bend, rel=2e-3)

@@ -8,7 +8,7 @@ from math import acos, radians
 
 import numpy as np
 
-from magshell_fenicsx.assembly.motion import Motion, moved
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion, apply_motions
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
@@ -78,21 +78,21 @@ def _applied(context: Context) -> AppliedSection | None:
     return magnetic.applied if magnetic else None
 
 
-def turns(context: Context, turn: float = 0.0) -> tuple[Motion, ...]:
+def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
     """The rotations of all of the field about the origin, of a field that is known by values, or
     has a gradient.
     """
     applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
         return ()
-    rotations, before, zero = list[Motion](), applied.vector(turn), np.zeros(3)
+    rotations, before, zero = list[RigidMotion](), applied.vector(turn), np.zeros(3)
     for step in context.steps:
         if isinstance(step.load, RotationSection):
             after = step.load.to.vector(turn)
             axis = np.cross(before, after)
             angle = acos(float(before @ after))
             rotations.append(
-                Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero)
+                RigidMotion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero)
             )
             before = after
     return tuple(rotations)
@@ -137,13 +137,13 @@ def _driven(
     steps: Sequence[ProgrammeStep],
     number: int,
     source: PlacedSource,
-    rotations: Sequence[Motion],
+    rotations: Sequence[RigidMotion],
     Q: Array,
 ) -> Driven:
     """A source with the amplitudes of its steps; turns about its own position come before all other
     motions.
     """
-    spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
+    spins, moves, factors, zero = list[RigidMotion](), list[RigidMotion](), dict[str, float](), np.zeros(3)
     of_all = {motion.name: motion for motion in rotations}
     loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
     own = {name for name, load in loads.items() if load.number(applied.sources or []) == number}
@@ -156,15 +156,15 @@ def _driven(
         load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
-            spins.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
+            spins.append(RigidMotion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
         elif load.strength is not None:
             factors[name] = load.strength - 1
         else:
             end = np.array(load.move or load.to) / source.length
-            begin = moved(
+            begin = apply_motions(
                 moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]
             ).x[0]
-            moves.append(Motion(name, Q @ end - (begin if load.to else zero), zero, zero))
+            moves.append(RigidMotion(name, Q @ end - (begin if load.to else zero), zero, zero))
     return Driven(source, [*spins, *moves], factors)
 
 

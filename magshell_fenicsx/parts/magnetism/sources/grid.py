@@ -12,8 +12,8 @@ from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.parts.magnetism.sources.source import Array, FieldOfSource, SourceSection
-from magshell_fenicsx.platform.reading import Files, vtk_data
-from magshell_fenicsx.shape.ground import edges
+from magshell_fenicsx.platform.input_files import Files, read_vtk
+from magshell_fenicsx.shape.reference_shell import box_lines
 
 if TYPE_CHECKING:
     import scipy
@@ -66,7 +66,7 @@ class GridSection(FileKeys, SourceSection):
             return B, G, H
 
         low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
-        return FieldOfSource(values, edges(low, high), "beyond the grid of")
+        return FieldOfSource(values, box_lines(low, high), "beyond the grid of")
 
 
 def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
@@ -141,7 +141,7 @@ def _size(unit: str | None, name: str) -> float:
 
 def _vtk_rows(file: Path, files: Files) -> tuple[Array, Array]:
     try:
-        data = vtk_data(files.content(file), file.suffix)
+        data = read_vtk(files.content(file), file.suffix)
     except (OSError, ValueError) as e:
         raise TableError(f"cannot be read: {getattr(e, 'strerror', None) or e}") from None
     if "B" not in data.point_data or np.shape(data.point_data["B"]) != (data.n_points, 3):

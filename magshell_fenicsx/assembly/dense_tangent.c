@@ -32,12 +32,12 @@ typedef float eight_floats __attribute__((vector_size(32), aligned(4)));
         }                                                                                                                  \
     }
 
-PRODUCT(of_doubles, double, eight)
-PRODUCT(of_floats, float, eight_floats)
+PRODUCT(multiply_doubles, double, eight)
+PRODUCT(multiply_floats, float, eight_floats)
 
 /* y (rows, 3) from a symmetric matrix of floats, with the blocks on and above its diagonal only, in each row that on it
    first, and x (rows, 3). The third number of a node is apart from eight others, which fill a line of the cache. */
-FAST void of_upper(int64_t rows, const int32_t *starts, const int32_t *columns, const float *values, const double *x,
+FAST void multiply_upper(int64_t rows, const int32_t *starts, const int32_t *columns, const float *values, const double *x,
                    double *y)
 {
     typedef double line __attribute__((vector_size(64)));

@@ -17,7 +17,7 @@ from command import magshell
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.platform.reading import Files, read_whole, text_of
+from magshell_fenicsx.platform.input_files import Files, read_bounded, table_text
 
 DATA = """
 shell: {{geometry: hemisphere, radius_to_thickness: 50, poisson_ratio: 0.3,
@@ -196,12 +196,12 @@ def test_limits(tmp_path: Path) -> None:
     is a zero byte.
     """
     (tmp_path / "ten").write_bytes(b"0123456789")
-    assert read_whole(tmp_path / "ten", 10) == b"0123456789"
+    assert read_bounded(tmp_path / "ten", 10) == b"0123456789"
     with pytest.raises(OSError, match="it is larger than 9 bytes"):
-        read_whole(tmp_path / "ten", 9)
+        read_bounded(tmp_path / "ten", 9)
     with pytest.raises(OSError, match="its name has a zero byte"):
         Files().content(Path("a\0b"))
-    assert text_of(b"\xef\xbb\xbfx,y\r\n1,2\r3,4") == "x,y\n1,2\n3,4"
+    assert table_text(b"\xef\xbb\xbfx,y\r\n1,2\r3,4") == "x,y\n1,2\n3,4"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""An expression of UFL as operations on scalars, each of which occurs once, and its derivatives.
+"""An expression of UFL as a graph of operations on scalars, and its derivatives.
 
-Fields and constants are the inputs. A node is the number of an operation; the operands of a node
-have smaller numbers.
+Each operation occurs once. A node is the number of an operation; the operands of a node have
+smaller numbers. Inputs are the components of fields and constants. Theory: docs/tangent.md.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,13 +19,13 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals, unique_post_traversal
 
 Nodes = NDArray[np.int64]
-First = dict[int, int]  # operand or input -> derivative
-Second = dict[tuple[int, int], int]  # two of them, the smaller one first -> second derivative
-Operation = tuple[
-    Any, ...
-]  # its name, then the operands' nodes; of an input or a number what it is
+FirstDerivatives = dict[int, int]  # operand or input -> derivative
+SecondDerivatives = dict[tuple[int, int], int]  # two of them, the smaller one first -> derivative
 
-COMPARISONS = {
+# Its name, then the operands' nodes; of an input or a number what it is.
+Operation = tuple[Any, ...]
+
+COMPARISONS = {  # and logical operations, with their names in C
     classes.LT: "<",
     classes.GT: ">",
     classes.LE: "<=",
@@ -34,43 +34,45 @@ COMPARISONS = {
     classes.NE: "!=",
 }
 COMPARISONS |= {classes.AndCondition: "&", classes.OrCondition: "|"}
-LARGEST_POWER = 4.5  # that is written as a product
-UNCHANGED = (classes.Variable, classes.Real, classes.Conj)  # all is real here
+MAX_PRODUCT_POWER = 4.5  # exponent up to which a power is written as a product
+IDENTITY_OPERATIONS = (classes.Variable, classes.Real, classes.Conj)  # all numbers are real
 
 
-class Scalars:
-    """Operations on scalars.
+class ScalarGraph:
+    """A graph of operations on scalars.
 
     Attributes
     ----------
     operations
         By node. Names are those of C, and "number", "field" (its position among the fields,
-        component), "constant" (place among the values of all constants) and "pick" (condition, what
-        is taken if it holds, what else).
+        component), "constant" (position among the values of all constants) and "pick" (condition,
+        what is taken if it holds, what else).
     """
 
     def __init__(self) -> None:
         self.operations: list[Operation] = []
-        self._known: dict[Operation, int] = {}
+        self._nodes: dict[Operation, int] = {}
         self.zero, self.one = self.number(0.0), self.number(1.0)
 
     def node(self, *operation: Any) -> int:
-        """The node of an operation."""
-        node = self._known.get(operation)
+        """Return the node of an operation."""
+        node = self._nodes.get(operation)
         if node is None:
-            node = self._known[operation] = len(self.operations)
+            node = self._nodes[operation] = len(self.operations)
             self.operations.append(operation)
         return node
 
     def number(self, value: float) -> int:
+        """Return the node of a number."""
         return self.node("number", float(value))
 
     def value(self, node: int) -> float | None:
-        """Of a number; None for all else."""
+        """Return the value of a number's node; None for other nodes."""
         operation = self.operations[node]
         return operation[1] if operation[0] == "number" else None
 
     def add(self, a: int, b: int) -> int:
+        """Return the node of a + b, simplified."""
         if a == self.zero or b == self.zero:
             return b if a == self.zero else a
         if a == b:
@@ -81,6 +83,7 @@ class Scalars:
         return self.node("+", min(a, b), max(a, b))
 
     def times(self, a: int, b: int) -> int:
+        """Return the node of a b, simplified."""
         if self.zero in (a, b):
             return self.zero
         if a == self.one or b == self.one:
@@ -98,82 +101,82 @@ class Scalars:
         return self.node("*", min(a, b), max(a, b))
 
     def minus(self, a: int) -> int:
+        """Return the node of -a, simplified."""
         return self.times(self.number(-1.0), a)
 
-    def over(self, a: int, b: int) -> int:
+    def divide(self, a: int, b: int) -> int:
+        """Return the node of a/b, simplified."""
         y = self.value(b)
-        return (
-            self.times(a, self.number(1 / y))
-            if y
-            else self.zero
-            if a == self.zero
-            else self.node("/", a, b)
-        )
+        if y:
+            return self.times(a, self.number(1 / y))
+        return self.zero if a == self.zero else self.node("/", a, b)
 
     def power(self, a: int, b: int) -> int:
+        """Return the node of a to the power b, simplified."""
         exponent = self.value(b)
-        if exponent is None or 2 * exponent != int(2 * exponent) or abs(exponent) > LARGEST_POWER:
+        if exponent is None:
+            return self.node("pow", a, b)
+        if 2 * exponent != int(2 * exponent) or abs(exponent) > MAX_PRODUCT_POWER:
             return self.node("pow", a, b)
         product = self.one if exponent == int(exponent) else self.node("sqrt", a)
         for _ in range(int(abs(exponent))):
             product = self.times(product, a)
-        return product if exponent >= 0 else self.over(self.one, product)
+        return product if exponent >= 0 else self.divide(self.one, product)
 
     def pick(self, condition: int, a: int, b: int) -> int:
+        """Return the node of a if a condition holds, else of b."""
         return a if a == b else self.node("pick", condition, a, b)
 
     def sum(self, nodes: Iterable[int]) -> int:
+        """Return the node of the sum of nodes, simplified."""
         total = self.zero
         for node in nodes:
             total = self.add(total, node)
         return total
 
-    def reached(self, nodes: Iterable[int]) -> list[int]:
-        """All nodes on which some depend, and themselves; operands first, each shortly before it is
-        needed.
+    def dependencies(self, nodes: Iterable[int]) -> list[int]:
+        """Return all nodes on which some depend, and themselves.
+
+        Operands come first, each shortly before it is needed.
         """
-        order, seen, stack = (
-            list[int](),
-            set[int](),
-            [(node, False) for node in reversed(list(nodes))],
-        )
+        order, visited = list[int](), set[int]()
+        stack = [(node, False) for node in reversed(list(nodes))]
         while stack:
-            node, ready = stack.pop()
-            if ready:
+            node, operands_done = stack.pop()
+            if operands_done:
                 order.append(node)
-            elif node not in seen:
-                seen.add(node)
+            elif node not in visited:
+                visited.add(node)
                 stack.append((node, True))
-                stack += [
-                    (operand, False)
-                    for operand in reversed(self.operands(node))
-                    if operand not in seen
-                ]
+                for operand in reversed(self.operands(node)):
+                    if operand not in visited:
+                        stack.append((operand, False))
         return order
 
     def operands(self, node: int) -> tuple[int, ...]:
+        """Return the operands of a node; none of an input or a number."""
         name, *rest = self.operations[node]
         return () if name in ("number", "field", "constant") else tuple(rest)
 
-    def replaced(self, nodes: Sequence[int], by: dict[int, int]) -> list[int]:
-        """Some nodes with others in place of inputs."""
-        new = dict(by)
-        for node in self.reached(nodes):
-            if node not in new:
-                operands = self.operands(node)
-                new[node] = (
-                    self.made(self.operations[node][0], [new[o] for o in operands])
-                    if operands
-                    else node
-                )
+    def substitute(self, nodes: Sequence[int], replacements: dict[int, int]) -> list[int]:
+        """Return nodes with others in place of inputs."""
+        new = dict(replacements)
+        for node in self.dependencies(nodes):
+            if node in new:
+                continue
+            operands = self.operands(node)
+            if operands:
+                new[node] = self.apply(self.operations[node][0], [new[o] for o in operands])
+            else:
+                new[node] = node
         return [new[node] for node in nodes]
 
-    def made(self, name: str, operands: Sequence[int]) -> int:
-        """An operation by name, simplified."""
+    def apply(self, name: str, operands: Sequence[int]) -> int:
+        """Return the node of an operation by name, simplified."""
         simplified: dict[str, Callable[..., int]] = {
             "+": self.add,
             "*": self.times,
-            "/": self.over,
+            "/": self.divide,
             "pow": self.power,
             "pick": self.pick,
         }
@@ -184,12 +187,12 @@ class Scalars:
     def components(
         self, expression: Expr, fields: Sequence[Any], constants: Sequence[Any]
     ) -> Nodes:
-        """The nodes of an expression's components, in the shape of the expression.
+        """Return the nodes of an expression's components, in the shape of the expression.
 
         Parameters
         ----------
         fields, constants
-            Those that occur, and their order among the inputs.
+            All that occur, in their order among the inputs.
 
         Raises
         ------
@@ -202,61 +205,61 @@ class Scalars:
         inputs: dict[Expr, list[Operation]] = {}
         for number, f in enumerate(fields):
             inputs[f] = [("field", number, k) for k in range(prod(f.ufl_shape))]
-        place = 0
+        first = 0
         for c in constants:
-            inputs[c] = [("constant", place + k) for k in range(prod(c.ufl_shape))]
-            place += prod(c.ufl_shape)
+            inputs[c] = [("constant", first + k) for k in range(prod(c.ufl_shape))]
+            first += prod(c.ufl_shape)
         values: dict[Expr, Nodes] = {}
         for e in unique_post_traversal(lowered):
             if e in inputs:
-                values[e] = np.array([self.node(*one) for one in inputs[e]]).reshape(e.ufl_shape)
+                nodes = [self.node(*operation) for operation in inputs[e]]
+                values[e] = np.array(nodes).reshape(e.ufl_shape)
             elif not isinstance(e, classes.MultiIndex | classes.Label):
-                values[e] = self._translated(e, [values.get(o) for o in e.ufl_operands])
+                values[e] = self._translate(e, [values.get(o) for o in e.ufl_operands])
         return values[lowered]
 
-    def _translated(self, e: Expr, operands: list[Any]) -> Nodes:
-        """(shape, dimensions of the free indices) by those of the operands."""
+    def _translate(self, e: Expr, operands: list[Any]) -> Nodes:
+        """Return the nodes of an expression from those of its operands.
+
+        Their shape is (*shape, *dimensions of the free indices).
+        """
         if isinstance(e, classes.Zero):
             return np.full(e.ufl_shape + e.ufl_index_dimensions, self.zero)
         if isinstance(e, classes.ScalarValue):
             return np.array(self.number(float(e)))
         if isinstance(e, classes.Identity):
             return np.where(np.eye(*e.ufl_shape) == 1, self.one, self.zero)
-        if isinstance(e, UNCHANGED):
+        if isinstance(e, IDENTITY_OPERATIONS):
             return np.asarray(operands[0])
         if isinstance(e, classes.Indexed):
             return _indexed(operands[0], e)
         if isinstance(e, classes.ComponentTensor):
             a, labels = e.ufl_operands
-            free = [len(a.ufl_shape) + a.ufl_free_indices.index(i.count()) for i in labels]
-            return np.asarray(np.moveaxis(operands[0], free, range(len(free))))
+            axes = [len(a.ufl_shape) + a.ufl_free_indices.index(i.count()) for i in labels]
+            return np.asarray(np.moveaxis(operands[0], axes, range(len(axes))))
         if isinstance(e, classes.ListTensor):
             return np.stack(operands)
         if isinstance(e, classes.IndexSum):
             a, label = e.ufl_operands
-            summed = np.moveaxis(
-                operands[0], len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count()), -1
-            )
-            sums = [self.sum(flat(row)) for row in summed.reshape(-1, summed.shape[-1])]
-            return np.array(sums).reshape(summed.shape[:-1])
-        operation = self._of_numbers(e)
-        aligned = [
-            _aligned(v, o, e)
-            for v, o in zip(operands, e.ufl_operands, strict=True)
-            if v is not None
-        ]
-        together = np.broadcast_arrays(*aligned)
-        rows = np.stack([values.ravel() for values in together], axis=1).tolist()
-        return np.array([operation(*row) for row in rows]).reshape(together[0].shape)
+            axis = len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count())
+            summands = np.moveaxis(operands[0], axis, -1)
+            sums = [self.sum(flat(row)) for row in summands.reshape(-1, summands.shape[-1])]
+            return np.array(sums).reshape(summands.shape[:-1])
+        operation = self._scalar_operation(e)
+        pairs = zip(operands, e.ufl_operands, strict=True)
+        aligned = [_aligned(nodes, operand, e) for nodes, operand in pairs if nodes is not None]
+        arrays = np.broadcast_arrays(*aligned)
+        rows = np.stack([nodes.ravel() for nodes in arrays], axis=1).tolist()
+        return np.array([operation(*row) for row in rows]).reshape(arrays[0].shape)
 
-    def _of_numbers(self, e: Expr) -> Callable[..., int]:
-        """The operation that is applied to each component."""
+    def _scalar_operation(self, e: Expr) -> Callable[..., int]:
+        """Return the operation that an expression applies to each component."""
         if isinstance(e, classes.Sum):
             return self.add
         if isinstance(e, classes.Product):
             return self.times
         if isinstance(e, classes.Division):
-            return self.over
+            return self.divide
         if isinstance(e, classes.Power):
             return self.power
         if isinstance(e, classes.Conditional):
@@ -286,18 +289,19 @@ class Scalars:
 
     # --- derivatives --------------------------------------------------------------------------
 
-    def derivatives(self, f: int, inputs: Sequence[int], *, second: bool) -> tuple[First, Second]:
-        """The first derivatives of a node by some inputs, and the second ones; what is missing is
-        zero.
+    def derivatives(
+        self, f: int, inputs: Sequence[int], *, second: bool
+    ) -> tuple[FirstDerivatives, SecondDerivatives]:
+        """Return the first derivatives of a node by some inputs, and the second ones.
 
-        Nodes are eliminated from f down to the inputs, with the derivatives of f by those that are
-        left: R. M. Gower and M. P. Mello, *A new framework for the computation of Hessians*,
-        Optimization Methods and Software 27 (2012).
+        Missing derivatives are zero. Nodes are eliminated from f down to the inputs, with the
+        derivatives of f by those that are left: R. M. Gower and M. P. Mello, *A new framework for
+        the computation of Hessians*, Optimization Methods and Software 27 (2012).
         """
         ends = set(inputs)
-        reached = sorted(self.reached([f]))
+        ascending = sorted(self.dependencies([f]))
         active = set(ends)
-        for node in reached:
+        for node in ascending:
             if any(operand in active for operand in self.operands(node)):
                 active.add(node)
         first, pairs = {f: self.one}, dict[int, dict[int, int]]()
@@ -307,40 +311,37 @@ class Scalars:
                 total = self.add(pairs.setdefault(j, {}).get(k, self.zero), value)
                 pairs[j][k] = pairs.setdefault(k, {})[j] = total
 
-        for node in reversed(reached):
+        for node in reversed(ascending):
             if node in ends or node not in active:
                 continue
-            bar = first.pop(node, self.zero)
-            others = pairs.pop(node, {})
-            itself = others.pop(node, self.zero)
-            if bar == self.zero and itself == self.zero and not others:
+            adjoint = first.pop(node, self.zero)
+            mixed = pairs.pop(node, {})
+            squared = mixed.pop(node, self.zero)
+            if adjoint == self.zero and squared == self.zero and not mixed:
                 continue
-            by, twice = self._local(node, active, ends, second=second)
-            for other, value in others.items():
+            slopes, curvatures = self._local_derivatives(node, active, ends, second=second)
+            for other, value in mixed.items():
                 pairs[other].pop(node)
-                for j, slope in by.items():
-                    couple(
-                        j,
-                        other,
-                        self.times(
-                            self.number(2.0 if j == other else 1.0), self.times(slope, value)
-                        ),
-                    )
-            for j, k in combinations_with_replacement(by, 2) if second else ():
-                bent = self.times(bar, twice.get((min(j, k), max(j, k)), self.zero))
-                couple(j, k, self.add(self.times(by[j], self.times(by[k], itself)), bent))
-            for j, slope in by.items():
-                first[j] = self.add(first.get(j, self.zero), self.times(bar, slope))
-        kept = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
-        return {node: value for node, value in first.items() if node in ends}, kept
+                for j, slope in slopes.items():
+                    multiplicity = self.number(2.0 if j == other else 1.0)
+                    couple(j, other, self.times(multiplicity, self.times(slope, value)))
+            for j, k in combinations_with_replacement(slopes, 2) if second else ():
+                curvature = curvatures.get((min(j, k), max(j, k)), self.zero)
+                bent = self.times(adjoint, curvature)
+                product = self.times(slopes[j], self.times(slopes[k], squared))
+                couple(j, k, self.add(product, bent))
+            for j, slope in slopes.items():
+                first[j] = self.add(first.get(j, self.zero), self.times(adjoint, slope))
+        upper = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
+        return {node: value for node, value in first.items() if node in ends}, upper
 
-    def _local(
+    def _local_derivatives(
         self, node: int, active: set[int], ends: set[int], *, second: bool
-    ) -> tuple[First, Second]:
-        """The derivatives of an operation by its operands; of a choice by the inputs, for each side
-        on its own.
+    ) -> tuple[FirstDerivatives, SecondDerivatives]:
+        """Return the derivatives of an operation by its operands.
 
-        What is not picked may have no value, and then it must be multiplied by nothing.
+        Those of a choice are by the inputs, for each side on its own: the side that is not picked
+        may have no value, and then it must be multiplied by nothing.
         """
         name, *operands = self.operations[node]
         if name == "pick":
@@ -353,30 +354,33 @@ class Scalars:
                 {i: self.pick(condition, f1.get(i, zero), g1.get(i, zero)) for i in f1 | g1},
                 {i: self.pick(condition, f2.get(i, zero), g2.get(i, zero)) for i in f2 | g2},
             )
-        slopes, bends = self._rules(node, name, operands)
-        by: First = {}
-        twice: Second = {}
+        rule_slopes, rule_curvatures = self._rules(node, name, operands)
+        slopes: FirstDerivatives = {}
+        curvatures: SecondDerivatives = {}
         for i, operand in enumerate(operands):
-            if operand in active:
-                by[operand] = self.add(by.get(operand, self.zero), slopes[i])
-                for k in range(len(operands) if second else 0):
-                    if operands[k] >= operand and operands[k] in active:
-                        pair = operand, operands[k]
-                        twice[pair] = self.add(twice.get(pair, self.zero), bends[i][k])
-        return by, twice
+            if operand not in active:
+                continue
+            slopes[operand] = self.add(slopes.get(operand, self.zero), rule_slopes[i])
+            for k in range(len(operands) if second else 0):
+                if operands[k] >= operand and operands[k] in active:
+                    pair = operand, operands[k]
+                    curvature = curvatures.get(pair, self.zero)
+                    curvatures[pair] = self.add(curvature, rule_curvatures[i][k])
+        return slopes, curvatures
 
     def _rules(
         self, node: int, name: str, operands: list[int]
     ) -> tuple[list[int], list[list[int]]]:
-        """First and second derivatives of an operation by its operands."""
-        zero, one, number, times, over = self.zero, self.one, self.number, self.times, self.over
+        """Return the first and second derivatives of an operation by its operands."""
+        zero, one, number = self.zero, self.one, self.number
+        times, divide = self.times, self.divide
         a, b = operands[0], operands[-1]
         if name == "+":
             return [one, one], [[zero, zero], [zero, zero]]
         if name == "*":
             return [b, a], [[zero, one], [one, zero]]
         if name == "/":
-            inverse, slope = over(one, b), self.minus(over(node, b))
+            inverse, slope = divide(one, b), self.minus(divide(node, b))
             mixed = self.minus(times(inverse, inverse))
             return [inverse, slope], [
                 [zero, mixed],
@@ -392,7 +396,7 @@ class Scalars:
             mixed = times(lower, self.add(one, times(b, log)))
             return [slope, times(node, log)], [[bend, mixed], [mixed, times(node, times(log, log))]]
         if name == "atan2":
-            inverse = over(one, self.add(times(a, a), times(b, b)))
+            inverse = divide(one, self.add(times(a, a), times(b, b)))
             x, y = times(b, inverse), times(a, inverse)
             bend = times(number(-2.0), times(x, y))
             mixed = self.add(times(y, y), self.minus(times(x, x)))
@@ -401,35 +405,37 @@ class Scalars:
             down, up, further = (self._bessel(name, a, b, k) for k in (-1, 1, None))
             slope = times(number(0.5), self.add(down, self.minus(up)))
             return [zero, slope], [[zero, zero], [zero, further]]
-        slope, bend = self._of_one(node, name, a)
+        slope, bend = self._function_rules(node, name, a)
         return [slope], [[bend]]
 
     def _bessel(self, name: str, order: int, x: int, shift: int | None) -> int:
-        """The function of a neighbouring order, or the second derivative."""
+        """Return a Bessel function of an order nearby; the second derivative if shift is None."""
         n = int(self.value(order) or 0)
 
-        def of(m: int) -> int:
-            even = self.node(name, self.number(abs(m)), x)
-            return even if m >= 0 or m % 2 == 0 else self.minus(even)
+        def of_order(m: int) -> int:
+            positive = self.node(name, self.number(abs(m)), x)
+            return positive if m >= 0 or m % 2 == 0 else self.minus(positive)
 
         if shift is not None:
-            return of(n + shift)
-        outer = self.add(of(n - 2), of(n + 2))
-        return self.times(self.number(0.25), self.add(outer, self.times(self.number(-2.0), of(n))))
+            return of_order(n + shift)
+        outer = self.add(of_order(n - 2), of_order(n + 2))
+        quarter = self.number(0.25)
+        inner = self.times(self.number(-2.0), of_order(n))
+        return self.times(quarter, self.add(outer, inner))
 
-    def _of_one(self, node: int, name: str, x: int) -> tuple[int, int]:
-        """First and second derivative of a function of one number."""
-        number, times, over = self.number, self.times, self.over
+    def _function_rules(self, node: int, name: str, x: int) -> tuple[int, int]:
+        """Return the first and second derivative of a function of one number."""
+        number, times, divide = self.number, self.times, self.divide
         square = times(x, x)
         rest = self.add(self.one, self.minus(square))
         match name:
             case "sqrt":
-                slope = over(number(0.5), node)
-                return slope, times(number(-0.5), over(slope, x))
+                slope = divide(number(0.5), node)
+                return slope, times(number(-0.5), divide(slope, x))
             case "exp":
                 return node, node
             case "log":
-                slope = over(self.one, x)
+                slope = divide(self.one, x)
                 return slope, self.minus(times(slope, slope))
             case "sin":
                 return self.node("cos", x), self.minus(node)
@@ -446,10 +452,10 @@ class Scalars:
                 slope = self.add(self.one, self.minus(times(node, node)))
                 return slope, times(number(-2.0), times(node, slope))
             case "asin" | "acos":
-                slope = over(number(1.0 if name == "asin" else -1.0), self.node("sqrt", rest))
-                return slope, over(times(x, slope), rest)
+                slope = divide(number(1.0 if name == "asin" else -1.0), self.node("sqrt", rest))
+                return slope, divide(times(x, slope), rest)
             case "atan":
-                slope = over(self.one, self.add(self.one, square))
+                slope = divide(self.one, self.add(self.one, square))
                 return slope, times(number(-2.0), times(x, times(slope, slope)))
             case "erf":
                 slope = times(number(2 / np.sqrt(np.pi)), self.node("exp", self.minus(square)))
@@ -458,12 +464,17 @@ class Scalars:
 
 
 def flat(nodes: Nodes) -> list[int]:
+    """Return nodes as a list, row by row."""
     return [int(node) for node in nodes.ravel()]
 
 
 def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], ...]:
-    """The fields, constants, ... in some expressions, each kind in the order in which they were
-    made.
+    """Return the terminals in expressions, each kind in the order in which they were created.
+
+    Parameters
+    ----------
+    kinds
+        Such as `ufl.Coefficient`.
     """
     terminals = {terminal for e in expressions for terminal in traverse_unique_terminals(e)}
     return tuple(
@@ -473,25 +484,32 @@ def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], 
 
 
 def _indexed(value: Nodes, e: Expr) -> Nodes:
-    """A[i, 0, ...]: an index that is free in A too makes a diagonal."""
-    tensor, places = e.ufl_operands
+    """Return the nodes of A[i, 0, ...] from those of A.
+
+    An index that is free in A too makes a diagonal.
+    """
+    tensor, indices = e.ufl_operands
     fixed, labels = list[int | slice](), list[int]()
-    for place in places:
-        is_fixed = isinstance(place, classes.FixedIndex)
-        fixed.append(int(place) if is_fixed else slice(None))
-        labels += [] if is_fixed else [place.count()]
+    for index in indices:
+        is_fixed = isinstance(index, classes.FixedIndex)
+        fixed.append(int(index) if is_fixed else slice(None))
+        labels += [] if is_fixed else [index.count()]
     labels += tensor.ufl_free_indices
-    short = {label: i for i, label in enumerate(dict.fromkeys(labels))}  # einsum knows 52
-    given, wanted = ([short[label] for label in some] for some in (labels, e.ufl_free_indices))
-    return np.asarray(np.einsum(value[tuple(fixed)], given, wanted))
+    numbers = {label: i for i, label in enumerate(dict.fromkeys(labels))}  # einsum knows 52
+    axes = [numbers[label] for label in labels]
+    free_axes = [numbers[label] for label in e.ufl_free_indices]
+    return np.asarray(np.einsum(value[tuple(fixed)], axes, free_axes))
 
 
 def _aligned(value: Nodes, operand: Expr, e: Expr) -> Nodes:
-    """The components of an operand with an axis for each free index of the whole."""
-    own, shape = operand.ufl_free_indices, operand.ufl_shape
-    axes = [len(shape) + own.index(label) if label in own else None for label in e.ufl_free_indices]
+    """Return the components of an operand with an axis for each free index of the expression."""
+    labels, shape = operand.ufl_free_indices, operand.ufl_shape
+    axes = [
+        len(shape) + labels.index(label) if label in labels else None
+        for label in e.ufl_free_indices
+    ]
     present = [axis for axis in axes if axis is not None]
     ordered = np.transpose(value, [*range(len(shape)), *present])
     sizes = [1 if axis is None else value.shape[axis] for axis in axes]
-    whole = (1,) * (len(e.ufl_shape) - len(shape))
-    return ordered.reshape((*whole, *shape, *sizes))
+    padding = (1,) * (len(e.ufl_shape) - len(shape))
+    return ordered.reshape((*padding, *shape, *sizes))

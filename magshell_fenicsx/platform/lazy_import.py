@@ -1,12 +1,12 @@
-"""Packages that are imported where they are first used: a case that is refused does without UFL."""
+"""Import of packages at their first use: a case that is refused does without UFL."""
 
 import sys
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from typing import Any
 
 
-def later(name: str) -> Any:
-    """A package that is imported when something of it is asked for, as `importlib` offers."""
+def lazy_import(name: str) -> Any:
+    """Return a package that is imported when one of its attributes is first read."""
     if name in sys.modules:
         return sys.modules[name]
     spec = find_spec(name)

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx.assembly.motion import Motion, moved, turned
+from magshell_fenicsx.assembly.rigid_motion import RigidMotion, apply_motions, total_rotation
 
 RNG = np.random.default_rng(0)
 X = RNG.standard_normal((5, 3))
-SHIFT = Motion("a", np.array([0.3, -0.2, 0.1]), np.zeros(3), np.zeros(3))
-TURN = Motion(
+SHIFT = RigidMotion("a", np.array([0.3, -0.2, 0.1]), np.zeros(3), np.zeros(3))
+TURN = RigidMotion(
     "b", np.array([0.0, 0.4, 0.2]), np.array([0.5, -0.7, 1.1]), np.array([1.0, 0.0, -0.5])
 )
-OTHER = Motion("c", np.zeros(3), np.array([-0.4, 0.9, 0.2]), np.array([0.2, 0.3, 0.0]))
+OTHER = RigidMotion("c", np.zeros(3), np.array([-0.4, 0.9, 0.2]), np.array([0.2, 0.3, 0.0]))
 MOTIONS = (SHIFT, TURN, OTHER)
 STEP = 1e-5
 
@@ -19,13 +19,13 @@ STEP = 1e-5
 @pytest.mark.parametrize("mu", [{"a": 0.0, "b": 0.0, "c": 0.0}, {"a": 0.7, "b": -1.3, "c": 2.0}])
 def test_derivatives(mu: dict[str, float]) -> None:
     """Central differences of the places and of their first derivatives, in all pairs of amplitudes."""
-    here = moved(MOTIONS, mu, X)
+    here = apply_motions(MOTIONS, mu, X)
     for name in mu:
-        low, high = (moved(MOTIONS, {**mu, name: mu[name] + side * STEP}, X) for side in (-1, 1))
-        np.testing.assert_allclose(here.by[name], (high.x - low.x) / (2 * STEP), atol=1e-9)
+        low, high = (apply_motions(MOTIONS, {**mu, name: mu[name] + side * STEP}, X) for side in (-1, 1))
+        np.testing.assert_allclose(here.slopes[name], (high.x - low.x) / (2 * STEP), atol=1e-9)
         for other in mu:
-            slope = (high.by[other] - low.by[other]) / (2 * STEP)
-            np.testing.assert_allclose(here.twice[name, other], slope, atol=1e-9)
+            slope = (high.slopes[other] - low.slopes[other]) / (2 * STEP)
+            np.testing.assert_allclose(here.curvatures[name, other], slope, atol=1e-9)
 
 
 def test_rigid() -> None:
@@ -33,10 +33,10 @@ def test_rigid() -> None:
     turn is one.
     """
     mu = {"a": 0.7, "b": -1.3, "c": 2.0}
-    here, Q = moved(MOTIONS, mu, X).x, turned(MOTIONS, mu).x.T
+    here, Q = apply_motions(MOTIONS, mu, X).x, total_rotation(MOTIONS, mu).x.T
     np.testing.assert_allclose(here - here[0], (X - X[0]) @ Q.T, atol=1e-14)
     np.testing.assert_allclose(Q @ Q.T, np.eye(3), atol=1e-15)
-    quarter = Motion("d", np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
+    quarter = RigidMotion("d", np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(
-        moved([quarter], {"d": 1.0}, np.array([[2.0, 0.0, 5.0]])).x, [[1.0, 1.0, 5.0]]
+        apply_motions([quarter], {"d": 1.0}, np.array([[2.0, 0.0, 5.0]])).x, [[1.0, 1.0, 5.0]]
     )

@@ -1,4 +1,7 @@
-"""The derivatives of energies by all values of a field at once."""
+"""Derivatives of energies by all values of a field at once.
+
+Theory: docs/theory.md, derivatives of results.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,9 +20,15 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Share:
-    """What a term gives to a gradient: `energy` times Pi_f plus `work` times the derivative of
-    Pi_u[w] by f.
+class WeightedTerm:
+    """A term Pi with its weights in a gradient.
+
+    Attributes
+    ----------
+    energy
+        Factor of the derivative of Pi by the field f.
+    work
+        Factor of the derivative of dPi/du[w] by f, w a given vector.
     """
 
     term: FormTerm
@@ -29,7 +38,7 @@ class Share:
 
 @dataclass(frozen=True)
 class FieldGradient:
-    """The derivatives of a number with respect to the values of a field at the nodes of its cells.
+    """The derivatives of a number by the values of a field at the nodes of its cells.
 
     Attributes
     ----------
@@ -46,61 +55,75 @@ class FieldGradient:
     normals: Array
 
     def along(self, change: Array) -> float:
-        """The derivative along a change (cells, nodes, components) of the field; collective."""
+        """Return the derivative along a change (cells, nodes, components); collective."""
         return float(self._sum(np.sum(self.forces * change)))
 
     def cells(self) -> Array:
-        """(cells, components): of a field that is the same within each cell, of this rank's own
-        cells.
+        """Return derivatives (cells, components) by a field that is constant within each cell.
+
+        Cells are this rank's own.
         """
         return np.asarray(self.forces.sum(axis=1))
 
     def within(self, cells: NDArray[np.bool_]) -> Array:
-        """(components,): of a field that is the same within a patch of own cells; collective."""
+        """Return derivatives (components,) by a field that is constant in a patch; collective.
+
+        Parameters
+        ----------
+        cells
+            Which of this rank's own cells are in the patch.
+        """
         return np.asarray(self._sum(self.forces[cells].sum(axis=(0, 1))))
 
-    def _sum(self, own: Any) -> Any:
-        return self.field.function_space.mesh.comm.allreduce(own)
+    def _sum(self, local: Any) -> Any:
+        return self.field.function_space.mesh.comm.allreduce(local)
 
 
-def by_field(
-    shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.Function, log: KernelLog
+def derivatives_by_field(
+    weighted_terms: Iterable[WeightedTerm],
+    f: fem.Function,
+    u: fem.Function,
+    w: fem.Function,
+    log: KernelLog,
 ) -> Array:
-    """The sum of the shares' derivatives by f, (cells, nodes, components) on this rank's own cells;
-    collective.
+    """Return the sum of the weighted terms' derivatives by f; collective.
 
-    A field that is the same in neighbouring cells, such as a placement, changes in each cell alone:
-    the sum over cells that share a node is what the node's own change gives.
+    A field that is continuous, such as a placement, changes in each cell alone: the sum over cells
+    that share a node is the derivative by the node's own value.
 
     Parameters
     ----------
     u, w
         The displacement of the terms, and the vector along which their residual is taken.
+
+    Returns
+    -------
+    Array
+        (cells, nodes, components) on this rank's own cells.
     """
     domain = f.function_space.mesh
-    Q = broken(f.function_space)
+    Q = broken_space(f.function_space)
     v, derivatives = ufl.TestFunction(Q), fem.Function(Q)
-    for share in shares:
-        energy = share.term.form
+    for weighted in weighted_terms:
+        energy = weighted.term.form
         if f not in energy.coefficients():
             continue
-        for order, factor in enumerate((share.energy, share.work)):
+        for order, factor in enumerate((weighted.energy, weighted.work)):
             if not domain.comm.allreduce(abs(factor)):
                 continue
-            taken = ufl.derivative(energy, u, w) if order else energy
+            functional = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))
-            form = log.compile(
-                f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v)
-            )
-            share.term.renew()
+            name = f"{weighted.term.name} by {f.name} {order}"
+            form = log.compile(name, weight * ufl.derivative(functional, f, v))
+            weighted.term.renew()
             fem.assemble_vector(derivatives.x.array, form)
     derivatives.x.scatter_reverse(InsertMode.add)
     cells = domain.topology.index_map(domain.topology.dim).size_local
     return np.asarray(derivatives.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
 
 
-def broken(V: fem.FunctionSpace) -> fem.FunctionSpace:
-    """The space, free to jump from cell to cell."""
+def broken_space(V: fem.FunctionSpace) -> fem.FunctionSpace:
+    """Return the space with the same element, discontinuous between cells."""
     element = V.element.basix_element
     if element.discontinuous:
         return V

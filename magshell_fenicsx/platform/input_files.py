@@ -1,5 +1,6 @@
-"""Reading the files that a case names: each once, whole, of a limited size, and what it declares
-before it is unpacked.
+"""Files that a case names: each is read once, as a whole, and only up to a limited size.
+
+The size that a packed file declares is checked before it is unpacked.
 
 A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a
 million times its size, or may change while it is read; a message then says so before memory or time
@@ -26,14 +27,16 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import pyvista
 
-LARGEST = 500_000_000  # bytes of a file
-UNPACKED = 500_000_000  # bytes of numbers that a packed file may declare
-LONGEST = 10_000  # characters in a line of a table
+MAX_FILE_BYTES = 500_000_000
+MAX_UNPACKED_BYTES = 500_000_000  # of numbers that a packed file may declare
+MAX_LINE_LENGTH = 10_000  # characters in a line of a table
+
+# Declarations of sizes in the XML files and in the legacy files of VTK.
 EXTENT = re.compile(rb"""\b(?:Whole)?Extent\s*=\s*["']([^"']*)["']""")
 COUNT = re.compile(
     rb"""\bNumberOf(?:Points|Cells|Tuples|Verts|Lines|Strips|Polys)\s*=\s*["']\s*(\d+)"""
 )
-WIDTH = re.compile(rb"""<\s*(?:P?DataArray|Array)\b[^>]*""")
+ARRAY_TAG = re.compile(rb"""<\s*(?:P?DataArray|Array)\b[^>]*""")
 COMPONENTS = re.compile(rb"""\bNumberOfComponents\s*=\s*["']\s*(\d+)""")
 LEGACY_GRID = re.compile(rb"^[ \t]*DIMENSIONS\s+(\d+)\s+(\d+)\s+(\d+)", re.M)
 LEGACY = re.compile(
@@ -42,23 +45,23 @@ LEGACY = re.compile(
 LEGACY_ARRAY = re.compile(rb"^[ \t]*\S+[ \t]+(\d+)[ \t]+(\d+)[ \t]+[a-z_]+[ \t]*\r?$", re.M)
 
 
-def read_whole(file: Path, largest: int = LARGEST) -> bytes:
-    """The content of a regular file, as long as it is when it is opened.
+def read_bounded(file: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Return the content of a regular file, as long as it is when it is opened.
 
     Raises
     ------
     OSError
-        If it cannot be read, is a folder, a device or a pipe, or has more bytes than `largest`.
+        If it cannot be read, is a folder, a device or a pipe, or has more bytes than `max_bytes`.
     """
     with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
-        if size > largest:
-            raise OSError(EFBIG, f"it is larger than {largest} bytes", str(file))
+        if size > max_bytes:
+            raise OSError(EFBIG, f"it is larger than {max_bytes} bytes", str(file))
         return stream.read(size)
 
 
 def open_regular(file: Path) -> BinaryIO:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
     Raises
     ------
@@ -67,9 +70,8 @@ def open_regular(file: Path) -> BinaryIO:
     """
     try:
         _refuse_special(file, file.stat().st_mode)
-        number = os.open(
-            file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
-        )  # never waits for a writer
+        # Without waiting for a writer.
+        number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError:
         raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
     stream = os.fdopen(number, "rb")
@@ -98,7 +100,7 @@ class Files:
     shared
         Whether all ranks have the same contents.
     given
-        What a program gives in place of files, each with a `digest`.
+        Objects that a program gives in place of files, each with a `digest`.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -117,16 +119,16 @@ class Files:
         return self
 
     def content(self, file: Path) -> bytes:
-        """The content of a file.
+        """Return the content of a file.
 
         Raises
         ------
         OSError
-            See `read_whole`; the same each time.
+            See `read_bounded`; the same each time.
         """
         if file not in self.contents:
             try:
-                self.contents[file] = read_whole(file)
+                self.contents[file] = read_bounded(file)
             except OSError as e:
                 self.contents[file] = e
         content = self.contents[file]
@@ -135,7 +137,7 @@ class Files:
         return content
 
     def digest(self, file: Path) -> str | None:
-        """Hash of the content of a file; None if it cannot be read."""
+        """Return a hash of the content of a file; None if it cannot be read."""
         if file in self.given:
             return str(self.given[file].digest)
         if file not in self._digests:
@@ -146,8 +148,8 @@ class Files:
         return self._digests[file]
 
 
-def text_of(content: bytes) -> str:
-    """The text of a table.
+def table_text(content: bytes) -> str:
+    """Return the text of a table.
 
     Raises
     ------
@@ -155,62 +157,65 @@ def text_of(content: bytes) -> str:
         If one of its lines is longer than any row of numbers.
     """
     text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", errors="replace").read()
-    if long := next(
-        (number for number, line in enumerate(io.StringIO(text), 1) if len(line) > LONGEST), None
-    ):
-        raise ValueError(f"line {long} has more than {LONGEST} characters")
+    for number, line in enumerate(io.StringIO(text), 1):
+        if len(line) > MAX_LINE_LENGTH:
+            raise ValueError(f"line {number} has more than {MAX_LINE_LENGTH} characters")
     return text
 
 
-def arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
-    """The arrays of numbers in an .npz file.
+def npz_arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of numbers in an .npz file.
 
     Raises
     ------
     ValueError
-        If it is none, has objects, or would unpack to more than `UNPACKED` bytes.
+        If it is none, has objects, or would unpack to more than `MAX_UNPACKED_BYTES` bytes.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            total = sum(_declared(archive, member) for member in archive.infolist())
-        if total <= UNPACKED:
-            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-                return {name: np.asarray(stored[name], dtype=float) for name in stored.files}
+            total = sum(_declared_bytes(archive, member) for member in archive.infolist())
+        if total <= MAX_UNPACKED_BYTES:
+            with np.load(io.BytesIO(content), allow_pickle=False) as npz:
+                return {name: np.asarray(npz[name], dtype=float) for name in npz.files}
     except Exception as e:  # whatever is wrong in a zip file of arrays
         raise ValueError(f"is no .npz file of arrays of numbers: {e}") from None
-    raise ValueError(f"its arrays have {total:.3g} bytes; allowed at most {UNPACKED:.3g}")
+    raise ValueError(f"its arrays have {total:.3g} bytes; allowed at most {MAX_UNPACKED_BYTES:.3g}")
 
 
-def _declared(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """The bytes of an array as floats, from its head alone; at least those that the archive
-    declares.
+def _declared_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
+    """Return the bytes of an array as floats, from its header alone.
+
+    They are at least those that the archive declares.
     """
     format_of_numpy: Any = np.lib.format
     with archive.open(member) as stream:
         version = format_of_numpy.read_magic(stream)
-        head = (
-            format_of_numpy.read_array_header_1_0
-            if version == (1, 0)
-            else format_of_numpy.read_array_header_2_0
-        )
-        shape, _, kind = head(stream)
+        if version == (1, 0):
+            shape, _, kind = format_of_numpy.read_array_header_1_0(stream)
+        else:
+            shape, _, kind = format_of_numpy.read_array_header_2_0(stream)
     return max(member.file_size, prod(map(int, shape)) * max(int(kind.itemsize), 8))
 
 
-def vtk_data(content: bytes, suffix: str) -> "pyvista.DataSet":
-    """What VTK reads in a file; its own lines about damaged files are not printed.
+def read_vtk(content: bytes, suffix: str) -> "pyvista.DataSet":
+    """Return the data set that VTK reads from a file.
+
+    Messages of VTK about damaged files are not printed.
 
     Raises
     ------
     ValueError
-        If it declares more numbers than `UNPACKED` bytes hold, or VTK cannot read it.
+        If it declares more numbers than `MAX_UNPACKED_BYTES` bytes hold, or VTK cannot read it.
     """
-    if (size := _declared_by_vtk(content)) > UNPACKED:
-        raise ValueError(f"declares {size:.3g} bytes of numbers; allowed at most {UNPACKED:.3g}")
+    if (size := _vtk_declared_bytes(content)) > MAX_UNPACKED_BYTES:
+        raise ValueError(
+            f"declares {size:.3g} bytes of numbers; allowed at most {MAX_UNPACKED_BYTES:.3g}"
+        )
     import pyvista  # VTK takes long to import
     from vtkmodules.vtkCommonCore import vtkObject
 
-    shown, before = vtkObject.GetGlobalWarningDisplay(), logging.root.manager.disable
+    vtk_warnings = vtkObject.GetGlobalWarningDisplay()
+    logging_level = logging.root.manager.disable
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         copied = Path(folder) / f"data{suffix}"
@@ -222,14 +227,12 @@ def vtk_data(content: bytes, suffix: str) -> "pyvista.DataSet":
         except Exception as e:  # VTK and pyvista raise many types
             raise ValueError(str(e).replace(str(copied), "the file") or type(e).__name__) from None
         finally:
-            logging.disable(before)
-            vtkObject.SetGlobalWarningDisplay(shown)
+            logging.disable(logging_level)
+            vtkObject.SetGlobalWarningDisplay(vtk_warnings)
 
 
-def _declared_by_vtk(content: bytes) -> int:
-    """Bytes of the numbers that the heads in a VTK file declare: of its points and of all arrays at
-    them.
-    """
+def _vtk_declared_bytes(content: bytes) -> int:
+    """Return the bytes of points and arrays that the headers in a VTK file declare."""
     if b"<VTKFile" not in content[:4096]:
         counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
         counts += [int(numbers) for numbers in LEGACY.findall(content)]
@@ -239,12 +242,12 @@ def _declared_by_vtk(content: bytes) -> int:
         [int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)
     ]
     points = [
-        prod(abs(b - a) + 1 for a, b in zip(each[::2], each[1::2], strict=False))
-        for each in extents
+        prod(abs(b - a) + 1 for a, b in zip(extent[::2], extent[1::2], strict=False))
+        for extent in extents
     ]
-    most = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
+    max_count = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
     widths = [
         int(numbers[1]) if (numbers := COMPONENTS.search(tag)) else 1
-        for tag in WIDTH.findall(content)
+        for tag in ARRAY_TAG.findall(content)
     ]
-    return 8 * most * (3 + sum(widths))
+    return 8 * max_count * (3 + sum(widths))

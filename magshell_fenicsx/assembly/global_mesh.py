@@ -1,0 +1,125 @@
+"""A distributed mesh seen as a whole: its cells and nodal values gathered on every rank.
+
+Terms that couple any two cells, such as contact and magnetic interaction, need all cells on each
+rank. Nodes are numbered globally as in the index map of their space.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True)
+class GlobalCells:
+    """The cells of all ranks, on each of them.
+
+    Attributes
+    ----------
+    nodes
+        (cells, k) global numbers of the nodes of each cell.
+    own_range
+        Rows of the cells that this rank owns.
+    """
+
+    nodes: NDArray[np.intp]
+    own_range: range
+    comm: MPI.Comm
+
+    @classmethod
+    def gather(cls, V: fem.FunctionSpace) -> "GlobalCells":
+        """Gather the cells of a space; collective."""
+        comm, index_map, topology = V.mesh.comm, V.dofmap.index_map, V.mesh.topology
+        count = topology.index_map(topology.dim).size_local
+        local_nodes = V.dofmap.list[:count]
+        flat_nodes = local_nodes.ravel().astype(np.int32)
+        nodes = index_map.local_to_global(flat_nodes).reshape(local_nodes.shape)
+        first = sum(comm.allgather(count)[: comm.rank])
+        all_nodes = np.concatenate(comm.allgather(nodes)).astype(np.intp)
+        return cls(all_nodes, range(first, first + count), comm)
+
+    def gather_values(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of all cells; collective.
+
+        Parameters
+        ----------
+        values
+            (local cells, ...) of this rank; rows of ghost cells, which come last, are left out.
+        """
+        return gather_rows(self.comm, values[: len(self.own_range)])
+
+
+def gather_rows(comm: MPI.Comm, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the rows of all ranks, in the order of ranks; collective."""
+    return np.concatenate(comm.allgather(values)) if comm.size > 1 else np.array(values)
+
+
+def global_values(f: fem.Function) -> NDArray[np.float64]:
+    """Return the nodal values (nodes, components) of all ranks, by global numbers; collective."""
+    V = f.function_space
+    block_size = V.dofmap.bs
+    owned = f.x.array[: block_size * V.dofmap.index_map.size_local]
+    return gather_rows(V.mesh.comm, owned.reshape(-1, block_size))
+
+
+def add_to_owners(
+    b: NDArray[np.float64],
+    forces: NDArray[np.float64],
+    owned_dofs: tuple[int, int],
+    comm: MPI.Comm,
+) -> None:
+    """Sum forces on all nodes over the ranks and add each to its owner's vector; collective.
+
+    Parameters
+    ----------
+    b
+        Local vector, which is changed.
+    forces
+        (nodes, 3) by global numbers, this rank's part.
+    owned_dofs
+        Global number of this rank's first degree of freedom, and how many it owns.
+    """
+    start, size = owned_dofs
+    summed = np.asarray(comm.allreduce(forces)) if comm.size > 1 else forces
+    b[:size] += summed.ravel()[start : start + size]
+
+
+def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
+    """Return the connected component of the mesh that each local node belongs to; collective.
+
+    Returns
+    -------
+    NDArray
+        (local nodes, ghosts included): numbers of components, the same on all ranks.
+    """
+    comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, V.dofmap.list
+    count, local_labels = _graph_components(
+        np.repeat(cells[:, 0], cells.shape[1]),
+        cells.ravel(),
+        index_map.size_local + index_map.num_ghosts,
+    )
+    counts = comm.allgather(count)
+    labels = local_labels + sum(counts[: comm.rank])
+    # Where two ranks share a node, their components are one: the owner's label tells which.
+    owner_labels = fem.Function(V)
+    nodal = owner_labels.x.array.reshape(-1, V.dofmap.bs)
+    nodal[:] = labels[:, None]
+    owner_labels.x.scatter_forward()
+    links = np.unique(np.column_stack([labels, nodal[:, 0].astype(np.int64)]), axis=0)
+    all_links = np.concatenate(comm.allgather(links))
+    _, merged_labels = _graph_components(all_links[:, 0], all_links[:, 1], sum(counts))
+    return np.asarray(merged_labels[labels], dtype=np.int32)
+
+
+def _graph_components(
+    starts: NDArray[np.int64], ends: NDArray[np.int64], count: int
+) -> tuple[int, NDArray[np.int32]]:
+    """Return the number of components of a graph of `count` nodes, and the component of each."""
+    graph = coo_array((np.ones(len(starts), dtype=np.int8), (starts, ends)), (count, count))
+    number, labels = connected_components(graph, directed=False)
+    return int(number), labels

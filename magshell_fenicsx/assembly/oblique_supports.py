@@ -1,0 +1,156 @@
+"""Supports along any direction, imposed by a projection.
+
+With the projector P of every supported node, u is replaced by P u. The residual becomes P b and the
+tangent P K P + (I - P), whose number of negative eigenvalues is that of K for admissible
+displacements. Theory: docs/theory.md, mirror planes in any direction.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+Array = NDArray[np.float64]
+DIRECTION_TOLERANCE = 1e-6  # sine of the angle below which two directions are equal
+
+
+@dataclass(frozen=True)
+class ObliqueSupport:
+    """Nodes that do not move along a direction.
+
+    Attributes
+    ----------
+    nodes
+        Local numbers, ghosts included.
+    normal
+        (3,) unit vector.
+    """
+
+    nodes: NDArray[np.int32]
+    normal: Array
+
+
+Constraint: TypeAlias = fem.DirichletBC | ObliqueSupport
+
+
+def support_along(
+    V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], normal: Array
+) -> Constraint:
+    """Return the constraint u . normal = 0 on some edges (`dim` 1) or faces (2)."""
+    axis = int(np.argmax(np.abs(normal)))
+    if np.delete(normal, axis).any():
+        return ObliqueSupport(fem.locate_dofs_topological(V, dim, entities), normal)
+    component = V.sub(axis)
+    dofs = fem.locate_dofs_topological(component, dim, entities)
+    return fem.dirichletbc(0.0, dofs, component)
+
+
+class Projection:
+    """The projection of displacements onto the admissible ones.
+
+    Parameters
+    ----------
+    oblique
+        Supports along any direction.
+    clamped
+        Conditions on components, possibly at the same nodes.
+    """
+
+    def __init__(
+        self,
+        V: fem.FunctionSpace,
+        oblique: Sequence[ObliqueSupport],
+        clamped: Sequence[fem.DirichletBC],
+    ) -> None:
+        index_map = V.dofmap.index_map
+        is_clamped = np.zeros((index_map.size_local + index_map.num_ghosts, 3), dtype=bool)
+        for bc in clamped:
+            is_clamped.ravel()[bc.dof_indices()[0]] = True
+        self._nodes = np.unique(np.concatenate([support.nodes for support in oblique]))
+        directions = [np.eye(3)[is_clamped[node]] for node in self._nodes]
+        for support in oblique:
+            for i in np.searchsorted(self._nodes, support.nodes):
+                directions[i] = np.vstack([directions[i], support.normal])
+        self._P = np.array([_complement(d) for d in directions]).reshape(-1, 3, 3)
+        self._owned, self._comm = index_map.size_local, V.mesh.comm
+        self._first = index_map.local_range[0]
+        self._P_matrix: PETSc.Mat | None = None
+        self._projected: PETSc.Mat | None = None
+        # Kept alive, so that no other matrix has its handle.
+        self._unprojected: PETSc.Mat | None = None
+
+    def project(self, u: Array) -> None:
+        """Project a vector of owned nodes, with or without ghosts, in place."""
+        local = self._nodes < len(u) // 3
+        nodes, x = self._nodes[local], u.reshape(-1, 3)
+        x[nodes] = np.einsum("nij,nj->ni", self._P[local], x[nodes])
+
+    def constrained_part(self, u: Array) -> Array:
+        """Return u - P u: rounding, which extrapolation along a path would multiply."""
+        admissible = np.array(u)
+        self.project(admissible)
+        return np.asarray(u - admissible)
+
+    def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
+        """Return P K P + (I - P). Collective.
+
+        It is the same object as long as K is the same; contact makes another K.
+        """
+        if self._P_matrix is None:
+            self._P_matrix = self._block_diagonal(self._P, 1.0)
+            self._complement = self._block_diagonal(np.eye(3) - self._P, 0.0)
+        is_same = self._unprojected is not None and self._unprojected.handle == K.handle
+        self._projected = K.ptap(self._P_matrix, self._projected if is_same else None)
+        self._unprojected = K
+        subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        self._projected.axpy(1.0, self._complement, subset)
+        for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
+            self._projected.setOption(option, True)
+        return self._projected
+
+    def project_both_sides(self, M: PETSc.Mat) -> PETSc.Mat:
+        """Return P M P. Collective."""
+        return M.ptap(self._block_diagonal(self._P, 1.0))
+
+    def mass(self, M: PETSc.Mat) -> PETSc.Mat:
+        """Return P M P, symmetric. Collective.
+
+        Directions of supports then have no finite eigenvalue.
+        """
+        product = self.project_both_sides(M)
+        product.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return product
+
+    def _block_diagonal(self, blocks: Array, elsewhere: float) -> PETSc.Mat:
+        """Return a block-diagonal matrix. Collective.
+
+        Parameters
+        ----------
+        blocks
+            (supported nodes, 3, 3).
+        elsewhere
+            The number on the diagonal at other nodes.
+        """
+        n, first = 3 * self._owned, 3 * self._first
+        matrix = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
+        local = self._nodes < self._owned
+        if elsewhere:
+            other_nodes = np.setdiff1d(np.arange(self._owned), self._nodes[local])
+            for i in (3 * other_nodes[:, None] + np.arange(3)).ravel():
+                matrix.setValue(first + i, first + i, elsewhere)
+        for node, block in zip(self._nodes[local], blocks[local], strict=True):
+            rows = (first + 3 * node + np.arange(3)).astype(PETSc.IntType)
+            matrix.setValues(rows, rows, block)
+        matrix.assemble()
+        return matrix
+
+
+def _complement(directions: Array) -> Array:
+    """Return the (3, 3) projector onto the complement of the directions (n, 3)."""
+    _, sizes, axes = np.linalg.svd(directions)
+    spanned = axes[: len(sizes)][sizes > DIRECTION_TOLERANCE]
+    return np.asarray(np.eye(3) - spanned.T @ spanned)

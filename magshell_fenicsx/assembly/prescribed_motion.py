@@ -1,0 +1,441 @@
+"""Prescribed motion of supports: displacements of nodes, normals of clamped edges, swept volumes.
+
+Nodes of moving supports follow rigid motions, and the normals of clamped edges turn with them.
+
+Under a live pressure, rigid lids close the shell at edges that move, and the pressure acts on the
+edges too. The potential of the pressure is the volume that the surface sweeps when its points move
+straight to their places. An edge that moves sweeps a volume as well. With a lid on the edge, which
+moves as rigidly, the two volumes add up to the change of the enclosed volume, whatever the shape of
+the lid: here it is a cone. Theory: docs/theory.md, live pressure and moving supports.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.rigid_motion import (
+    AmplitudePair,
+    RigidMotion,
+    apply_motions,
+    total_rotation,
+)
+from magshell_fenicsx.assembly.shape_tables import CORNERS
+
+Array = NDArray[np.float64]
+Amplitudes = Mapping[str, float]
+
+# First and last place in the reference cell, and the numbers of the corners there.
+CellSide = tuple[Array, Array, tuple[int, int]]
+
+# Points in (0, 1) of the two-point Gauss rule, whose weights are equal; exact for cubics.
+GAUSS_POINTS = (0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12))
+
+
+@dataclass(frozen=True)
+class EdgeCurve:
+    """Sides of cells on this rank, oriented with the surface on their left.
+
+    Attributes
+    ----------
+    nodes
+        (sides, functions): local numbers.
+    values
+        (sides, points, functions): the shape functions at quadrature points.
+    slopes
+        (sides, points, functions): their derivatives along the side, times the weights.
+    corners
+        (sides, 2): the first and the last corner, by numbers that are the same on all ranks.
+    """
+
+    nodes: NDArray[np.int32]
+    values: Array
+    slopes: Array
+    corners: NDArray[np.int64]
+
+    @classmethod
+    def from_facets(
+        cls,
+        V: fem.FunctionSpace,
+        facets: NDArray[np.int32],
+        sides: Mapping[int, CellSide],
+        pressure_signs: Array | None = None,
+    ) -> "EdgeCurve":
+        """Return the curve of those facets that this rank owns.
+
+        Parameters
+        ----------
+        sides
+            Sides of the reference cell, by the local numbers of facets.
+        pressure_signs
+            (local cells,): -1 beside cells on which the pressure acts from inside, where the
+            surface is on the right of the curve; 1 elsewhere.
+        """
+        topology, element, dim = V.mesh.topology, V.element.basix_element, V.mesh.topology.dim
+        for dims in ((dim - 1, dim), (dim, dim - 1), (dim, 0)):
+            topology.create_connectivity(*dims)
+        facets = facets[facets < topology.index_map(dim - 1).size_local]
+        rule = basix.make_quadrature(basix.CellType.interval, 3 * element.degree)
+        x, weights = (np.asarray(array) for array in rule)
+        values, slopes = {}, {}
+        for number, (first, last, _) in sides.items():
+            table = element.tabulate(1, first + x * (last - first))[..., 0]
+            values[number] = table[0]
+            slopes[number] = weights[:, None] * np.tensordot(last - first, table[1:], 1)
+        cells = [int(topology.connectivity(dim - 1, dim).links(facet)[0]) for facet in facets]
+        facets_of_cells = topology.connectivity(dim, dim - 1)
+        numbers = [
+            int(np.flatnonzero(facets_of_cells.links(cell) == facet)[0])
+            for cell, facet in zip(cells, facets, strict=True)
+        ]
+        vertices_of_cells = topology.connectivity(dim, 0)
+        corners = [
+            vertices_of_cells.links(cell)[list(sides[number][2])]
+            for cell, number in zip(cells, numbers, strict=True)
+        ]
+        flat_corners = np.array(corners, dtype=np.int32).ravel()
+        shape = len(cells), len(weights), element.dim
+        signs = np.ones(len(cells)) if pressure_signs is None else pressure_signs[cells]
+        return cls(
+            V.dofmap.list[cells],
+            np.reshape([values[number] for number in numbers], shape),
+            signs[:, None, None] * np.reshape([slopes[number] for number in numbers], shape),
+            topology.index_map(0).local_to_global(flat_corners).reshape(-1, 2),
+        )
+
+    def at_points(self, x: Array) -> Array:
+        """Return nodal vectors (nodes, 3) at the quadrature points, (sides, points, 3)."""
+        return np.asarray(self.values @ x[self.nodes])
+
+    def derivative(self, x: Array) -> Array:
+        """Return the derivatives of nodal vectors along the curve times the weights.
+
+        The shape is (sides, points, 3).
+        """
+        return np.asarray(self.slopes @ x[self.nodes])
+
+
+def triangle_sides() -> dict[int, CellSide]:
+    """Return the sides of the reference triangle, which is on their left."""
+    corners_of_sides = ((1, 2), (2, 0), (0, 1))
+    return {i: (CORNERS[a], CORNERS[b], (a, b)) for i, (a, b) in enumerate(corners_of_sides)}
+
+
+def level_sides(height: float) -> dict[int, CellSide]:
+    """Return lines on the side faces of the reference hexahedron at a height from 0 to 1.
+
+    The face above a line is on its left.
+    """
+    corners = np.array(
+        [[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height], [1.0, 1.0, height]]
+    )
+    corners_of_faces = {1: (0, 1), 3: (1, 3), 4: (3, 2), 2: (2, 0)}
+    return {i: (corners[a], corners[b], (a, b)) for i, (a, b) in corners_of_faces.items()}
+
+
+def end_corners(curves: Sequence[EdgeCurve], comm: MPI.Comm) -> NDArray[np.int64]:
+    """Return the corners at which curves begin or end, none of closed curves; collective."""
+    local = np.concatenate([np.empty(0, np.int64), *(curve.corners.ravel() for curve in curves)])
+    corners, count = np.unique(np.concatenate(comm.allgather(local)), return_counts=True)
+    return np.asarray(corners[count % 2 == 1])
+
+
+@dataclass(frozen=True)
+class Lid:
+    """A surface that closes an edge and moves with it.
+
+    Attributes
+    ----------
+    motions
+        Carried out one after the other.
+    origin
+        (3,): the apex of the cone.
+    area
+        (3,): the integral of the normal n over the lid.
+    moment
+        (3, 3): the integral of y n^T over the lid; y is counted from the origin.
+    """
+
+    motions: Sequence[RigidMotion]
+    origin: Array
+    area: Array
+    moment: Array
+
+    @classmethod
+    def cone(
+        cls,
+        curves: Sequence[EdgeCurve],
+        x: Array,
+        motions: Sequence[RigidMotion],
+        origin: Array,
+        comm: MPI.Comm,
+    ) -> "Lid":
+        """Return the cone over curves through nodes at x (nodes, 3); collective."""
+        area, moment = np.zeros(3), np.zeros((3, 3))
+        for curve in curves:
+            y = curve.at_points(x) - origin
+            normal = np.cross(y, curve.derivative(x))
+            area -= normal.sum(axis=(0, 1)) / 2
+            moment -= np.einsum("sqi,sqj->ij", y, normal) / 3
+        return cls(motions, origin, comm.allreduce(area), comm.allreduce(moment))
+
+    @classmethod
+    def disc(cls, rho: float, motions: Sequence[RigidMotion], *, last: bool) -> "Lid":
+        """Return the disc at the first or the last end of a meridian, with motions along e3.
+
+        Parameters
+        ----------
+        rho
+            Its radius.
+        """
+        area = np.array([0.0, 0.0, np.pi * rho**2])
+        return cls(motions, np.zeros(3), -area if last else area, np.zeros((3, 3)))
+
+    def swept_volume(
+        self, mu: Amplitudes
+    ) -> tuple[float, dict[str, float], dict[AmplitudePair, float]]:
+        """Return the volume that the lid sweeps when its points move straight to their places.
+
+        Returns
+        -------
+        tuple
+            The volume, its first and its second derivatives by the amplitudes of the motions.
+        """
+        turn = total_rotation(self.motions, mu)
+        place = apply_motions(self.motions, mu, self.origin[None])
+        # The displacement is u = G y + s; (G, s) here and of each derivative.
+        displacement = turn.x.T - np.eye(3), place.x[0] - self.origin
+        rates = {name: (turn.slopes[name].T, place.slopes[name][0]) for name in turn.slopes}
+        bends = {
+            pair: (turn.curvatures[pair].T, place.curvatures[pair][0]) for pair in turn.curvatures
+        }
+        volume, slopes, curvatures = 0.0, dict.fromkeys(rates, 0.0), dict.fromkeys(bends, 0.0)
+        for tau in GAUSS_POINTS:
+            F = np.eye(3) + tau * displacement[0]
+            flux = self._flux(*displacement)
+            volume += float((_cofactor(F, F) * flux).sum()) / 2
+            for a, (G, s) in rates.items():
+                stretched = 2 * tau * _cofactor(F, G) * flux
+                slopes[a] += float((stretched + _cofactor(F, F) * self._flux(G, s)).sum()) / 2
+            for (a, b), (G, s) in bends.items():
+                second = 2 * tau**2 * _cofactor(rates[a][0], rates[b][0])
+                stretched = (second + 2 * tau * _cofactor(F, G)) * flux
+                mixed = [
+                    2 * tau * _cofactor(F, rates[i][0]) * self._flux(*rates[j])
+                    for i, j in ((a, b), (b, a))
+                ]
+                integrand = stretched + sum(mixed) + _cofactor(F, F) * self._flux(G, s)
+                curvatures[a, b] += float(integrand.sum()) / 2
+        return volume, slopes, curvatures
+
+    def _flux(self, G: Array, s: Array) -> Array:
+        """Return the integral (3, 3) of u n^T over the lid for u = G y + s."""
+        return np.asarray(G @ self.moment + np.outer(s, self.area))
+
+
+def _cofactor(X: Array, Y: Array) -> Array:
+    """Return the bilinear symmetric form of which cof F is the value for X = Y = F."""
+    trace = np.trace(X) * np.trace(Y) - np.trace(X @ Y)
+    return np.asarray((X @ Y + Y @ X - np.trace(X) * Y - np.trace(Y) * X + trace * np.eye(3)).T / 2)
+
+
+@dataclass(frozen=True)
+class EdgePressure:
+    """The part of a live pressure with a potential that acts at edges that move.
+
+    Attributes
+    ----------
+    load
+        Name of the amplitude of the pressure.
+    unit
+        The pressure that the amplitude 1 stands for.
+    lids
+        On edges that are closed.
+    curves
+        The edges.
+    """
+
+    load: str
+    unit: float
+    lids: Sequence[Lid]
+    curves: Sequence[EdgeCurve] = ()
+
+    def swept_volume(self, mu: Amplitudes) -> float:
+        """Return the volume that the lids sweep."""
+        return sum(lid.swept_volume(mu)[0] for lid in self.lids)
+
+    def volume_slope(self, mu: Amplitudes, name: str) -> float:
+        """Return the derivative of the swept volume by an amplitude."""
+        return sum(lid.swept_volume(mu)[1].get(name, 0.0) for lid in self.lids)
+
+    def volume_curvature(self, mu: Amplitudes, name: str, other: str) -> float:
+        """Return the second derivative of the swept volume by two amplitudes."""
+        return sum(lid.swept_volume(mu)[2].get((name, other), 0.0) for lid in self.lids)
+
+    def edge_forces(self, x0: Array, u: Array) -> Array:
+        """Return nodal forces (nodes, 3) of p = 1 on the edges.
+
+        Those that the derivative of the swept volume has are left out. An edge that moves straight
+        by u sweeps a ribbon. Where a node moves further by v, the volume between the two ribbons is
+        the integral of v . u x (x0/2 + u/3)' along the edge.
+        """
+        forces = np.zeros_like(x0)
+        for curve in self.curves:
+            tangent = curve.derivative(x0) / 2 + curve.derivative(u) / 3
+            ribbon = np.cross(curve.at_points(u), tangent)
+            np.add.at(forces, curve.nodes, np.einsum("sqf,sqi->sfi", curve.values, ribbon))
+        return self.unit * forces
+
+
+# Axes of a displacement's components: in the plane of a meridian, or in space.
+AXES_OF_COMPONENTS = {2: (0, 2), 3: (0, 1, 2)}
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """Nodes that move together as one rigid body.
+
+    Attributes
+    ----------
+    motions
+        Carried out one after the other.
+    dofs
+        Local numbers, with ghosts, of the components that are prescribed.
+    edge
+        Name of the term that holds the normal of a clamped edge; "" without.
+    turn
+        The rotation in that term; None if no motion turns.
+    """
+
+    motions: Sequence[RigidMotion]
+    dofs: NDArray[np.int32]
+    edge: str = ""
+    turn: fem.Constant | None = None
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the motions' amplitudes."""
+        return {motion.name for motion in self.motions}
+
+
+class PrescribedMotion:
+    """The displacement E(mu) of all nodes that move; vectors are local, with ghosts.
+
+    The energy of a clamped edge depends on its normal through Q^T r alone, Q the edge's rotation.
+    So its derivatives by Q are those by the displacement along A r, with A = Q dQ^T.
+
+    Parameters
+    ----------
+    r0
+        The reference placement.
+    edge_pressure
+        What a live pressure does at edges that move.
+
+    Attributes
+    ----------
+    names
+        Names of the amplitudes of all motions.
+    cells
+        (local cells,): whether a node of the cell moves.
+    """
+
+    def __init__(
+        self,
+        r0: fem.Function,
+        bodies: Sequence[RigidBody],
+        edge_pressure: EdgePressure | None = None,
+    ) -> None:
+        self.edge_pressure = edge_pressure
+        self._axes = list(AXES_OF_COMPONENTS[r0.function_space.dofmap.index_map_bs])
+        self._r0, self._bodies = r0, bodies
+        places = vectors_in_space(r0.x.array, len(self._axes))
+        self._places = [places[body.dofs // len(self._axes)] for body in bodies]
+        self.names = frozenset(name for body in bodies for name in body.names)
+        V = r0.function_space
+        node_moves = np.zeros(len(r0.x.array) // len(self._axes), dtype=bool)
+        for body in bodies:
+            node_moves[body.dofs // len(self._axes)] = True
+        self.cells = node_moves[V.dofmap.list].any(axis=1)
+
+    def put(self, u: Array, mu: Amplitudes) -> None:
+        """Write E(mu) into a displacement."""
+        for body, places in zip(self._bodies, self._places, strict=True):
+            displacement = apply_motions(body.motions, mu, places).x - places
+            u[body.dofs] = self._components(body, displacement)
+
+    def turn(self, mu: Amplitudes) -> None:
+        """Write the rotations into the terms of the edges; missing amplitudes are zero."""
+        for body in self._bodies:
+            if body.turn is not None:
+                amplitudes = dict.fromkeys(body.names, 0.0) | dict(mu)
+                body.turn.value[:] = total_rotation(body.motions, amplitudes).x.T
+
+    def rate(self, mu: Amplitudes, name: str) -> Array:
+        """Return dE/dmu."""
+        rates = np.zeros(len(self._r0.x.array))
+        for body, places in self._bodies_moved_by(name):
+            velocity = apply_motions(body.motions, mu, places).slopes[name]
+            rates[body.dofs] = self._components(body, velocity)
+        return rates
+
+    def bend(self, mu: Amplitudes, name: str, other: str) -> Array:
+        """Return d2E/dmu_i dmu_j."""
+        bends = np.zeros(len(self._r0.x.array))
+        for body, places in self._bodies_moved_by(name, other):
+            curvature = apply_motions(body.motions, mu, places).curvatures[name, other]
+            bends[body.dofs] = self._components(body, curvature)
+        return bends
+
+    def edge_forces(self, u: Array) -> Array:
+        """Return the forces of p = 1 on edges, see `EdgePressure.edge_forces`."""
+        if not (self.edge_pressure and self.edge_pressure.curves):
+            return np.zeros_like(u)
+        x0 = self._r0.x.array.reshape(-1, 3)
+        return self.edge_pressure.edge_forces(x0, u.reshape(-1, 3)).ravel()
+
+    def turning(self, mu: Amplitudes, name: str) -> Iterator[tuple[str, Array]]:
+        """Iterate over edges that the motion turns, each with A = Q dQ^T/dmu (3, 3)."""
+        for body, _ in self._bodies_moved_by(name):
+            if body.turn is not None:
+                rotation = total_rotation(body.motions, mu)
+                yield body.edge, rotation.x.T @ rotation.slopes[name]
+
+    def turning_twice(self, mu: Amplitudes, pair: AmplitudePair) -> Iterator[tuple[str, Array]]:
+        """Iterate over edges that both motions turn, each with dA_i/dmu_j (3, 3)."""
+        for body, _ in self._bodies_moved_by(*pair):
+            if body.turn is not None:
+                rotation = total_rotation(body.motions, mu)
+                i, j = pair
+                product = rotation.slopes[j].T @ rotation.slopes[i]
+                yield body.edge, product + rotation.x.T @ rotation.curvatures[pair]
+
+    def spin_displacement(self, A: Array, u: Array) -> Array:
+        """Return the displacement A r of all nodes, r = r0 + u."""
+        return self.transform(A, self._r0.x.array + u)
+
+    def transform(self, A: Array, v: Array) -> Array:
+        """Return a matrix (3, 3) times the vectors of all nodes."""
+        vectors = vectors_in_space(v, len(self._axes)) @ A.T
+        return np.ascontiguousarray(vectors[:, self._axes]).ravel()
+
+    def _bodies_moved_by(self, *names: str) -> Iterator[tuple[RigidBody, Array]]:
+        """Iterate over bodies that all these motions move, with the places of their nodes."""
+        for body, places in zip(self._bodies, self._places, strict=True):
+            if body.names.issuperset(names):
+                yield body, places
+
+    def _components(self, body: RigidBody, vectors: Array) -> Array:
+        """Return that component of each vector which is prescribed."""
+        axes = np.array(self._axes)[body.dofs % len(self._axes)]
+        return np.asarray(vectors[np.arange(len(axes)), axes])
+
+
+def vectors_in_space(v: Array, components: int) -> Array:
+    """Return vectors (n, 3) of nodes, from three components each or two in a meridian's plane."""
+    vectors = np.zeros((len(v) // components, 3))
+    vectors[:, AXES_OF_COMPONENTS[components]] = v.reshape(-1, components)
+    return vectors

@@ -1,0 +1,195 @@
+"""Surfaces of revolution about e3: profiles, and the embeddings of charts.
+
+A chart is (rho theta, s) or, up to a pole, s (cos theta, sin theta). A profile is a curve in the
+plane (r, z) with the coordinate s. With r to the right and z upwards, the normal of the surface
+points to the right of the direction of s: on a cylinder with s upwards it points outwards. Lengths
+are over R.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+# iterations for a spline's parameter, which converges to the arc length as the square of its steps,
+# and of Newton's method for the place nearest to a point
+ITERATIONS = 4
+GAUSS_POINTS = 6  # on each part of a spline
+NEAREST_SAMPLES = 401  # of a spline, to begin the search for the nearest place
+POLE_SAMPLES = 2001  # of a profile, to begin the search for the lengths from the pole
+PARAMETER_TOLERANCE = 1e-13  # of the parameter of the nearest place
+AZIMUTH_TOLERANCE = 1e-9  # rad: an azimuth that is less than the first one by rounding
+TINY = 1e-300  # keeps divisions defined at the pole
+
+
+class Profile(Protocol):
+    """A curve in the plane (r, z)."""
+
+    @property
+    def length(self) -> float:
+        """Length of the curve: the largest s."""
+
+    def __call__(self, s: Array) -> Array:
+        """Return places (..., 2) at s (...)."""
+
+    def tangent(self, s: Array) -> Array:
+        """Return unit vectors (..., 2) in the direction of s."""
+
+    def nearest_parameter(self, rz: Array) -> float:
+        """Return s of the place nearest to a point (2,)."""
+
+
+@dataclass(frozen=True)
+class StraightProfile:
+    """A straight profile from `start` to `end`: cylinder, cone, ring."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    @property
+    def length(self) -> float:
+        return float(np.hypot(*np.subtract(self.end, self.start)))
+
+    def __call__(self, s: Array) -> Array:
+        share = np.asarray(s)[..., None] / self.length
+        return np.asarray(self.start + share * np.subtract(self.end, self.start))
+
+    def tangent(self, s: Array) -> Array:
+        return np.broadcast_to(np.subtract(self.end, self.start) / self.length, (*np.shape(s), 2))
+
+    def nearest_parameter(self, rz: Array) -> float:
+        tangent = np.subtract(self.end, self.start) / self.length
+        return float(np.clip((rz - self.start) @ tangent, 0.0, self.length))
+
+
+@dataclass(frozen=True)
+class ArcProfile:
+    """Arc around (centre, 0) from the angle `start` to `end` (rad, from r towards z)."""
+
+    radius: float
+    start: float
+    end: float
+    centre: float = 0.0
+
+    @property
+    def length(self) -> float:
+        return self.radius * (self.end - self.start)
+
+    def __call__(self, s: Array) -> Array:
+        angle = self.start + np.asarray(s) / self.radius
+        return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) + [self.centre, 0.0]
+
+    def tangent(self, s: Array) -> Array:
+        angle = self.start + np.asarray(s) / self.radius
+        return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+    def nearest_parameter(self, rz: Array) -> float:
+        angle = np.arctan2(rz[1], rz[0] - self.centre) - self.start
+        missing_angle = 2 * np.pi - (self.end - self.start)
+        # a point beyond the arc belongs to the nearer end
+        angle = (angle + missing_angle / 2) % (2 * np.pi) - missing_angle / 2
+        return float(np.clip(angle, 0.0, self.end - self.start) * self.radius)
+
+
+class SplineProfile:
+    """A smooth profile through points (n, 2), over its arc length."""
+
+    def __init__(self, points: Array) -> None:
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        for _ in range(ITERATIONS):  # from chords to arcs
+            knots = np.concatenate([[0.0], np.cumsum(steps)])
+            self._curve = scipy.interpolate.CubicSpline(knots, points)
+            x, w = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+            s = knots[:-1, None] + np.diff(knots)[:, None] * (x + 1) / 2
+            steps = np.diff(knots) / 2 * (np.linalg.norm(self._curve(s, 1), axis=2) @ w)
+        self.length = float(knots[-1])
+
+    def __call__(self, s: Array) -> Array:
+        return np.asarray(self._curve(s))
+
+    def tangent(self, s: Array) -> Array:
+        derivative = self._curve(s, 1)
+        return np.asarray(derivative / np.linalg.norm(derivative, axis=-1)[..., None])
+
+    def nearest_parameter(self, rz: Array) -> float:
+        samples = np.linspace(0, self.length, NEAREST_SAMPLES, dtype=np.float64)
+        nearest = int(np.argmin(np.linalg.norm(self(samples) - rz, axis=1)))
+        bounds = samples[max(nearest - 1, 0)], samples[min(nearest + 1, NEAREST_SAMPLES - 1)]
+        minimum = scipy.optimize.minimize_scalar(
+            lambda s: np.sum((self(s) - rz) ** 2),
+            bounds=bounds,
+            method="bounded",
+            options={"xatol": PARAMETER_TOLERANCE},
+        )
+        candidates = [float(minimum.x), *(float(s) for s in bounds)]
+        return min(candidates, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
+
+
+@dataclass(frozen=True)
+class RevolvedEmbedding:
+    """Embedding of the chart (rho theta, s) into space."""
+
+    profile: Profile
+    rho: float
+
+    def __call__(self, chart: Array) -> Array:
+        theta, (r, z) = chart[:, 0] / self.rho, self.profile(chart[:, 1]).T
+        return np.column_stack([r * np.cos(theta), r * np.sin(theta), z])
+
+    def normal(self, chart: Array) -> Array:
+        """Return outward normals (n, 3)."""
+        theta, (along_r, along_z) = chart[:, 0] / self.rho, self.profile.tangent(chart[:, 1]).T
+        return np.column_stack([along_z * np.cos(theta), along_z * np.sin(theta), -along_r])
+
+    def inverse(self, x: Array, first_azimuth: float) -> Array:
+        """Return the chart (2,) of a point (3,), theta in [first, first + 2 pi)."""
+        theta = np.arctan2(x[1], x[0])
+        on_first_rank = (theta - first_azimuth + AZIMUTH_TOLERANCE) % (2 * np.pi)
+        theta = first_azimuth + on_first_rank - AZIMUTH_TOLERANCE
+        s = self.profile.nearest_parameter(np.array([np.hypot(x[0], x[1]), x[2]]))
+        return np.array([theta * self.rho, s])
+
+
+@dataclass(frozen=True)
+class CappedEmbedding:
+    """Embedding of the chart t (cos theta, sin theta) into space.
+
+    t is the length of the meridian from the pole, which is at the profile's end.
+    """
+
+    profile: Profile
+
+    def __call__(self, chart: Array) -> Array:
+        t = np.hypot(chart[:, 0], chart[:, 1])
+        r, z = self.profile(self.profile.length - t).T
+        return np.column_stack([r[:, None] * _direction(chart, t), z])
+
+    def normal(self, chart: Array) -> Array:
+        """Return outward normals (n, 3)."""
+        t = np.hypot(chart[:, 0], chart[:, 1])
+        along_r, along_z = self.profile.tangent(self.profile.length - t).T
+        return np.column_stack([along_z[:, None] * _direction(chart, t), -along_r])
+
+    def from_pole(self, places: Array) -> Array:
+        """Return the length (n,) of the meridian from the pole to places (n, 3) of the surface."""
+        rz = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
+        samples = np.linspace(0, self.profile.length, POLE_SAMPLES, dtype=np.float64)
+        s = samples[scipy.spatial.cKDTree(self.profile(samples)).query(rz)[1]]
+        for _ in range(ITERATIONS):  # Newton's method, whose residual vanishes on the surface
+            correction = np.sum((rz - self.profile(s)) * self.profile.tangent(s), axis=1)
+            s = np.clip(s + correction, 0, self.profile.length)
+        return np.asarray(self.profile.length - s)
+
+    def inverse(self, x: Array) -> Array:
+        """Return the chart (2,) of a point (3,)."""
+        rho = np.hypot(x[0], x[1])
+        t = self.profile.length - self.profile.nearest_parameter(np.array([rho, x[2]]))
+        return t * x[:2] / rho if rho > 0 else np.zeros(2)
+
+
+def _direction(chart: Array, t: Array) -> Array:
+    """Return cos theta and sin theta, (n, 2); zero at the pole."""
+    return np.where(t[:, None] > 0, chart / np.maximum(t, TINY)[:, None], 0.0)

@@ -1,0 +1,284 @@
+"""A user's dolfinx mesh of triangles in space: its triangles, fields on it, displacements for it.
+
+Every rank has all triangles, in the order in which they were made, whatever the number of ranks:
+they are few. A scene has a mesh of its own, distributed in its own way; fields go there and
+displacements come back cell by cell.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import basix
+import numpy as np
+from dolfinx import fem, mesh
+from dolfinx.cpp.io import perm_gmsh
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError, Pairs, Triangles, UserField
+from magshell_fenicsx.platform import compat
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+TRIANGLE = basix.CellType.triangle
+NODES_BY_ORDER = {1: 3, 2: 6, 3: 10}  # order of a triangle -> its nodes
+MeshPart = int | NDArray[np.int32]  # a value of tags, or local numbers of facets or cells
+
+
+class UserMesh:
+    """A mesh to which fields belong and for which displacements are made.
+
+    All methods are collective.
+
+    Parameters
+    ----------
+    domain
+        Triangles of order 1 to 3 in space.
+
+    Raises
+    ------
+    MeshError
+        If the mesh is of another kind.
+    """
+
+    def __init__(self, domain: mesh.Mesh) -> None:
+        self.mesh, self.comm = domain, domain.comm
+        cell_type, dimension = domain.topology.cell_name(), domain.geometry.dim
+        if cell_type != "triangle":
+            raise MeshError(
+                f"mesh: its cells are of the kind {cell_type}; a mid-surface has triangles"
+            )
+        if dimension != 3:
+            raise MeshError(
+                f"mesh: its nodes have {dimension} coordinates; a mid-surface is in space: gdim=3"
+            )
+        self._element = domain.ufl_domain().ufl_coordinate_element().basix_element
+        if (order := self._element.degree) not in NODES_BY_ORDER:
+            raise MeshError(f"mesh: its triangles are of order {order}; allowed are 1, 2 and 3")
+        cell_map = domain.topology.index_map(2)
+        self._owned = cell_map.size_local
+        self._numbers = self._original_numbers(cell_map)
+        self._spaces: dict[int, fem.FunctionSpace] = {}
+
+    def triangles(
+        self,
+        edges: Mapping[str, MeshPart],
+        patches: Mapping[str, MeshPart],
+        facet_tags: mesh.MeshTags | None = None,
+        cell_tags: mesh.MeshTags | None = None,
+    ) -> Triangles:
+        """Return the triangles of all ranks with named edges and patches.
+
+        Parameters
+        ----------
+        edges, patches
+            Name -> a value of `facet_tags` or `cell_tags`, or local facets or cells.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if tags are missing or have no such value.
+        """
+        nodes, ids = self._nodes_of_owned_cells()
+        cells = self._gather_cells(ids)
+        used, first_index, index_of_used = np.unique(cells, return_index=True, return_inverse=True)
+        order = np.argsort(first_index)  # nodes in the order of the cells, too
+        number = np.empty(len(used), dtype=np.int64)
+        number[order] = np.arange(len(used))
+        places = self._gather_cells(nodes).reshape(-1, 3)[first_index[order]]
+        pairs_of_edges = {
+            name: self._vertex_pairs(self._entities_of_part(f"edges.{name}", part, facet_tags, 1))
+            for name, part in edges.items()
+        }
+        cells_of_patches = {
+            name: self._entities_of_part(f"patches.{name}", part, cell_tags, 2)
+            for name, part in patches.items()
+        }
+        return Triangles(
+            places,
+            number[index_of_used].reshape(cells.shape),
+            {name: number[np.searchsorted(used, ends)] for name, ends in pairs_of_edges.items()},
+            {name: self._cell_mask(local, len(cells)) for name, local in cells_of_patches.items()},
+            self,
+        )
+
+    def field(self, function: fem.Function, name: str) -> UserField:
+        """Return a function on this mesh as a field, a polynomial in each triangle.
+
+        Raises
+        ------
+        MeshError
+            If the function is on another mesh, or is no Lagrange or DG function.
+        """
+        V = function.function_space
+        if V.mesh._cpp_object is not self.mesh._cpp_object:
+            raise MeshError(f"{name}: is a function on another mesh than that of the shell")
+        family = getattr(V.ufl_element(), "element_family", None)
+        if family != basix.ElementFamily.P or len(function.ufl_shape) > 1:
+            raise MeshError(
+                f"{name}: is a function of {V.ufl_element()}; "
+                "allowed are Lagrange and DG, scalars or vectors: interpolate it into such a space"
+            )
+        element = V.element.basix_element
+        nodes = lagrange_element(element.degree)
+        table = element.tabulate(0, nodes.points)[0, :, :, 0]
+        values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
+        nodal = self._gather_cells(np.matmul(table, np.asarray(values, dtype=float)))
+        if not np.isfinite(nodal).all():
+            raise MeshError(f"{name}: has values that are not numbers")
+        return UserField(name, element.degree, nodal, swapped_nodes(nodes), self)
+
+    def displacement(
+        self, u: fem.Function, source_triangles: Numbers, scale: float
+    ) -> fem.Function:
+        """Return a field of a scene as a function on this mesh.
+
+        Parameters
+        ----------
+        u
+            A vector Lagrange function on the scene's mesh.
+        source_triangles
+            (cells, 2) of the scene's cells, ghosts perhaps included, see
+            `PatchMesh.source_triangles`.
+        scale
+            What the values are divided by.
+        """
+        V = u.function_space
+        degree, owned = V.element.basix_element.degree, V.mesh.topology.index_map(2).size_local
+        nodal = u.x.array.reshape(-1, 3)[V.dofmap.list[:owned]] / scale
+        number, is_reversed = source_triangles[:owned].T
+        of_reversed = nodal[:, swapped_nodes(V.element.basix_element)]
+        nodal = np.where(is_reversed[:, None, None] == 1, of_reversed, nodal)
+        cell_count = self.mesh.topology.index_map(2).size_global
+        nodal_of_all = np.zeros((cell_count, *nodal.shape[1:]))
+        for numbers, values in self.comm.allgather((number, nodal)):
+            nodal_of_all[numbers] = values
+        W = self._spaces.get(degree) or fem.functionspace(self.mesh, ("Lagrange", degree, (3,)))
+        self._spaces[degree] = W
+        displacement = fem.Function(W, name="u")
+        displacement.x.array.reshape(-1, 3)[W.dofmap.list] = nodal_of_all[self._numbers]
+        return displacement
+
+    def _original_numbers(self, cell_map: Any) -> Numbers:
+        """Return the number of each local cell, ghosts included, in the order of their making."""
+        local_count = cell_map.size_local + cell_map.num_ghosts
+        original = compat.original_cells(self.mesh)[:local_count]
+        of_all_ranks = np.concatenate(self.comm.allgather(original[: self._owned]))
+        has_all = len(of_all_ranks) == cell_map.size_global
+        if has_all and (np.sort(of_all_ranks) == np.arange(cell_map.size_global)).all():
+            return original
+        # the mesh is a part of another one
+        return np.asarray(cell_map.local_to_global(np.arange(local_count, dtype=np.int32)))
+
+    def _gather_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of this rank's own cells for the cells of all ranks, in their order."""
+        parts = self.comm.allgather((self._numbers[: self._owned], values))
+        numbers, all_values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return np.asarray(all_values[np.argsort(numbers)])
+
+    def _nodes_of_owned_cells(self) -> tuple[Array, Numbers]:
+        """Return coordinates (cells, nodes, 3) and global numbers of nodes, in gmsh's order.
+
+        They are of this rank's own cells.
+        """
+        geometry, dofs = self.mesh.geometry, compat.geometry_dofs(self.mesh)[: self._owned]
+        x = geometry.x[dofs]
+        if self._element.lagrange_variant != basix.LagrangeVariant.equispaced:
+            degree = self._element.degree
+            equispaced = basix.create_element(
+                basix.ElementFamily.P, TRIANGLE, degree, basix.LagrangeVariant.equispaced
+            )
+            x = np.matmul(self._element.tabulate(0, equispaced.points)[0, :, :, 0], x)
+        ids = geometry.index_map().local_to_global(dofs.ravel().astype(np.int32))
+        ids = ids.reshape(dofs.shape)
+        order = np.argsort(perm_gmsh(mesh.CellType.triangle, dofs.shape[1]))
+        return np.asarray(x[:, order]), np.asarray(ids[:, order])
+
+    def _entities_of_part(
+        self, key: str, part: MeshPart, tags: mesh.MeshTags | None, dimension: int
+    ) -> NDArray[np.int32]:
+        """Return local facets or cells.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if no rank has any, or if those of one rank are not of this mesh.
+        """
+        tags_name = "facet_tags" if dimension == 1 else "cell_tags"
+        entities_name = "facets" if dimension == 1 else "cells"
+        entities: NDArray[np.int32] = np.empty(0, dtype=np.int32)
+        error = ""
+        by_value = isinstance(part, int | np.integer)
+        if not by_value:
+            error = self._error_of_numbers(np.asarray(part), dimension, entities_name)
+            entities = entities if error else np.asarray(part, dtype=np.int32)
+        elif tags is None or tags.dim != dimension:
+            error = f"is a value of tags: give {tags_name}"
+        elif not compat.tags_belong_to(tags, self.mesh):
+            error = f"{tags_name} belong to another mesh than that of the shell"
+        else:
+            entities = np.asarray(tags.find(part))
+        if first_error := next(filter(None, self.comm.allgather(error)), ""):
+            raise MeshError(
+                f"{key}: {part}: {first_error}" if by_value else f"{key}: {first_error}"
+            )
+        values = [] if tags is None else np.unique(tags.values)
+        values_of_ranks = self.comm.allgather(values)
+        allowed = sorted({int(value) for of_rank in values_of_ranks for value in of_rank})
+        if not self.comm.allreduce(len(entities)) and by_value:
+            raise MeshError(
+                f"{key}: {part}: {tags_name} have no such value, "
+                f"only {', '.join(map(str, allowed)) or 'none'}"
+            )
+        return entities
+
+    def _error_of_numbers(self, numbers: NDArray[Any], dimension: int, entities_name: str) -> str:
+        """Return what is wrong with local numbers of facets or cells; empty if nothing is."""
+        self.mesh.topology.create_entities(dimension)
+        entities = self.mesh.topology.index_map(dimension)
+        count = entities.size_local + entities.num_ghosts
+        if numbers.ndim != 1 or (len(numbers) and numbers.dtype.kind not in "iu"):
+            hint = ": np.flatnonzero(...) of a mask" if numbers.dtype.kind == "b" else ""
+            return (
+                f"is neither a value of tags nor a list of local numbers of {entities_name}{hint}"
+            )
+        unknown = numbers[(numbers < 0) | (numbers >= count)]
+        if not len(unknown):
+            return ""
+        return f"{unknown[0]}: this process has {entities_name} 0 to {count - 1}"
+
+    def _vertex_pairs(self, facets: NDArray[np.int32]) -> Pairs:
+        """Return global numbers (e, 2) of the vertices of facets of all ranks."""
+        topology = self.mesh.topology
+        for dimensions in ((1, 2), (1, 0), (2, 1)):
+            topology.create_connectivity(*dimensions)
+        ends = np.empty((0, 2), np.int32)
+        if len(facets):
+            ends = mesh.entities_to_geometry(self.mesh, 1, facets)[:, :2]
+        numbers = self.mesh.geometry.index_map().local_to_global(
+            np.asarray(ends, dtype=np.int32).ravel()
+        )
+        pairs = np.concatenate(
+            self.comm.allgather(np.asarray(numbers, dtype=np.int64).reshape(-1, 2))
+        )
+        return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
+
+    def _cell_mask(self, local_cells: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
+        """Return whether each cell of all ranks is among local ones of any rank, (count,)."""
+        mask = np.zeros(count, dtype=bool)
+        for numbers in self.comm.allgather(self._numbers[local_cells]):
+            mask[numbers] = True
+        return mask
+
+
+def lagrange_element(degree: int) -> basix.finite_element.FiniteElement:
+    """Return the element at whose nodes a `UserField` of a degree has its values."""
+    variant = basix.LagrangeVariant.gll_warped
+    return basix.create_element(
+        basix.ElementFamily.P, TRIANGLE, degree, variant, discontinuous=True
+    )
+
+
+def swapped_nodes(element: basix.finite_element.FiniteElement) -> Numbers:
+    """Return the number of each node (nodes,) with the second and the third vertex exchanged."""
+    distances = np.linalg.norm(element.points[:, None, ::-1] - element.points[None], axis=2)
+    return np.asarray(np.argmin(distances, axis=1))

@@ -1,0 +1,158 @@
+"""A cache on disk for compiled kernels, and for other results that are the same for every run.
+
+What is in it is executed. So files are only taken from folders, and are only files, that the user
+or root owns and nobody else may change. Where the usual folder is none of these, a private one
+takes its place.
+"""
+
+import grp
+import os
+import pwd
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+
+class UnsafeCache(RuntimeError):
+    """No folder for kernels can be written by the user alone."""
+
+
+def cache_folder() -> Path:
+    """Return the folder of the compiled kernels, to which new ones go.
+
+    Raises
+    ------
+    UnsafeCache
+        If none can be made that nobody else may write.
+    """
+    return _cache_folders(_usual_folder())[0]
+
+
+def cached_file(name: str) -> Path | None:
+    """Return a trusted file of this name in the user's cache or a shared one; None without."""
+    folders = dict.fromkeys([cache_folder(), *_cache_folders(_usual_folder())])
+    return next((folder / name for folder in folders if is_trusted(folder / name)), None)
+
+
+def is_trusted(file: Path) -> bool:
+    """Return whether there is such a file, of the user or root, that nobody else may change."""
+    try:
+        status = file.stat()
+    except OSError:
+        return False
+    return status.st_uid in (0, os.getuid()) and not _writable_by_others(status)
+
+
+def load_cached(name: str) -> bytes | None:
+    """Return the content that is cached under a name; None without.
+
+    The name depends on all that the content depends on.
+    """
+    file = cached_file(name)
+    try:
+        return file.read_bytes() if file else None
+    except OSError:
+        return None
+
+
+def save_cached(name: str, content: bytes) -> None:
+    """Cache a content for later processes; do nothing if the folder cannot be written."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        number, scratch = tempfile.mkstemp(dir=folder, prefix=name)
+        with os.fdopen(number, "wb") as stream:
+            stream.write(content)
+        Path(scratch).replace(folder / name)  # atomic: other processes may read it
+    except OSError:
+        return
+
+
+def _usual_folder() -> Path:
+    """Return the cache folder of dolfinx."""
+    from dolfinx.jit import get_options  # takes long to import
+
+    usual, base = Path(get_options()["cache_dir"]), os.environ.get("XDG_CACHE_HOME")
+    if base is not None and not Path(base).is_absolute() and usual == Path(base) / "fenics":
+        # The specification of XDG_CACHE_HOME says that an empty or relative one is ignored.
+        return Path.home() / ".cache" / "fenics"
+    return usual.absolute()
+
+
+@cache
+def _cache_folders(usual: Path) -> tuple[Path, ...]:
+    """Return the folder that new kernels go to, and the usual one if it is only read.
+
+    The usual folder may be trusted but not writable, such as that of a container image.
+    """
+    readable = (usual,) if usual.is_dir() and _is_private(usual) else ()
+    for folder in _candidate_folders(usual):
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o755 if folder == usual else 0o700)
+        if folder.is_dir() and os.access(folder, os.W_OK) and _is_private(folder):
+            return tuple(dict.fromkeys((folder, *readable)))
+    if readable:
+        return readable  # has what was compiled before
+    raise UnsafeCache(
+        f"kernel cache {usual}: others may write to it or own it, and what is in it is executed; "
+        "no private folder can be made in its place: set XDG_CACHE_HOME to a folder that you own "
+        "and nobody else may write (chmod go-w)"
+    )
+
+
+def _candidate_folders(usual: Path) -> Iterator[Path]:
+    """Iterate over the usual folder, one within it, and private ones elsewhere."""
+    user = os.getuid()
+    yield usual
+    yield usual / f"user_{user}"
+    with suppress(RuntimeError):  # no home
+        yield Path.home() / ".cache" / "magshell"
+    yield Path(tempfile.gettempdir()) / f"magshell_{user}"
+
+
+def _is_private(folder: Path) -> bool:
+    """Return whether only the user and root may change a folder's content or replace the folder."""
+    folder = folder.resolve()
+    status = folder.stat()
+    if status.st_uid not in (0, os.getuid()) or _writable_by_others(status):
+        return False
+    return all(_protects_content(parent.stat()) for parent in folder.parents)
+
+
+def _protects_content(status: os.stat_result) -> bool:
+    """Return whether others cannot move a folder of ours out of this one.
+
+    In a sticky folder they cannot.
+    """
+    owned = status.st_uid in (0, os.getuid(), *_unmapped_users())
+    return owned and (bool(status.st_mode & stat.S_ISVTX) or not _writable_by_others(status))
+
+
+def _writable_by_others(status: os.stat_result) -> bool:
+    by_group = status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid)
+    return bool(status.st_mode & stat.S_IWOTH or by_group)
+
+
+@cache
+def _is_private_group(number: int) -> bool:
+    """Return whether a group has the user alone, as many systems make one for each user."""
+    try:
+        group, user = grp.getgrgid(number), pwd.getpwuid(os.getuid())
+    except KeyError:
+        return False
+    return group.gr_name == user.pw_name and {*group.gr_mem} <= {user.pw_name}
+
+
+@cache
+def _unmapped_users() -> tuple[int, ...]:
+    """Return the number that root seems to have where a container has only this user."""
+    try:
+        lines = Path("/proc/self/uid_map").read_text(encoding="utf-8").splitlines()
+        if any(line.split()[0] == "0" for line in lines):
+            return ()
+        return (int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="utf-8")),)
+    except (OSError, ValueError, IndexError):
+        return ()
