@@ -72,7 +72,7 @@ def compare(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
     lines, scale = [], 1.0
     if new["machine"] != old["machine"]:
         scale = median([ratio for (_, key), ratio in ratios.items() if key.endswith("_s")] or [1.0])
-        lines += [f"new: {described(new['machine'])}", f"old: {described(old['machine'])}"]
+        lines += [f"new: {describe_machine(new['machine'])}", f"old: {describe_machine(old['machine'])}"]
         lines.append(
             f"Not the same machine or versions: times are divided by their median ratio {scale:.3g}."
         )
@@ -94,4 +94,4 @@ def table(found: Mapping[str, Any]) -> str:
         lines.append([name, *values])
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     ratios = "\n".join(f"- {name}: {value:.3g}" for name, value in found["derived"].items())
-    return f"# Numbers of the benchmark\n\nMedians on {described(found['machine'])}.\n\n{rows}\n\n{ratios}\n"
+    return f"# Numbers of the benchmark\n\nMedians on {describe_machine(found['machine'])}.\n\n{rows}\n\n{ratios}\n"

@@ -30,14 +30,14 @@ from magshell_fenicsx.case.shells import Part, Several, Shells, in_words_of_shel
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import (
     NOTED,
-    Chosen,
+    ChosenByKey,
     FileKeys,
-    Later,
+    LazyValidation,
     digests,
     numbers_with_units,
 )
 from magshell_fenicsx.input.source import Source, read_source
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.joints import Joints
@@ -53,16 +53,16 @@ from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.parts.touching.section import Pairs
-from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
-from magshell_fenicsx.problem.wanted import (
+from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
+from magshell_fenicsx.problem.requests import (
     FrequenciesSection,
     GradientsSection,
     OutputSection,
     StabilitySection,
 )
-from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface
-from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
+from magshell_fenicsx.shape.reference_shell import Coordinates
+from magshell_fenicsx.shape.revolution_sections import CapSurface, RevolutionSurface
+from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 
@@ -89,7 +89,7 @@ class Case(WithParts):
 
     model: Literal["shell", "solid"] = "shell"
     """A thin shell, or its body in three dimensions"""
-    shell: Annotated[ShellSection | Surface, Chosen("geometry"), NOTED]
+    shell: Annotated[ShellSection | Surface, ChosenByKey("geometry"), NOTED]
     """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
     """Of `model: solid`"""
@@ -101,13 +101,13 @@ class Case(WithParts):
     """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. Formulas
     and results are over the R, h, E and density of the first. The edge or point `rim` of the shell `upper` is
     `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
-    magnetic: Annotated[MagneticSection, Later(MagneticSection)] | None = None
+    magnetic: Annotated[MagneticSection, LazyValidation(MagneticSection)] | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
     """Name -> point at which the magnetic field is read"""
     field_maps: FieldMaps = Field(default_factory=dict)
     """Name -> grid on which the magnetic field is computed, for ParaView and drawn"""
-    natural: Annotated[NaturalSection, Later(NaturalSection)] | None = None
+    natural: Annotated[NaturalSection, LazyValidation(NaturalSection)] | None = None
     """The curvature and the size that the shell would have without stress"""
     bodies: Bodies = Field(default_factory=dict)
     """Name -> rigid body that presses on the shell, or stands in its way"""
@@ -126,13 +126,13 @@ class Case(WithParts):
     """Lowest modes after the run"""
     frequencies: FrequenciesSection | None = None
     """Natural frequencies at points of the path"""
-    gradients: Annotated[GradientsSection, Later(GradientsSection)] | None = None
+    gradients: Annotated[GradientsSection, LazyValidation(GradientsSection)] | None = None
     """Derivatives of results after the run"""
-    ensemble: Annotated[EnsembleSection, Later(EnsembleSection)] | None = None
+    ensemble: Annotated[EnsembleSection, LazyValidation(EnsembleSection)] | None = None
     """What is random, for `magshell ensemble`"""
-    design: Annotated[DesignSection, Later(DesignSection)] | None = None
+    design: Annotated[DesignSection, LazyValidation(DesignSection)] | None = None
     """What varies and what is wanted, for `magshell design`"""
-    identify: Annotated[IdentifySection, Later(IdentifySection)] | None = None
+    identify: Annotated[IdentifySection, LazyValidation(IdentifySection)] | None = None
     """Which numbers measured data are to determine, for `magshell identify`"""
     output: OutputSection = OutputSection.model_construct()
     """How pictures look"""
@@ -242,11 +242,11 @@ class Case(WithParts):
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
-        if isinstance(self.thickness_factor, dict | GivenField):
+        if isinstance(self.thickness_factor, dict | UserField):
             raise ValueError(
                 "shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body"
             )
-        self.mesh.refuse_unfit_solid(read=read)
+        self.mesh.refuse_unfit_solid(mesh_file=read)
         if self.symmetry not in ("auto", "none", "half"):
             raise ValueError(f"symmetry: {self.symmetry}: a solid is whole or half")
         if self.solid:
@@ -299,7 +299,7 @@ class Case(WithParts):
         return {"dimple" if i == 0 else f"dimple_{i + 1}": key for i, key in enumerate(keys)}
 
     @property
-    def thickness_factor(self) -> str | dict[str, float] | GivenField | None:
+    def thickness_factor(self) -> str | dict[str, float] | UserField | None:
         """What multiplies h: a formula, numbers of patches, or a function of a program."""
         return self.shell.thickness_factor
 

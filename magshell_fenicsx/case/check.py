@@ -10,12 +10,12 @@ from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.problem.columns import sizes_of
-from magshell_fenicsx.problem.formulas import cells_of_patch, unshown, written
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
-from magshell_fenicsx.problem.names import open_edges
+from magshell_fenicsx.problem.formulas import case_formulas, cells_of_patch, unresolved_formulas
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
+from magshell_fenicsx.problem.mesh_sizes import degree_of
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
-from magshell_fenicsx.problem.sizes import degree_of
-from magshell_fenicsx.shape.sections import FLAT
+from magshell_fenicsx.problem.surface_names import open_edges
+from magshell_fenicsx.shape.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.simulate.overlap import refuse_overlap
 
 
@@ -56,7 +56,7 @@ def _described(case: Case, problem: Problem) -> str:
         "Lambda_m = lambda_m R/h": case.lambda_m / problem.material.h,
     }
     flat = (
-        case.context.shell.geometry in FLAT and not problem.loads.pressure
+        case.context.shell.geometry in FLAT_GEOMETRIES and not problem.loads.pressure
     )  # p_c is of spheres, and the unit of pressures
     if flat:
         del numbers["p_c/E"]
@@ -99,8 +99,8 @@ def _described(case: Case, problem: Problem) -> str:
         *(f"  {item}" for item in left_out),
     ]
     missed: list[str] = []
-    if patch and (formulas := written(problem.context)):
-        missed = unshown(
+    if patch and (formulas := case_formulas(problem.context)):
+        missed = unresolved_formulas(
             formulas,
             cells_of_patch(patch, degree_of(problem.context)),
             problem.azimuth,
@@ -121,10 +121,10 @@ def _in_units(case: Case, without: str) -> list[str]:
     }
     factor = {"λ_m": case.lambda_m}
     shown = {
-        scale: words for scale, words in named.items() if scale in sizes.of and scale != without
+        scale: words for scale, words in named.items() if scale in sizes.by_unit and scale != without
     }
     return [
-        f"{name} = {sizes.of[scale] * factor.get(scale, 1.0):.6g} {unit}"
+        f"{name} = {sizes.by_unit[scale] * factor.get(scale, 1.0):.6g} {unit}"
         for scale, (name, unit) in shown.items()
     ]
 
@@ -162,12 +162,12 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     if patch is None:
         assert problem.meridian
         along = problem.meridian
-        pieces = max(len(along.pieces) - sum(one == other for one, other in along.joints), 1)
+        pieces = max(len(along.shell_meridians) - sum(one == other for one, other in along.joints), 1)
         count = len(meridian_vertices(problem)) - pieces
         return count, 2 * (k * count + pieces)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if problem.body:  # three hexahedra a layer above each triangle
-        count = len(problem.body.layers) - 1
+        count = len(problem.body.layer_bounds) - 1
         return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
     return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag
 
-from magshell_fenicsx.input.section import Chosen
+from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
-from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
+from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 if TYPE_CHECKING:
     OneStep: TypeAlias = Step
 else:
-    OneStep = Annotated[Union[tuple(STEPS.values())], Chosen("kind")]  # noqa: UP007
+    OneStep = Annotated[Union[tuple(STEPS.values())], ChosenByKey("kind")]  # noqa: UP007
 PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[
     Annotated[OneStep, Tag("one")]

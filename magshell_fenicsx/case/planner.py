@@ -12,16 +12,16 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.meeting import Meeting
 from magshell_fenicsx.case.opened import changed, perfect_case
 from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, on_features
-from magshell_fenicsx.input.expressions import formula, together
+from magshell_fenicsx.input.expressions import formula, formula_group
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Assembly
-from magshell_fenicsx.mesh.distinct import lines_of
-from magshell_fenicsx.mesh.grading import Disc, Grading, Squares
+from magshell_fenicsx.mesh.grading import DiscFeature, Grading, SquaresFeature
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
-from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror, Sector, rotation
+from magshell_fenicsx.mesh.mirror import ROUNDING, Y0_PLANE, Mirror, Sector, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -34,31 +34,31 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
-from magshell_fenicsx.problem.account import account
-from magshell_fenicsx.problem.columns import refuse_twice
+from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
-    looked_at,
+    adaptive_cells,
+    case_formulas,
+    formula_refinements,
+    imperfection_refinements,
     narrow_places,
-    of_imperfections,
-    refinements,
     refuse_unfit_formulas,
-    written,
 )
-from magshell_fenicsx.problem.limits import unknowns_of
-from magshell_fenicsx.problem.names import refuse_unfit_ends, surface_terms
-from magshell_fenicsx.problem.problem import Awaited, Document, Problem, body_of
-from magshell_fenicsx.problem.sizes import Loaded, Shown, grading
-from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
-from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import (
-    Leaves,
-    askew,
-    mirror,
-    of_points,
-    of_shape,
-    sector,
+from magshell_fenicsx.problem.memory import unknowns_of
+from magshell_fenicsx.problem.mesh_sizes import Loaded, Refined, grading
+from magshell_fenicsx.problem.model_description import describe_model
+from magshell_fenicsx.problem.problem import Document, PendingModes, Problem, solid_body_of
+from magshell_fenicsx.problem.surface_names import refuse_unfit_ends, surface_terms
+from magshell_fenicsx.shape.outline import Chart, Outline, reference_shell_of
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import (
+    SymmetryConstraint,
+    common_mirror,
+    common_sector,
+    energy_without_mirror,
+    points_constraint,
+    shape_constraint,
     unit,
-    unmirrored,
+    why_not_axisymmetric,
 )
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ def make_problem(
         material = replace(
             material, shells=several.materials, laws=several.laws, laminates=several.laminates
         )
-    ground = ground_of(case.shell)
+    ground = reference_shell_of(case.shell)
     perfect = ground.perfect
     imperfections = flaws(case.imperfections, ground)
     context, last = case.context, {step.name: step for step in case.programme}
@@ -103,7 +103,7 @@ def make_problem(
         key for step in last.values() for key in step.load.multiplies(step, context)
     }
     drawn = imperfect(perfect, imperfections, 0.0, still)
-    ground = replace(ground, drawn=drawn)
+    ground = replace(ground, imperfect=drawn)
     standing = case.bodies, case.approaches, {step.name for step in case.programme}
     at_place = {
         name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()
@@ -112,12 +112,12 @@ def make_problem(
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     for section in context.abilities:
         section.refuse_unfit_values(context, sample)
-    formulas = written(context)
+    formulas = case_formulas(context)
     narrow = [
-        None if each.given.key in smooth else looked_at(each.formulas, drawn) for each in formulas
+        None if each.spec.key in smooth else adaptive_cells(each.formulas, drawn) for each in formulas
     ]
     drawn = (
-        drawn.looked_at(narrow_places([leaves for leaves in narrow if leaves]))
+        drawn.with_samples(narrow_places([leaves for leaves in narrow if leaves]))
         if formulas
         else drawn
     )
@@ -132,7 +132,7 @@ def make_problem(
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
         turn, beyond = (
             plane.azimuth,
-            Sector.at(0.0, plane.waves) if isinstance(plane, Sector) else Y0,
+            Sector.from_azimuth(0.0, plane.waves) if isinstance(plane, Sector) else Y0_PLANE,
         )
     points = named_points(case, drawn, turn, beyond)
     under = dict[str, str]()
@@ -156,19 +156,19 @@ def make_problem(
         [] if isinstance(case.shell, MeshSurface) else spots(imperfections.items(), perfect, turn)
     )
     wide = [flaw for flaw in imperfections.values() if flaw.centre is None]
-    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
+    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[SquaresFeature]()
     bodies = contacts(*standing, replace(ground, turn=turn))
-    stood = replace(ground, drawn=drawn)
+    stood = replace(ground, imperfect=drawn)
     touched = [
         Pressed.by(c, (step.load for step in case.programme if step.name == c.amplitude), stood)
         for c in bodies
     ]
     if not (axisymmetric or case.mesh.size):
-        varying, everywhere = of_imperfections(wide, perfect, turn, material.h)
-        varying += refinements(formulas, narrow, drawn, turn, material.h)
+        varying, everywhere = imperfection_refinements(wide, perfect, turn, material.h)
+        varying += formula_refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
     facing = [Meeting(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
-    shown: list[Shown] = [*local, *touched, *facing]
+    shown: list[Refined] = [*local, *touched, *facing]
     size = grading(
         context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local)
     )
@@ -181,8 +181,8 @@ def make_problem(
         isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector)
     ):  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
-        x, y = ((*shape.movable[i], *(float(image[i]) for image in images)) for i in range(2))
-        shape = replace(shape, movable=(x, y))
+        x, y = ((*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, movable_lines=(x, y))
     rims = different(local)
     if isinstance(beyond, Sector) and any(
         joint.edges[1] in (case.shells or ()) for joint in case.joints
@@ -193,13 +193,13 @@ def make_problem(
             f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half"
         )
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else (), size)
-    span = drawn.span if axisymmetric else None
+    span = drawn.meridian if axisymmetric else None
     if not axisymmetric:
         Vertices.of(case, points, drawn, size, turn).refuse_near(shape, beyond)
     conditions = edge_conditions(case.boundary, turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
-        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost}
+        conditions = {name: c for name, c in conditions.items() if name not in beyond.removed_edges}
         conditions |= dict.fromkeys(beyond.sides, "symmetry")
     within = {name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in imperfections.items()}
@@ -210,22 +210,22 @@ def make_problem(
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"
-    included, left_out = account(context, all_loads, model, plane, len(rims))
+    included, left_out = describe_model(context, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in imperfections.items() if flaw.account]
     sample = sample if len(sample) else drawn.sample()
     problem = Problem(
         context=context,
         mesh=case.mesh,
-        body=body_of(context),
+        body=solid_body_of(context),
         material=replace(material, laminate=laminate_of(case.shell, turn)),
         loads=all_loads,
         conditions=conditions,
         meridian=span,
         mirror=beyond,
         azimuth=turn,
-        turns=askew(parts) is None,
+        turns=why_not_axisymmetric(parts) is None,
         shape=shape,
-        embedding=drawn.embedding if span else drawn.placed(shape),
+        embedding=drawn.embedding if span else drawn.embedding_of(shape),
         normal=None if isinstance(case.shell, MeshSurface) else drawn.normal,
         points=points,
         size=size,
@@ -236,7 +236,7 @@ def make_problem(
         within=within,
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
-        pressed=tuple((each.size, each.reach) for each in touched),
+        body_contacts=tuple((each.size, each.reach) for each in touched),
         warnings=_warnings(case, sample),
         lambda_m=case.lambda_m,
         unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, plane)),
@@ -245,11 +245,11 @@ def make_problem(
         frequencies=case.frequencies,
         gradients=case.gradients,
         output=case.output,
-        awaited=_awaited(case),
+        pending_modes=_awaited(case),
         document=document_of(case),
         remade=lambda values: make_problem(changed(case, values)),
     )
-    refuse_twice(problem)
+    refuse_duplicate_names(problem)
     return problem
 
 
@@ -263,7 +263,7 @@ def document_of(case: Case) -> Document:
     )
 
 
-def _awaited(case: Case) -> Awaited | None:
+def _awaited(case: Case) -> PendingModes | None:
     """The modes of the perfect shell, or of several perfect ones together, that are still to be
     computed.
     """
@@ -273,7 +273,7 @@ def _awaited(case: Case) -> Awaited | None:
         (i, key, section)
         for i, own in enumerate([part.case for part in parts] or [case])
         for key, section in own.imperfections.items()
-        if isinstance(section, ModesSection) and section.awaited
+        if isinstance(section, ModesSection) and section.pending_modes
     ]
 
     def given(modes: tuple[Mode, ...]) -> Problem:
@@ -287,23 +287,23 @@ def _awaited(case: Case) -> Awaited | None:
         made = make_problem(case.with_shells(several.parts) if several else case)
 
         def again(values: Mapping[str, Any]) -> Problem:
-            other = made.again(values)
-            return other.awaited.given(modes) if other.awaited else other
+            other = made.with_values(values)
+            return other.pending_modes.with_modes(modes) if other.pending_modes else other
 
         return replace(made, remade=again)
 
     count = max((len(section.amplitudes) for _, _, section in awaiting), default=0)
-    return Awaited(count, lambda: make_problem(perfect_case(case)), given) if count else None
+    return PendingModes(count, lambda: make_problem(perfect_case(case)), given) if count else None
 
 
-def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leaves]:
+def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[SymmetryConstraint]:
     """What each part of a case leaves of its symmetry."""
     context = case.context
     return [
-        of_shape(case.shell, drawn),
+        shape_constraint(case.shell, drawn),
         *(leaves for section in context.abilities for leaves in section.leaves(context, drawn)),
         *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
-        of_points(case.points.values(), case.shell.reference, drawn),
+        points_constraint(case.points.values(), case.shell.reference, drawn),
         *(term.leaves(drawn) for term in energies),
     ]
 
@@ -394,7 +394,7 @@ def _matched(
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
-        lines = lines_of(np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius))
+        lines = line_coordinates(np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius))
         return replace(shape, circles=tuple(lines), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
@@ -408,16 +408,16 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     loosely
         See `mesh_mirrors`.
     """
-    ground = ground_of(case.shell)
+    ground = reference_shell_of(case.shell)
     perfect = ground.perfect
     parts = [
-        of_shape(case.shell, perfect),
+        shape_constraint(case.shell, perfect),
         *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches)),
         *(plies.leaves(case.context, perfect) if (plies := Laminated.of(case.context)) else ()),
     ]
     vectors = [unit(v) for part in parts for v in part.vectors]
     planes = (
-        [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane, loosely)
+        [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane_vectors, loosely)
     )
     for one in planes:
         along = all(abs(one.normal @ v) < ROUNDING for v in vectors)
@@ -437,20 +437,20 @@ def towards_tip(size: Grading, sector: Sector) -> Grading:
     """Sizes at most as large as a sector is wide, so that triangles are not thin beside the axis of
     a disc.
     """
-    tip = Disc((0.0, 0.0), 0.0, SHORTEST * size.largest, sector.angle)
+    tip = DiscFeature((0.0, 0.0), 0.0, SHORTEST * size.largest, sector.angle)
     return replace(size, features=[*size.features, tip])
 
 
-def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
+def _symmetry(case: Case, drawn: Outline, parts: list[SymmetryConstraint]) -> tuple[bool, Mirror | None]:
     """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
-    reason = askew(parts)
+    reason = why_not_axisymmetric(parts)
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
     if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
         return True, None
     if isinstance(case.symmetry, int):
         places = [np.array(x) for x in case.points.values()]
-        if sector_of_waves := sector(parts, drawn, case.symmetry, places):
+        if sector_of_waves := common_sector(parts, drawn, case.symmetry, places):
             return False, sector_of_waves
         hint = ""
         if case.several:
@@ -465,9 +465,9 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         )
     if case.symmetry not in ("auto", "half"):
         return False, None
-    plane = mirror(parts, drawn, loosely=case.symmetry == "half")
+    plane = common_mirror(parts, drawn, loosely=case.symmetry == "half")
     if case.symmetry == "half" and plane is None:
-        if name := unmirrored(parts, drawn):
+        if name := energy_without_mirror(parts, drawn):
             raise CaseError(f"symmetry: half: the energy {name} does not share it")
         made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
         hint = made if isinstance(case.shell, MeshSurface) else ""
@@ -481,7 +481,7 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:
     """About how many triangles there will be."""
     if isinstance(shape, MeshFile):
-        halved = isinstance(shape.given, Assembly)  # it has the cells of its half
+        halved = isinstance(shape.in_memory, MultiShellMesh)  # it has the cells of its half
         return cell_count(shape) / (plane.copies if plane and not halved else 1)
     return shape.cells * (0.5 if plane else 1.0) if isinstance(shape, Grid) else size.cells(shape)
 
@@ -498,12 +498,12 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     factor = case.thickness_factor
     if isinstance(factor, dict):
         return Thickness(patches=factor)
-    if isinstance(factor, GivenField):
+    if isinstance(factor, UserField):
         return Thickness(given=factor)
     if not factor:
         return None
     told, Q = formula(factor), rotation(turn)
     return Thickness(
         lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z),
-        formulas=together([told], Q),
+        formulas=formula_group([told], Q),
     )

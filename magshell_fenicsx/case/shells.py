@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.section import Chosen, Direction, FileKeys, Section, or_number
+from magshell_fenicsx.input.section import ChosenByKey, Direction, FileKeys, Section, or_number
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import Assembly, Place
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh, ShellPose
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
-from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.shape.reference_shell import Coordinates
+from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
@@ -93,7 +93,7 @@ class OneOfShells(Section):
     What is its own is in its own frame; conditions and forces are in that of the case.
     """
 
-    shell: Annotated[ShellSection | Surface, Chosen("geometry")]
+    shell: Annotated[ShellSection | Surface, ChosenByKey("geometry")]
     """Mid-surface, thickness and material"""
     boundary: BoundarySection = BoundarySection.model_construct()
     """What is held, along the axes of the case"""
@@ -179,7 +179,7 @@ class Part:
 
 
 class Several:
-    """The shells of a case; an `Assembly` is made of them where a mesh is needed."""
+    """The shells of a case; an `MultiShellMesh` is made of them where a mesh is needed."""
 
     def __init__(
         self,
@@ -202,7 +202,7 @@ class Several:
                 part.section.place.model_dump_json(),
                 part.case.outside,
             ]
-            + [section.awaited for section in part.case.imperfections.values()]
+            + [section.pending_modes for section in part.case.imperfections.values()]
             for part in self.parts
         ]
         return hashlib.sha256(
@@ -214,13 +214,13 @@ class Several:
         """The name of the mesh file for which they stand."""
         return f"shells {self.digest[:16]}"
 
-    def place(self, part: Part) -> Place:
+    def place(self, part: Part) -> ShellPose:
         """Where a shell is, over the R of the first one."""
         R, place = self.parts[0].case.shell.reference, part.section.place
-        return Place(place.Q, np.array(place.position) / R, part.case.shell.reference / R)
+        return ShellPose(place.Q, np.array(place.position) / R, part.case.shell.reference / R)
 
     @cached_property
-    def assembly(self) -> Assembly:
+    def assembly(self) -> MultiShellMesh:
         """All of them as one mesh."""
         from magshell_fenicsx.case.coaxial import meridians  # the solver takes long to import
         from magshell_fenicsx.case.members import Members
@@ -235,7 +235,7 @@ class Several:
         }
         members = Members(self)
         of_members = members.mirrors, partial(meridians, self), members.normal, members.half
-        return Assembly(self.digest, members.whole, self.joints, moduli, laws, *of_members)
+        return MultiShellMesh(self.digest, members.whole, self.joints, moduli, laws, *of_members)
 
     def of(self, name: str) -> str:
         """The shell of an edge, or itself."""

@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.distinct import NEAR, SAME_PLACE, told_apart
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
-from magshell_fenicsx.shape.ground import refuse_beside
+from magshell_fenicsx.mesh.vertex_spacing import (
+    MIN_VERTEX_DISTANCE,
+    SAME_PLACE_TOLERANCE,
+    distinguishable_texts,
+)
 from magshell_fenicsx.shape.outline import Chart, Outline
+from magshell_fenicsx.shape.reference_shell import refuse_off_surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
@@ -47,7 +51,7 @@ def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None
     points: Points = {}
     for name, place in case.points.items():
         x = np.array(place) / R
-        refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
+        refuse_off_surface(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
         chart = chart_of(_on_planes(Q @ x, plane), drawn, half=plane is not None)
         points[name] = on_features(chart, drawn, points)
     if points:
@@ -65,9 +69,9 @@ def chart_of(x: Array, drawn: Outline, *, half: bool) -> Array:
 
 def _on_planes(x: Array, plane: Mirror | None) -> Array:
     """A place (3,), moved onto planes of symmetry that it nearly is on."""
-    for side in plane.sides.values() if plane else ():
-        off = float(side.beyond(x))
-        x = x - off * side.normal if abs(off) <= SAME_PLACE else x
+    for side in plane.planes.values() if plane else ():
+        off = float(side.signed_distance(x))
+        x = x - off * side.normal if abs(off) <= SAME_PLACE_TOLERANCE else x
     return x
 
 
@@ -85,7 +89,7 @@ def on_features(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Ar
     (place,) = drawn.embedding(chart[None])
 
     def is_at(other: Array) -> bool:
-        return bool(np.linalg.norm(drawn.embedding(other[None])[0] - place) <= SAME_PLACE)
+        return bool(np.linalg.norm(drawn.embedding(other[None])[0] - place) <= SAME_PLACE_TOLERANCE)
 
     for point in points.values():
         if is_at(point):
@@ -187,7 +191,7 @@ class Vertices:
             near = (
                 (vertices[i] == vertices[j]).all()
                 if vertices is not None
-                else apart < NEAR * self.size(places[i])
+                else apart < MIN_VERTEX_DISTANCE * self.size(places[i])
             )
             if near and not np.array_equal(places[i], places[j]):
                 self._refuse(
@@ -195,7 +199,7 @@ class Vertices:
                     self._place(places[j]),
                     f"{self._key(other)}: [{{}}]",
                     "give one of them",
-                    NEAR,
+                    MIN_VERTEX_DISTANCE,
                 )
 
     def _refuse_beside_edges(
@@ -203,13 +207,13 @@ class Vertices:
     ) -> None:
         """See that a point is not beside an edge or a plane of symmetry, but on it or away from
         it."""
-        chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
+        chart, factor = self.points[name], MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else BESIDE_CURVE
         size = self.size(chart)
         if isinstance(shape, Grid):
             size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
         (place,) = self.drawn.embedding(chart[None])
-        for side in plane.sides.values() if plane else ():
-            off = float(side.beyond(place))
+        for side in plane.planes.values() if plane else ():
+            off = float(side.signed_distance(place))
             if ROUNDING < abs(off) < factor * size:
                 on, hint = (
                     self._told(place - off * side.normal),
@@ -227,7 +231,7 @@ class Vertices:
         chart = self.points[name]
         one, two = self._place(chart), other
         here, there = (
-            ", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in told_apart(one, two)
+            ", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in distinguishable_texts(one, two)
         )
         apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
         raise CaseError(

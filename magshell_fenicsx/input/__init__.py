@@ -1,3 +1,3 @@
-"""What every section of a case is made of: its base with units, messages with file, line and key,
+"""Foundations of every section of a case: its base with units, messages with file, line and key,
 formulas.
 """

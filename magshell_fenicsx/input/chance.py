@@ -1,4 +1,4 @@
-"""Random quantities of a case file: distributions of numbers, random places, and defects there."""
+"""Random numbers of a case file: distributions, random places, and imperfections there."""
 
 import zlib
 from math import cos, degrees, inf, log, nextafter, pi, radians, sqrt
@@ -13,14 +13,18 @@ from magshell_fenicsx.input.section import Section
 
 Array = NDArray[np.float64]
 
-NEEDED = {
+REQUIRED_KEYS = {
     "normal": ("mean", "deviation"),
     "lognormal": ("mean", "deviation"),
     "uniform": ("above", "below"),
     "choice": ("values",),
 }
-OPTIONAL = {"normal": ("above", "below"), "lognormal": ("above", "below"), "choice": ("weights",)}
-LEAST_PART = 1e-9  # probability between the bounds of a truncated distribution
+OPTIONAL_KEYS = {
+    "normal": ("above", "below"),
+    "lognormal": ("above", "below"),
+    "choice": ("weights",),
+}
+MIN_PROBABILITY = 1e-9  # between the bounds of a truncated distribution
 
 Value = float | int | str
 
@@ -52,11 +56,12 @@ class DistributionSection(Section):
 
     @model_validator(mode="after")
     def _keys_belong_to_the_kind(self) -> Self:
-        needed, given = NEEDED[self.kind], self.model_fields_set - {"kind", "unit"}
-        if missing := [key for key in needed if key not in given]:
+        required, present = REQUIRED_KEYS[self.kind], self.model_fields_set - {"kind", "unit"}
+        if missing := [key for key in required if key not in present]:
             raise ValueError(f"kind: {self.kind} needs {' and '.join(missing)}")
-        if strange := sorted(given - {*needed, *OPTIONAL.get(self.kind, ())}):
-            raise ValueError(f"{strange[0]} does not belong to kind: {self.kind}")
+        allowed = {*required, *OPTIONAL_KEYS.get(self.kind, ())}
+        if unexpected := sorted(present - allowed):
+            raise ValueError(f"{unexpected[0]} does not belong to kind: {self.kind}")
         low, high = self._bounds
         if low >= high:
             raise ValueError(f"above must be less than below, here {low:g} and {high:g}")
@@ -64,38 +69,41 @@ class DistributionSection(Section):
             raise ValueError(
                 f"a lognormal number is positive: its mean must be too, here {self._mean:g}"
             )
-        if self.kind in ("normal", "lognormal") and np.diff(self._probabilities)[0] < LEAST_PART:
-            raise ValueError(
-                f"almost no number lies between above and below, here {low:g} and {high:g}: choose bounds closer to "
-                f"the mean, {self._mean:g}"
-            )
-        if self.weights is not None and (
-            len(self.weights) != len(self.values or []) or not sum(self.weights)
+        if (
+            self.kind in ("normal", "lognormal")
+            and np.diff(self._probabilities)[0] < MIN_PROBABILITY
         ):
+            raise ValueError(
+                f"almost no number lies between above and below, here {low:g} and {high:g}: choose "
+                f"bounds closer to the mean, {self._mean:g}"
+            )
+        weights, values = self.weights, self.values or []
+        if weights is not None and (len(weights) != len(values) or not sum(weights)):
             raise ValueError("weights: one for each of the values, not all zero")
         return self
 
     def draw(self, rng: np.random.Generator) -> Value:
-        """A value; takes one number of the generator, whatever the kind."""
-        return self.at(float(rng.random()))
+        """Draw a value; this takes one number of the generator, whatever the kind."""
+        return self.quantile(float(rng.random()))
 
-    def at(self, part: float) -> Value:
-        """The quantile of a probability: the inverse of the distribution function."""
+    def quantile(self, probability: float) -> Value:
+        """Return the quantile of a probability: the inverse of the distribution function."""
         if self.kind == "choice":
             assert self.values
             weights = np.array(self.weights or [1.0] * len(self.values))
             steps = np.cumsum(weights) / weights.sum()
-            return self._with_unit(self.values[int(np.searchsorted(steps, part, side="right"))])
+            return self._with_unit(
+                self.values[int(np.searchsorted(steps, probability, side="right"))]
+            )
         low, high = self._bounds
         if self.kind == "uniform":
-            return self._with_unit(low + part * (high - low))
+            return self._with_unit(low + probability * (high - low))
         first, last = self._probabilities
         centre, width = self._normal
-        inner = min(max(first + part * (last - first), nextafter(0, 1)), nextafter(1, 0))
+        inner = min(max(first + probability * (last - first), nextafter(0, 1)), nextafter(1, 0))
         x = NormalDist(centre, width).inv_cdf(inner)
-        return self._with_unit(
-            float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high))
-        )
+        value = np.exp(x) if self.kind == "lognormal" else x
+        return self._with_unit(float(np.clip(value, low, high)))
 
     @property
     def _mean(self) -> float:
@@ -104,7 +112,8 @@ class DistributionSection(Section):
 
     @property
     def _bounds(self) -> tuple[float, float]:
-        return -inf if self.above is None else self.above, inf if self.below is None else self.below
+        low = -inf if self.above is None else self.above
+        return low, inf if self.below is None else self.below
 
     @property
     def _normal(self) -> tuple[float, float]:
@@ -129,8 +138,8 @@ class DistributionSection(Section):
         return value if self.unit is None else f"{value!r} {self.unit}"
 
 
-def _certain(value: Any) -> Any:
-    """A number, as the choice of one."""
+def _number_as_choice(value: Any) -> Any:
+    """Return a number as a choice of one value."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return {"kind": "choice", "values": [value]}
     return value
@@ -138,12 +147,13 @@ def _certain(value: Any) -> Any:
 
 Distribution = Annotated[
     DistributionSection,
-    BeforeValidator(_certain, json_schema_input_type=float | DistributionSection),
+    BeforeValidator(_number_as_choice, json_schema_input_type=float | DistributionSection),
 ]
 
 
-MOST_TRIES, MOST_STARTS = 300, 30  # for one place; with all places anew
-DENSEST = pi / 12**0.5  # part of the plane that equal discs can cover
+MAX_TRIES = 300  # for one place
+MAX_STARTS = 30  # with new places from the first on
+DENSEST_PACKING = pi / 12**0.5  # part of the plane that equal discs can cover
 
 
 class NoRoom(ValueError):
@@ -153,7 +163,7 @@ class NoRoom(ValueError):
 def random_places(
     rng: np.random.Generator, count: int, polar: tuple[float, float], distance: float
 ) -> Array:
-    """Polar angles and azimuths (count, 2) in degrees, uniform in area between two polar angles.
+    """Return random places on a sphere, uniform in area between two polar angles.
 
     A place at less than `distance` from an earlier one is drawn again (random sequential addition).
 
@@ -162,22 +172,28 @@ def random_places(
     polar, distance
         In degrees; the distance is the angle between two places, seen from the centre.
 
+    Returns
+    -------
+    Array
+        (count, 2): polar angles and azimuths in degrees.
+
     Raises
     ------
     NoRoom
         If not even a dense packing has room, or none was found.
     """
     refuse_no_room(count, polar, distance)
-    low, high, least = cos(radians(polar[1])), cos(radians(polar[0])), cos(radians(distance))
-    for _ in range(MOST_STARTS):
+    low, high = cos(radians(polar[1])), cos(radians(polar[0]))
+    max_cosine = cos(radians(distance))
+    for _ in range(MAX_STARTS):
         places = np.empty((0, 3))
         for _ in range(count):
-            for _ in range(MOST_TRIES):
+            for _ in range(MAX_TRIES):
                 z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
                 new = np.array(
                     [np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z]
                 )
-                if (places @ new <= least).all():
+                if (places @ new <= max_cosine).all():
                     places = np.vstack([places, new])
                     break
             else:
@@ -188,7 +204,8 @@ def random_places(
             )
             return np.asarray(angles.T)
     raise NoRoom(
-        f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or closer ones"
+        f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or "
+        "closer ones"
     )
 
 
@@ -202,11 +219,15 @@ def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> N
     """
     half = radians(distance) / 2
     low, high = max(radians(polar[0]) - half, 0.0), min(radians(polar[1]) + half, pi)
-    most = max(DENSEST * (cos(low) - cos(high)) / (1 - cos(half)), 1.0) if half else np.inf
-    if count > most:
+    if half:
+        max_count = max(DENSEST_PACKING * (cos(low) - cos(high)) / (1 - cos(half)), 1.0)
+    else:
+        max_count = np.inf
+    if count > max_count:
         raise NoRoom(
-            f"{count} places at least {distance:g} degrees apart do not fit between the polar angles {polar[0]:g} and "
-            f"{degrees(radians(polar[1])):g}: there is room for less than {int(most) + 1}"
+            f"{count} places at least {distance:g} degrees apart do not fit between the polar "
+            f"angles {polar[0]:g} and {degrees(radians(polar[1])):g}: there is room for less than "
+            f"{int(max_count) + 1}"
         )
 
 
@@ -237,18 +258,15 @@ class DefectsSection(Section):
             raise ValueError(
                 f"polar: the first angle must be less than the second, here {self.polar}"
             )
-        numbers = [self.count.at(part) for part in np.linspace(0, 1 - 1e-9, 101)]
-        if any(
-            not float(n).is_integer() or not 0 <= float(n) <= 500
-            for n in numbers
-            if not isinstance(n, str)
-        ):
+        values = [self.count.quantile(p) for p in np.linspace(0, 1 - 1e-9, 101)]
+        numbers = [float(n) for n in values if not isinstance(n, str)]
+        if any(not n.is_integer() or not 0 <= n <= 500 for n in numbers):
             raise ValueError("count: must be whole numbers from 0 to 500")
-        refuse_no_room(max(int(n) for n in numbers), (self.polar[0], self.polar[1]), self.distance)
+        refuse_no_room(max(int(n) for n in values), (self.polar[0], self.polar[1]), self.distance)
         return self
 
     def draw(self, rng: np.random.Generator) -> list[dict[str, Any]]:
-        """Defects as in `shell.imperfections`.
+        """Draw defects, as in `shell.imperfections`.
 
         Raises
         ------
@@ -269,7 +287,6 @@ class DefectsSection(Section):
 
 
 def generator(seed: int, number: int, name: str) -> np.random.Generator:
-    """The random numbers of a sample for one name."""
-    return np.random.default_rng(
-        np.random.SeedSequence(seed, spawn_key=(number, zlib.crc32(name.encode())))
-    )
+    """Return the generator of random numbers of a sample for one name."""
+    spawn_key = number, zlib.crc32(name.encode())
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=spawn_key))

@@ -1,4 +1,4 @@
-"""All values that a formula has in a box: interval arithmetic, with first derivatives.
+"""Interval arithmetic with first derivatives: bounds of all values of a formula in a box.
 
 Values at places show a formula only there. The arithmetic of intervals shows that it has no others
 between them, or that it may have, however narrow a step or a Gaussian is. After each operation the
@@ -19,23 +19,26 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Range:
-    """Numbers from `low` to `high` (n,); what is not a number may be any."""
+class Interval:
+    """Intervals from `low` to `high` (n,); bounds that are not numbers are infinite."""
 
     low: Array
     high: Array
 
     @classmethod
-    def of(cls, low: Any, high: Any) -> "Range":
+    def between(cls, low: Any, high: Any) -> "Interval":
+        """Return the interval between two bounds."""
         unknown = np.isnan(low) | np.isnan(high)
         return cls(np.where(unknown, -np.inf, low), np.where(unknown, np.inf, high))
 
     @classmethod
-    def number(cls, value: Any) -> "Range":
+    def number(cls, value: Any) -> "Interval":
+        """Return the interval of one number."""
         number = np.asarray(value, dtype=np.float64)
         return cls(number, number)
 
-    def holds(self, value: float) -> NDArray[np.bool_]:
+    def contains(self, value: float) -> NDArray[np.bool_]:
+        """Return whether the intervals contain a number."""
         return np.asarray((self.low <= value) & (value <= self.high))
 
     @property
@@ -43,33 +46,35 @@ class Range:
         """The largest absolute value."""
         return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
 
-    def within(self, other: "Range") -> "Range":
-        """What is in both; rounding may leave nothing between."""
+    def intersection(self, other: "Interval") -> "Interval":
+        """Return the intersection; where rounding makes it empty, the gap between both."""
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
-        return Range(np.minimum(low, high), np.maximum(low, high))
+        return Interval(np.minimum(low, high), np.maximum(low, high))
 
-    def monotone(self, of: Callable[[Array], Array]) -> "Range":
-        return Range.of(of(self.low), of(self.high))
+    def monotone(self, function: Callable[[Array], Array]) -> "Interval":
+        """Return the image under an increasing function."""
+        return Interval.between(function(self.low), function(self.high))
 
-    def hull(self, *values: Any) -> "Range":
-        return Range.of(reduce(np.minimum, values), reduce(np.maximum, values))
+    def hull(self, *values: Any) -> "Interval":
+        """Return the smallest interval with some values."""
+        return Interval.between(reduce(np.minimum, values), reduce(np.maximum, values))
 
     def unless(
         self, which: NDArray[np.bool_], low: float = -np.inf, high: float = np.inf
-    ) -> "Range":
-        """With others where `which` holds."""
-        return Range(np.where(which, low, self.low), np.where(which, high, self.high))
+    ) -> "Interval":
+        """Return these intervals, with other bounds where `which` is true."""
+        return Interval(np.where(which, low, self.low), np.where(which, high, self.high))
 
 
-def _add(a: Range, b: Range) -> Range:
-    return Range.of(a.low + b.low, a.high + b.high)
+def _add(a: Interval, b: Interval) -> Interval:
+    return Interval.between(a.low + b.low, a.high + b.high)
 
 
-def _negative(a: Range) -> Range:
-    return Range(-a.high, -a.low)
+def _negative(a: Interval) -> Interval:
+    return Interval(-a.high, -a.low)
 
 
-def _multiply(a: Range, b: Range) -> Range:
+def _multiply(a: Interval, b: Interval) -> Interval:
     ends = [(c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b)]
     products = [x * y for x in ends[0] for y in ends[1]]
     if np.isnan(sum(products)).any():
@@ -77,49 +82,46 @@ def _multiply(a: Range, b: Range) -> Range:
     return a.hull(*products)
 
 
-def _inverse(a: Range) -> Range:
-    inverse = Range(1 / a.high, 1 / a.low).unless(a.holds(0.0))
+def _inverse(a: Interval) -> Interval:
+    inverse = Interval(1 / a.high, 1 / a.low).unless(a.contains(0.0))
     inverse = inverse.unless((a.low == 0) & (a.high > 0), high=np.inf, low=0.0)
     return inverse.unless((a.high == 0) & (a.low < 0), low=-np.inf, high=0.0)
 
 
-def _divide(a: Range, b: Range) -> Range:
+def _divide(a: Interval, b: Interval) -> Interval:
     return _multiply(a, _inverse(b))
 
 
-def _power(a: Range, p: Range) -> Range:
+def _power(a: Interval, p: Interval) -> Interval:
     if p.low.ndim or p.low != p.high:
-        return _exp(
-            _multiply(p, _log(a))
-        )  # NumPy has no real power of a negative number with a broken exponent
+        # NumPy has no real power of a negative number with a broken exponent.
+        return _exp(_multiply(p, _log(a)))
     n = float(p.low)
     if n != int(n) or abs(n) > 1e9:
-        return _power_positive(Range(np.maximum(a.low, 0.0), a.high), n)
+        return _power_positive(Interval(np.maximum(a.low, 0.0), a.high), n)
     if n < 0:
-        return _inverse(_power(a, Range.number(-n)))
+        return _inverse(_power(a, Interval.number(-n)))
     if n == 1:
         return a
     if n % 2:
         return a.monotone(lambda x: np.power(x, n))
-    return _power_positive(_absolute(a), n) if n else Range.number(np.ones_like(a.low))
+    return _power_positive(_absolute(a), n) if n else Interval.number(np.ones_like(a.low))
 
 
-def _power_positive(a: Range, n: float) -> Range:
+def _power_positive(a: Interval, n: float) -> Interval:
     if n == 2:
         return a.hull(np.square(a.low), np.square(a.high))
-    return (
-        a.hull(np.power(a.low, n), np.power(a.high, n))
-        if n >= 0
-        else _inverse(_power_positive(a, -n))
-    )
+    if n < 0:
+        return _inverse(_power_positive(a, -n))
+    return a.hull(np.power(a.low, n), np.power(a.high, n))
 
 
-def _absolute(a: Range) -> Range:
-    least = np.minimum(np.abs(a.low), np.abs(a.high))
-    return Range(np.where(a.holds(0.0), 0.0, least), a.size)
+def _absolute(a: Interval) -> Interval:
+    smallest = np.minimum(np.abs(a.low), np.abs(a.high))
+    return Interval(np.where(a.contains(0.0), 0.0, smallest), a.size)
 
 
-def _sin(a: Range) -> Range:
+def _sin(a: Interval) -> Interval:
     turns = 2 * np.pi
     ends = a.hull(np.sin(a.low), np.sin(a.high))
 
@@ -127,55 +129,51 @@ def _sin(a: Range) -> Range:
         passed = np.floor((a.high - peak) / turns) > np.floor((a.low - peak) / turns)
         return np.asarray(passed | ~np.isfinite(a.size))
 
-    low, high = (
-        np.where(passes(-np.pi / 2), -1.0, ends.low),
-        np.where(passes(np.pi / 2), 1.0, ends.high),
-    )
-    return Range(low, high)
+    low = np.where(passes(-np.pi / 2), -1.0, ends.low)
+    return Interval(low, np.where(passes(np.pi / 2), 1.0, ends.high))
 
 
-def _cos(a: Range) -> Range:
-    return _sin(Range(a.low + np.pi / 2, a.high + np.pi / 2))
+def _cos(a: Interval) -> Interval:
+    return _sin(Interval(a.low + np.pi / 2, a.high + np.pi / 2))
 
 
-def _tan(a: Range) -> Range:
-    pole: NDArray[np.bool_] = np.floor((a.high - np.pi / 2) / np.pi) > np.floor(
-        (a.low - np.pi / 2) / np.pi
-    )
+def _tan(a: Interval) -> Interval:
+    low_branch, high_branch = (np.floor((x - np.pi / 2) / np.pi) for x in (a.low, a.high))
+    pole: NDArray[np.bool_] = high_branch > low_branch
     return a.monotone(np.tan).unless(pole | ~np.isfinite(a.size))
 
 
-def _exp(a: Range) -> Range:
+def _exp(a: Interval) -> Interval:
     return a.monotone(np.exp)
 
 
-def _log(a: Range) -> Range:
-    return Range.of(np.log(np.maximum(a.low, 0.0)), np.log(a.high))
+def _log(a: Interval) -> Interval:
+    return Interval.between(np.log(np.maximum(a.low, 0.0)), np.log(a.high))
 
 
-def _sqrt(a: Range) -> Range:
-    return Range.of(np.sqrt(np.maximum(a.low, 0.0)), np.sqrt(a.high))
+def _sqrt(a: Interval) -> Interval:
+    return Interval.between(np.sqrt(np.maximum(a.low, 0.0)), np.sqrt(a.high))
 
 
-def _sign(a: Range) -> Range:
+def _sign(a: Interval) -> Interval:
     return a.monotone(np.sign)
 
 
-def _arctan2(y: Range, x: Range) -> Range:
+def _arctan2(y: Interval, x: Interval) -> Interval:
     angles = y.hull(*(np.arctan2(v, u) for v in (y.low, y.high) for u in (x.low, x.high)))
     return angles.unless(_on_cut(y, x), -np.pi, np.pi)
 
 
-def _on_cut(y: Range, x: Range) -> NDArray[np.bool_]:
-    """Where the angle jumps, or has no value."""
+def _on_cut(y: Interval, x: Interval) -> NDArray[np.bool_]:
+    """Return where the angle jumps, or has no value."""
     return np.asarray((x.low <= 0) & (y.low <= 0) & (y.high >= 0))
 
 
-def _one(a: Range) -> Range:
-    return Range.number(1.0)
+def _unit_slope(a: Interval) -> Interval:
+    return Interval.number(1.0)
 
 
-VALUES: dict[np.ufunc, Callable[..., Range]] = {
+VALUES: dict[np.ufunc, Callable[..., Interval]] = {
     np.add: _add,
     np.subtract: lambda a, b: _add(a, _negative(b)),
     np.multiply: _multiply,
@@ -195,81 +193,91 @@ VALUES: dict[np.ufunc, Callable[..., Range]] = {
 }
 
 
-def _power_slopes(a: Range, p: Range) -> list[Range]:
-    by_base = _multiply(p, _power(a, Range(p.low - 1, p.high - 1)))
-    return [
-        by_base,
-        _multiply(_power(a, p), _log(a)) if p.low.ndim else Range.number(0.0),
-    ]  # the power is a number
+def _power_slopes(a: Interval, p: Interval) -> list[Interval]:
+    by_base = _multiply(p, _power(a, Interval(p.low - 1, p.high - 1)))
+    # A single exponent is a number, which does not vary.
+    by_exponent = _multiply(_power(a, p), _log(a)) if p.low.ndim else Interval.number(0.0)
+    return [by_base, by_exponent]
 
 
-def _angle_slopes(y: Range, x: Range) -> list[Range]:
-    squared = _inverse(_add(_power(x, Range.number(2.0)), _power(y, Range.number(2.0))))
+def _angle_slopes(y: Interval, x: Interval) -> list[Interval]:
+    squared = _inverse(_add(_power(x, Interval.number(2.0)), _power(y, Interval.number(2.0))))
     slopes = [_multiply(x, squared), _negative(_multiply(y, squared))]
     return [slope.unless(_on_cut(y, x)) for slope in slopes]
 
 
-SLOPES: dict[np.ufunc, Callable[..., list[Range]]] = {  # by each argument
-    np.add: lambda a, b: [_one(a), _one(b)],
-    np.subtract: lambda a, b: [_one(a), Range.number(-1.0)],
+SLOPES: dict[np.ufunc, Callable[..., list[Interval]]] = {  # by each argument
+    np.add: lambda a, b: [_unit_slope(a), _unit_slope(b)],
+    np.subtract: lambda a, b: [_unit_slope(a), Interval.number(-1.0)],
     np.multiply: lambda a, b: [b, a],
-    np.divide: lambda a, b: [_inverse(b), _negative(_divide(a, _power(b, Range.number(2.0))))],
+    np.divide: lambda a, b: [_inverse(b), _negative(_divide(a, _power(b, Interval.number(2.0))))],
     np.power: _power_slopes,
-    np.positive: lambda a: [_one(a)],
-    np.negative: lambda a: [Range.number(-1.0)],
+    np.positive: lambda a: [_unit_slope(a)],
+    np.negative: lambda a: [Interval.number(-1.0)],
     np.sin: lambda a: [_cos(a)],
     np.cos: lambda a: [_negative(_sin(a))],
-    np.tan: lambda a: [_add(Range.number(1.0), _power(_tan(a), Range.number(2.0)))],
+    np.tan: lambda a: [_add(Interval.number(1.0), _power(_tan(a), Interval.number(2.0)))],
     np.exp: lambda a: [_exp(a)],
     np.log: lambda a: [_inverse(a)],
-    np.sqrt: lambda a: [_inverse(_multiply(Range.number(2.0), _sqrt(a)))],
+    np.sqrt: lambda a: [_inverse(_multiply(Interval.number(2.0), _sqrt(a)))],
     np.abs: lambda a: [_sign(a)],
-    np.sign: lambda a: [Range(np.zeros_like(a.low), np.zeros_like(a.low)).unless(a.holds(0.0))],
+    np.sign: lambda a: [
+        Interval(np.zeros_like(a.low), np.zeros_like(a.low)).unless(a.contains(0.0))
+    ],
     np.arctan2: _angle_slopes,
 }
 
 
 @dataclass(frozen=True)
-class Enclosed(NDArrayOperatorsMixin):
-    """What NumPy's functions of it return too.
+class Enclosure(NDArrayOperatorsMixin):
+    """Bounds of a function in boxes; NumPy's functions of it return bounds too.
 
     Attributes
     ----------
-    values, slopes
-        All values in the box, and all derivatives by x, y and z.
-    middle, halves
-        The value in the middle (n,), and half the sides of the box (3, n).
+    values
+        Interval of all values in each box.
+    slopes
+        Intervals of all derivatives by x, y and z.
+    middle
+        (n,) the value in the middle of each box.
+    halves
+        (3, n) half the sides of each box.
     """
 
-    values: Range
-    slopes: tuple[Range, ...]
+    values: Interval
+    slopes: tuple[Interval, ...]
     middle: Array
     halves: Array
 
     @classmethod
-    def coordinates(cls, low: Array, high: Array) -> "list[Enclosed]":
-        """x, y and z in boxes between corners (n, 3)."""
-        halves, one, none = (high - low).T / 2, np.ones(len(low)), np.zeros(len(low))
-        units = [tuple(Range.number(one if i == j else none) for j in range(3)) for i in range(3)]
+    def coordinates(cls, low: Array, high: Array) -> "list[Enclosure]":
+        """Return x, y and z in boxes between corners (n, 3)."""
+        halves, ones, zeros = (high - low).T / 2, np.ones(len(low)), np.zeros(len(low))
+        units = [
+            tuple(Interval.number(ones if i == j else zeros) for j in range(3)) for i in range(3)
+        ]
         middle = (low + high) / 2
-        return [cls(Range(low[:, i], high[:, i]), units[i], middle[:, i], halves) for i in range(3)]
+        return [
+            cls(Interval(low[:, i], high[:, i]), units[i], middle[:, i], halves) for i in range(3)
+        ]
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any, **options: Any) -> Any:
-        """A function of this and of numbers, by the chain rule."""
+        """Return a function of this and of numbers, by the chain rule."""
         if method != "__call__" or options or ufunc not in VALUES:
             return NotImplemented
-        ranges = [a.values if isinstance(a, Enclosed) else Range.number(a) for a in arguments]
-        partial = SLOPES[ufunc](*ranges)
-        none = Range.number(np.zeros_like(self.middle))
-        slopes = [none] * 3
-        for a, by in zip(arguments, partial, strict=True):
-            if isinstance(a, Enclosed):
-                slopes = [
-                    _add(one, _multiply(by, own)) for one, own in zip(slopes, a.slopes, strict=True)
-                ]
-        middle = ufunc(*(a.middle if isinstance(a, Enclosed) else a for a in arguments))
-        most = np.zeros_like(self.middle)
+        intervals = [
+            a.values if isinstance(a, Enclosure) else Interval.number(a) for a in arguments
+        ]
+        partial = SLOPES[ufunc](*intervals)
+        slopes = [Interval.number(np.zeros_like(self.middle))] * 3
+        for a, factor in zip(arguments, partial, strict=True):
+            if isinstance(a, Enclosure):
+                pairs = zip(slopes, a.slopes, strict=True)
+                slopes = [_add(total, _multiply(factor, slope)) for total, slope in pairs]
+        middle = ufunc(*(a.middle if isinstance(a, Enclosure) else a for a in arguments))
+        max_change = np.zeros_like(self.middle)
         for slope, half in zip(slopes, self.halves, strict=True):
-            most = most + np.where(slope.size == 0, 0.0, slope.size * half)
-        near = Range.of(middle - most, middle + most)
-        return Enclosed(VALUES[ufunc](*ranges).within(near), tuple(slopes), middle, self.halves)
+            max_change = max_change + np.where(slope.size == 0, 0.0, slope.size * half)
+        linear_bounds = Interval.between(middle - max_change, middle + max_change)
+        values = VALUES[ufunc](*intervals).intersection(linear_bounds)
+        return Enclosure(values, tuple(slopes), middle, self.halves)

@@ -1,4 +1,4 @@
-"""Formulas of a case: read, checked and evaluated, with their derivatives by Taylor's arithmetic."""
+"""Formulas of a case: parsed, checked and evaluated, with derivatives by Taylor arithmetic."""
 
 import ast
 import operator
@@ -12,17 +12,17 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from magshell_fenicsx.input.enclosure import Enclosed
+from magshell_fenicsx.input.enclosure import Enclosure
 
 Array = NDArray[np.float64]
-Partials = tuple[
-    list[Any], dict[tuple[int, int], Any]
-]  # first derivatives by each argument, second ones by pairs i <= j
+
+# First derivatives by each argument, second ones by pairs i <= j.
+Partials = tuple[list[Any], dict[tuple[int, int], Any]]
 
 
 @dataclass(frozen=True)
 class Taylor(NDArrayOperatorsMixin):
-    """What NumPy's functions of it return too.
+    """A function with its derivatives at places; NumPy's functions of it return these too.
 
     Attributes
     ----------
@@ -36,12 +36,12 @@ class Taylor(NDArrayOperatorsMixin):
 
     @classmethod
     def coordinates(cls, x: Array) -> list[Self]:
-        """x, y and z at places (n, 3)."""
-        one, none = np.ones(len(x)), np.zeros((3, 3, len(x)))
-        return [cls(x[:, i], np.eye(3)[i, :, None] * one, none) for i in range(3)]
+        """Return x, y and z at places (n, 3)."""
+        ones, zeros = np.ones(len(x)), np.zeros((3, 3, len(x)))
+        return [cls(x[:, i], np.eye(3)[i, :, None] * ones, zeros) for i in range(3)]
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any, **options: Any) -> Any:
-        """A function of this and of numbers, by the chain rule."""
+        """Return a function of this and of numbers, by the chain rule."""
         if method != "__call__" or options or ufunc not in PARTIALS:
             return NotImplemented
         values = [a.value if isinstance(a, Taylor) else a for a in arguments]
@@ -54,17 +54,16 @@ class Taylor(NDArrayOperatorsMixin):
         for (i, j), partial in second.items():
             if i in varying and j in varying:
                 product = arguments[i].gradient[:, None] * arguments[j].gradient
-                hessian = hessian + partial * (
-                    product if i == j else product + product.swapaxes(0, 1)
-                )
+                if i != j:
+                    product = product + product.swapaxes(0, 1)
+                hessian = hessian + partial * product
         return Taylor(ufunc(*values), gradient, hessian)
 
 
 def _power(x: Any, p: Any) -> Partials:
     def term(factor: Any, exponent: Any) -> Any:
-        return np.where(
-            factor == 0, 0.0, factor * np.power(x, exponent)
-        )  # not 0/0, of x**1 at 0 for instance
+        # Not 0/0, for instance of x**1 at 0.
+        return np.where(factor == 0, 0.0, factor * np.power(x, exponent))
 
     value, log = np.power(x, p), np.log(x)
     mixed = np.power(x, p - 1) * (1 + p * log)
@@ -77,8 +76,8 @@ def _power(x: Any, p: Any) -> Partials:
 
 def _arctan2(y: Any, x: Any) -> Partials:
     r2 = x**2 + y**2
-    across = 2 * x * y / r2**2
-    return [x / r2, -y / r2], {(0, 0): -across, (0, 1): (y**2 - x**2) / r2**2, (1, 1): across}
+    bend = 2 * x * y / r2**2
+    return [x / r2, -y / r2], {(0, 0): -bend, (0, 1): (y**2 - x**2) / r2**2, (1, 1): bend}
 
 
 def _tan(x: Any) -> Partials:
@@ -124,17 +123,16 @@ _ALLOWED = (
     *(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant),
     *_OPERATORS,
 )
-_Step = (
-    tuple[Callable[..., Any], int] | np.float64 | str
-)  # of a stack: a function of some values, a number, a name
-_Operation = tuple[
-    Callable[..., Any], tuple[int, ...], tuple[int, ...]
-]  # of which values, and which are then not used
+# A step of a stack machine: a function with its number of arguments, a number, or a name.
+_Step = tuple[Callable[..., Any], int] | np.float64 | str
+
+# A function, the numbers of its arguments, and of values that are not used after it.
+_Operation = tuple[Callable[..., Any], tuple[int, ...], tuple[int, ...]]
 _Program = list[_Operation | np.float64 | str]
 
 
 @dataclass(frozen=True)
-class Read:
+class FormulaFunction:
     """A formula as a function of x, y, z (in lengths of R)."""
 
     steps: _Program
@@ -145,28 +143,29 @@ class Read:
         )
 
     def bounds(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
-        """In boxes between corners (n, 3) a least and a largest value, and by how much f's
-        derivatives differ (n,).
+        """Return bounds of the formula in boxes between corners (n, 3).
 
-        The latter times the sides, summed.
+        Returns
+        -------
+        tuple
+            (n,) each: a least and a largest value, and the variation of the derivatives within a
+            box times its sides, summed.
         """
-        enclosed, n = _evaluate(self.steps, *Enclosed.coordinates(low, high)), len(low)
-        if not isinstance(enclosed, Enclosed):
-            return np.full(n, enclosed), np.full(n, enclosed), np.zeros(n)
-        sides, widths = 2 * enclosed.halves, (slope.high - slope.low for slope in enclosed.slopes)
-        bent = sum(
+        enclosure, n = _evaluate(self.steps, *Enclosure.coordinates(low, high)), len(low)
+        if not isinstance(enclosure, Enclosure):
+            return np.full(n, enclosure), np.full(n, enclosure), np.zeros(n)
+        sides = 2 * enclosure.halves
+        widths = (slope.high - slope.low for slope in enclosure.slopes)
+        variation = sum(
             np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True)
         )
-        return (
-            *np.broadcast_arrays(enclosed.values.low, enclosed.values.high),
-            np.broadcast_to(bent, n),
-        )  # type: ignore[return-value]
+        least, largest = np.broadcast_arrays(enclosure.values.low, enclosure.values.high)
+        return least, largest, np.broadcast_to(variation, n)
 
 
 @dataclass(frozen=True)
-class Together:
-    """Formulas of places in another frame and unit of length, for what they may have between
-    places.
+class FormulaGroup:
+    """Formulas of places in another frame and unit of length, with bounds between places.
 
     Attributes
     ----------
@@ -174,41 +173,41 @@ class Together:
         Its axes, in the formulas' frame, are its rows; None if it is the same.
     """
 
-    functions: Sequence[Read]
+    functions: Sequence[FormulaFunction]
     frame: Array | None = None
     length: float = 1.0
 
     def values(self, x: Array) -> Array:
-        """Of places (n, 3): (n, formulas)."""
+        """Return the values (n, formulas) at places (n, 3)."""
         x = self.length * (x if self.frame is None else x @ self.frame)
         return np.stack([f(*x.T) for f in self.functions], axis=-1)
 
     def bounds(self, low: Array, high: Array) -> tuple[Array, ...]:
-        """Of each (n, formulas), see `Read.bounds`."""
+        """Return bounds (n, formulas) in boxes, see `FormulaFunction.bounds`."""
         if self.frame is not None:
             middle, half = (low + high) / 2 @ self.frame, (high - low) / 2 @ np.abs(self.frame)
             low, high = middle - half, middle + half
-        of_formulas = [f.bounds(self.length * low, self.length * high) for f in self.functions]
-        return tuple(np.stack(each, axis=-1) for each in zip(*of_formulas, strict=True))
+        bounds = [f.bounds(self.length * low, self.length * high) for f in self.functions]
+        return tuple(np.stack(bound, axis=-1) for bound in zip(*bounds, strict=True))
 
 
-def together(
+def formula_group(
     functions: Sequence[object], frame: Array | None = None, length: float = 1.0
-) -> Together | None:
-    """Those of some functions that are formulas; None without."""
-    readable = [f for f in functions if isinstance(f, Read)]
-    return Together(readable, frame, length) if readable else None
+) -> FormulaGroup | None:
+    """Return the group of those functions that are formulas; None without."""
+    formulas = [f for f in functions if isinstance(f, FormulaFunction)]
+    return FormulaGroup(formulas, frame, length) if formulas else None
 
 
-def formula(text: str) -> Read:
-    """A function from text such as "z*sqrt(x**2 + y**2)".
+def formula(text: str) -> FormulaFunction:
+    """Return a function from text such as "z*sqrt(x**2 + y**2)".
 
     Raises
     ------
     ValueError
         If the text is anything but arithmetic of x, y, z, pi and the known functions.
     """
-    return Read(_read(text))
+    return FormulaFunction(_parse(text))
 
 
 def _checked(text: str) -> str:
@@ -216,22 +215,23 @@ def _checked(text: str) -> str:
     return text
 
 
-def _of_number(given: Any) -> Any:
-    """A number is a formula."""
-    return repr(given) if isinstance(given, int | float) and not isinstance(given, bool) else given
+def _number_as_text(value: Any) -> Any:
+    """Return a number as a formula."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return repr(value) if is_number else value
 
 
 Formula = Annotated[
     str,
-    BeforeValidator(_of_number, json_schema_input_type=str | float),
+    BeforeValidator(_number_as_text, json_schema_input_type=str | float),
     AfterValidator(_checked),
     Field(examples=["z*sqrt(x**2 + y**2)"]),
 ]
 
 
-def with_derivatives(text: str) -> Callable[[Array], Taylor]:
-    """The same with its first and second derivatives, a function of places (n, 3)."""
-    steps = _read(text)
+def formula_with_derivatives(text: str) -> Callable[[Array], Taylor]:
+    """Return a formula with its first and second derivatives, as a function of places (n, 3)."""
+    steps = _parse(text)
 
     def evaluate(x: Array) -> Taylor:
         coordinates = Taylor.coordinates(x)
@@ -241,19 +241,20 @@ def with_derivatives(text: str) -> Callable[[Array], Taylor]:
     return evaluate
 
 
-def _read(text: str) -> _Program:
-    said = text if len(text) <= 60 else f"{text[:57]}..."
+def _parse(text: str) -> _Program:
+    """Return the steps of a formula; raise a ValueError if it is none."""
+    excerpt = text if len(text) <= 60 else f"{text[:57]}..."
     try:
         tree = ast.parse(text, mode="eval")
         nodes = list(ast.walk(tree))
     except (RecursionError, MemoryError):
         raise ValueError(
-            f"{said!r} is too long: allowed are some thousand terms in a row"
+            f"{excerpt!r} is too long: allowed are some thousand terms in a row"
         ) from None
     except (SyntaxError, ValueError) as e:
         if "nested parentheses" in str(e):
-            raise ValueError(f"{said!r}: allowed are 200 brackets within each other") from None
-        raise ValueError(f"{said!r} is not a formula") from None
+            raise ValueError(f"{excerpt!r}: allowed are 200 brackets within each other") from None
+        raise ValueError(f"{excerpt!r} is not a formula") from None
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
         allowed = isinstance(node, _ALLOWED)
@@ -268,37 +269,41 @@ def _read(text: str) -> _Program:
             )
         if not allowed:
             raise ValueError(
-                f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}"
+                f"{excerpt!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, "
+                f"{', '.join(FUNCTIONS)}"
             )
-    return _once(_steps(tree))
+    return _without_repetition(_steps(tree))
 
 
-def _once(steps: list[_Step]) -> _Program:
-    """The steps with what is written several times computed once, as the weights of points are."""
-    numbers, stack, operands = dict[Any, int](), list[int](), list[tuple[int, ...]]()
-    made = list[Any]()
+def _without_repetition(steps: list[_Step]) -> _Program:
+    """Return the steps with what is written several times computed once.
+
+    Formulas of weights of points repeat themselves.
+    """
+    numbers, stack = dict[Any, int](), list[int]()
+    unique_steps, operands = list[Any](), list[tuple[int, ...]]()
     for step in steps:
-        of = tuple(stack[-step[1] :]) if isinstance(step, tuple) else ()
-        stack = stack[: len(stack) - len(of)]
-        key = (
-            (step[0], of)
-            if isinstance(step, tuple)
-            else step
-            if isinstance(step, str)
-            else step.hex()
-        )
-        if key not in numbers:  # 0.0 and -0.0 are not the same
-            numbers[key] = len(made)
-            made.append(step)
-            operands.append(of)
+        arguments = tuple(stack[-step[1] :]) if isinstance(step, tuple) else ()
+        stack = stack[: len(stack) - len(arguments)]
+        key: Any = step
+        if isinstance(step, tuple):
+            key = step[0], arguments
+        elif not isinstance(step, str):
+            key = step.hex()  # 0.0 and -0.0 are not the same
+        if key not in numbers:
+            numbers[key] = len(unique_steps)
+            unique_steps.append(step)
+            operands.append(arguments)
         stack.append(numbers[key])
-    last = {value: i for i, of in enumerate(operands) for value in of}
-    no_more = [
-        tuple(value for value in dict.fromkeys(of) if last[value] == i)
-        for i, of in enumerate(operands)
-    ]
-    each = zip(made, operands, no_more, strict=True)
-    return [(step[0], of, then) if isinstance(step, tuple) else step for step, of, then in each]
+    last_use = {value: i for i, arguments in enumerate(operands) for value in arguments}
+    program = _Program()
+    for i, (step, arguments) in enumerate(zip(unique_steps, operands, strict=True)):
+        if isinstance(step, tuple):
+            unused = tuple(value for value in dict.fromkeys(arguments) if last_use[value] == i)
+            program.append((step[0], arguments, unused))
+        else:
+            program.append(step)
+    return program
 
 
 def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
@@ -306,9 +311,9 @@ def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
     with np.errstate(all="ignore"):
         for step in steps:
             if isinstance(step, tuple):
-                function, of, no_more = step
-                values.append(function(*(values[i] for i in of)))
-                for i in no_more:
+                function, arguments, unused = step
+                values.append(function(*(values[i] for i in arguments)))
+                for i in unused:
                     values[i] = None
             else:
                 values.append(names[step] if isinstance(step, str) else step)
@@ -316,21 +321,21 @@ def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
 
 
 def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: Any, z: Any) -> Any:
-    """A formula of symbols, with the functions that stand for those of `FUNCTIONS`."""
+    """Return a formula of symbols, with the functions that stand for those of `FUNCTIONS`."""
     formula(text)
-    instead = {FUNCTIONS[name]: functions[name] for name in FUNCTIONS}
+    replacements = {FUNCTIONS[name]: functions[name] for name in FUNCTIONS}
     names, stack = {"x": x, "y": y, "z": z, "pi": float(np.pi)}, list[Any]()
     for step in _steps(ast.parse(text, mode="eval")):
         if isinstance(step, tuple):
             function, count = step
-            stack[-count:] = [instead.get(function, function)(*stack[-count:])]
+            stack[-count:] = [replacements.get(function, function)(*stack[-count:])]
         else:
             stack.append(names[step] if isinstance(step, str) else float(step))
     return stack[0]
 
 
 def is_formula(text: str) -> bool:
-    """Whether `formula` takes it."""
+    """Return whether a text is a formula."""
     try:
         formula(text)
     except ValueError:
@@ -339,25 +344,27 @@ def is_formula(text: str) -> bool:
 
 
 def _steps(tree: ast.Expression) -> list[_Step]:
-    """What a stack does in turn: a sum of thousand terms is as many levels deep, too deep for
-    recursion.
+    """Return the steps of a stack machine that evaluates a formula.
+
+    A sum of thousand terms is as many levels deep, too deep for recursion.
 
     Numbers are NumPy's: these neither grow without end, as 9**9**9 does, nor turn complex.
     """
     steps: list[_Step] = []
-    left: list[ast.AST] = [tree.body]
-    while left:  # the last operation first, and of its values the last first; then all backwards
-        node = left.pop()
+    pending: list[ast.AST] = [tree.body]
+    # The last operation first, and of its values the last first; then all backwards.
+    while pending:
+        node = pending.pop()
         if isinstance(node, ast.BinOp):
             steps.append((_OPERATORS[type(node.op)], 2))
-            left += [node.left, node.right]
+            pending += [node.left, node.right]
         elif isinstance(node, ast.UnaryOp):
             steps.append((_OPERATORS[type(node.op)], 1))
-            left.append(node.operand)
+            pending.append(node.operand)
         elif isinstance(node, ast.Call):
             assert isinstance(node.func, ast.Name)
             steps.append((FUNCTIONS[node.func.id], len(node.args)))
-            left += node.args
+            pending += node.args
         elif isinstance(node, ast.Name):
             steps.append(node.id)
         else:
@@ -368,9 +375,19 @@ def _steps(tree: ast.Expression) -> list[_Step]:
 
 
 @dataclass(frozen=True)
-class ByFormula:
-    """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of
-    their own.
+class FormulaVectors:
+    """Vectors of numbers and formulas of the undeformed place.
+
+    Attributes
+    ----------
+    of_position
+        Functions of x, y, z for each component.
+    frame
+        Axes of the formulas' frame, as columns.
+    length
+        R in the formulas' unit of length.
+    vectors
+        Whether components are those of a vector in the formulas' frame.
     """
 
     by_formula: ClassVar[bool] = True
@@ -386,27 +403,27 @@ class ByFormula:
         return values @ self.frame.T if self.vectors else values
 
     @property
-    def formulas(self) -> Together | None:
-        return together(self.of_position, self.frame, self.length)
+    def formulas(self) -> FormulaGroup | None:
+        return formula_group(self.of_position, self.frame, self.length)
 
 
 @dataclass(frozen=True)
-class Inwards:
-    """A pressure by formula, which is against the normal."""
+class InwardPressure:
+    """A traction from a pressure by formula, which acts against the normal."""
 
     by_formula: ClassVar[bool] = True
-    pressure: ByFormula
+    pressure: FormulaVectors
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         return -self.pressure(r0, n0) * n0
 
     @property
-    def formulas(self) -> Together | None:
+    def formulas(self) -> FormulaGroup | None:
         return self.pressure.formulas
 
 
-def function(value: float | str) -> Callable[[Array, Array, Array], Array]:
-    """A formula of x, y, z, or a number that is the same everywhere."""
+def formula_function(value: float | str) -> Callable[[Array, Array, Array], Array]:
+    """Return a function of x, y, z from a formula, or from a number that is the same everywhere."""
     if isinstance(value, str):
         return formula(value)
     return lambda x, y, z: np.full_like(x, value)
@@ -414,8 +431,14 @@ def function(value: float | str) -> Callable[[Array, Array, Array], Array]:
 
 @dataclass(frozen=True)
 class FormulasInSpace:
-    """Three formulas of the deformed place as a `FieldInSpace`, in a frame whose axes are the rows
-    of `axes`.
+    """A field in space from three formulas of the deformed place; a `FieldInSpace`.
+
+    Attributes
+    ----------
+    components
+        The formulas with their derivatives.
+    axes
+        Axes of the formulas' frame, as rows.
     """
 
     components: list[Callable[[Array], Taylor]]

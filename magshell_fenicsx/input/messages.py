@@ -1,5 +1,4 @@
-"""What the user reads when a case is wrong: file, line, key, value, what is allowed; and what a key
-means.
+"""Messages about a wrong case: file, line, key, value, what is allowed; and meanings of keys.
 
 Python does not keep the docstrings of keys: they are read in the source when somebody asks.
 """
@@ -18,48 +17,42 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
-NO_KEYS = (
-    "a word",
-    "a gas",
-    "a pair",
-    "a pair with keys",
-)  # tags of a union that has no sections to choose from
-NO_CONTAINER = ("list_type", "dict_type")
-LIKE_A_NAME = "[A-Za-z]"  # what patterns of names contain, others are of text with a unit
+# Tags of unions without sections, which pydantic puts into locations.
+NO_KEYS = ("a word", "a gas", "a pair", "a pair with keys")
+NO_CONTAINER = ("list_type", "dict_type")  # errors about values that are no list or mapping
+NAME_PATTERN_PART = "[A-Za-z]"  # in patterns of names; other patterns are of text with a unit
 
 
 def meaning(section: type[BaseModel], key: str) -> str:
-    """The docstring of a key of a section or its base, or what stands in its place; empty without."""
+    """Return the docstring or description of a key of a section or its base; empty without."""
     field = section.model_fields.get(key)
     if field is not None and field.description:
         return field.description
-    return next(
-        (docstring for base in section.__mro__ if (docstring := _docstrings(base).get(key))), ""
-    )
+    docstrings = (_docstrings(base).get(key) for base in section.__mro__)
+    return next((docstring for docstring in docstrings if docstring), "")
 
 
 @cache
 def _docstrings(section: type) -> dict[str, str]:
-    """Key -> docstring of a class's own keys."""
-    own = (
-        _classes(section.__module__).get(section.__qualname__)
-        if issubclass(section, BaseModel)
-        else None
-    )
-    pairs = zip(own.body, own.body[1:], strict=False) if own else ()
-    return {
-        key.target.id: inspect.cleandoc(text.value.value)
-        for key, text in pairs
-        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name)
-        if isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-        and isinstance(text.value.value, str)
-    }
+    """Return the docstrings of a class's own keys, by key."""
+    if not issubclass(section, BaseModel):
+        return {}
+    definition = _classes(section.__module__).get(section.__qualname__)
+    if not definition:
+        return {}
+    docstrings = {}
+    for key, statement in zip(definition.body, definition.body[1:], strict=False):
+        if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
+            continue
+        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+            if isinstance(text := statement.value.value, str):
+                docstrings[key.target.id] = inspect.cleandoc(text)
+    return docstrings
 
 
 @cache
 def _classes(module: str) -> dict[str, ast.ClassDef]:
-    """Name -> class at the top of a module that has a source."""
+    """Return the classes at the top of a module's source, by name; none without a source."""
     try:
         tree = ast.parse(inspect.getsource(sys.modules[module]))
     except (OSError, TypeError, KeyError):
@@ -73,7 +66,7 @@ class InvalidCase(CaseError):
     Parameters
     ----------
     in_words
-        Puts the names of the case file into a message.
+        Replaces names in a message by those of the case file.
     """
 
     def __init__(
@@ -86,8 +79,8 @@ class InvalidCase(CaseError):
         super().__init__(in_words(explained(errors, source, case)))
         self._errors, self._source, self._case, self._in_words = errors, source, case, in_words
 
-    def of(self, *kinds: str) -> list[str]:
-        """The lines of pydantic's errors of some kinds."""
+    def lines_of_kinds(self, *kinds: str) -> list[str]:
+        """Return the lines of pydantic's errors of some kinds."""
         errors = [error for error in self._errors if error["type"] in kinds]
         return [self._in_words(explained(errors, self._source, self._case))] if errors else []
 
@@ -96,111 +89,108 @@ class InvalidCase(CaseError):
 
 
 def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
-    """One line for each mistake.
+    """Return one line for each mistake.
 
     Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts
     as one, and what is neither as a value.
     """
-    placed = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
-    places = [location for location, _ in placed]
+    locations = [_without_tag(error["loc"], source.data, case) for error in errors]
 
-    def beside(location: Location, kind: str) -> bool:
-        within = any(
-            len(other) > len(location) and other[: len(location)] == location for other in places
+    def is_explained(location: Location, kind: str) -> bool:
+        """Return whether another error says more about the same mistake."""
+        has_inner_error = any(
+            len(other) > len(location) and other[: len(location)] == location for other in locations
         )
-        return within or (kind in NO_CONTAINER and places.count(location) > 1)
+        return has_inner_error or (kind in NO_CONTAINER and locations.count(location) > 1)
 
-    told = [
+    lines = [
         explain(error, location, source, case)
-        for location, error in placed
-        if not beside(location, error["type"])
+        for location, error in zip(locations, errors, strict=True)
+        if not is_explained(location, error["type"])
     ]
-    return "\n".join(dict.fromkeys(told))
+    return "\n".join(dict.fromkeys(lines))
 
 
 def explain(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
-    """One line for one of pydantic's errors, at the location of its key."""
+    """Return one line for one of pydantic's errors, at the location of its key."""
     value, kind = error["input"], error["type"]
-    said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    said = re.sub(
+    problem = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    problem = re.sub(
         r"^\w+ should have (at \w+ \d+) items? after validation, not",
         r"must have \1 items, not",
-        said,
+        problem,
     )
     if kind == "string_pattern_mismatch":
-        name = LIKE_A_NAME in error["ctx"]["pattern"]
-        said = (
-            "must be a letter, then letters, digits and _"
-            if name
-            else "must be a number with a unit"
-        )
-    if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
-        keys = about[1].split(".")
-        location, said = (
-            tuple(int(key) if key.isdecimal() else key for key in keys),
-            said[about.end() :],
-        )
+        if NAME_PATTERN_PART in error["ctx"]["pattern"]:
+            problem = "must be a letter, then letters, digits and _"
+        else:
+            problem = "must be a number with a unit"
+    if own_key := re.match(r"(\w+(\.[^.:]+)+): ", problem):  # of a rule between sections
+        keys = own_key[1].split(".")
+        location = tuple(int(key) if key.isdecimal() else key for key in keys)
+        problem = problem[own_key.end() :]
     place, key = source.place(location), dotted(location) or "case"
     if kind == "list_type":
-        said = "must be a list, in brackets"
+        problem = "must be a list, in brackets"
     if kind == "dict_type":
-        said = f"must be a mapping, as {{{_example(value, location, source.data, case)}}}"
+        problem = f"must be a mapping, as {{{_example(value, location, source.data, case)}}}"
     if kind == "extra_forbidden":
-        return f"{place}: {key}: {unknown(str(location[-1]), _allowed_keys(location[:-1], source.data, case))}"
+        allowed = _allowed_keys(location[:-1], source.data, case)
+        return f"{place}: {key}: {unknown(str(location[-1]), allowed)}"
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
         keys = location[:-1] if isinstance(location[-1], int) else location
-        field = _found(keys, source.data, case)[1] or case.model_fields[str(location[0])]
+        field = _section_at(keys, source.data, case)[1] or case.model_fields[str(location[0])]
         models = [m for m in _models(field.annotation) if _tag_key([m])]
         tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
-        said = "is missing" if tag is None else shown(tag)
-        return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
+        problem = "is missing" if tag is None else shown_value(tag)
+        return f"{place}: {key}.{_tag_key(models)}: {problem}; allowed: {', '.join(tags)}"
     if kind in ("model_type", "model_attributes_type"):
-        return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
+        return f"{place}: {key}: {shown_value(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
-        return f"{place}: {key}: {said}"
-    if said.startswith(shown(value)):
-        return f"{place}: {key}: {said}"
+        return f"{place}: {key}: {problem}"
+    if problem.startswith(shown_value(value)):
+        return f"{place}: {key}: {problem}"
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
-    written = _at(source.data, location, str) if isinstance(value, float) else ""
-    text = (
-        f"{shown(written)} is {value:.6g}" if written else shown(value)
-    )  # its limits are those of the number
-    return f"{place}: {key}: {text}: {said}{meaning}"
+    text_in_case = _data_at(source.data, location, str) if isinstance(value, float) else ""
+    text = shown_value(value)
+    if text_in_case:  # limits are those of the number that the text became
+        text = f"{shown_value(text_in_case)} is {value:.6g}"
+    return f"{place}: {key}: {text}: {problem}{meaning}"
 
 
 def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:
-    """That there is no such key, and which is nearest to it.
+    """Return the message that there is no such key, with the nearest one.
 
     Examples
     --------
     >>> unknown("thicknes", ["radius", "thickness"])
     'unknown key; did you mean thickness? allowed here: radius, thickness'
     """
-    near = difflib.get_close_matches(key, allowed, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
+    nearest = difflib.get_close_matches(key, allowed, n=1)
+    hint = f"did you mean {nearest[0]}? " if nearest else ""
     return f"unknown {what}; {hint}allowed here: {', '.join(sorted(allowed))}"
 
 
 def refuse_unknown(
     keys: Iterable[str], section: type[BaseModel], place: str, others: Iterable[str] = ()
 ) -> None:
-    """See that keys are those of a section, or others that stand there too.
+    """Refuse keys that are neither those of a section nor others that are allowed there.
 
     Raises
     ------
     CaseError
-        With the first that is not, and the nearest one that is.
+        With the first such key, and the nearest one that is allowed.
     """
     allowed = {*section.model_fields, *others}
-    if strange := next((key for key in keys if key not in allowed), None):
-        raise CaseError(f"{place}.{strange}: {unknown(strange, allowed)}")
+    if unexpected := next((key for key in keys if key not in allowed), None):
+        raise CaseError(f"{place}.{unexpected}: {unknown(unexpected, allowed)}")
 
 
-def shown(value: Any) -> str:
-    """The value as it was written, on one line of bearable length."""
+def shown_value(value: Any) -> str:
+    """Return a value as it was written, on one line of at most 80 characters."""
     try:
         text = repr(value)
     except ValueError:  # Python prints no integers of thousands of digits
@@ -209,123 +199,120 @@ def shown(value: Any) -> str:
 
 
 def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
-    """Pydantic puts what distinguishes the members of a union after their key: take it out."""
-    models, kept, named = [case], list[str | int](), False
+    """Return a location without tags: pydantic puts those of a union's members after their key."""
+    models, keys, below_names = [case], list[str | int](), False
     for key in loc:
         if key in NO_KEYS:
             continue
-        known = models[0].model_fields if len(models) == 1 else ()
-        if (
-            len(models) < 2
-            and not named
-            and isinstance(key, str)
-            and key not in {*known, *_at(data, kept, dict)}
-        ):
-            continue  # of a union of values, or of a section and a list of it
-        if named:
-            kept.append(key)
-            named = False
+        fields = models[0].model_fields if len(models) == 1 else ()
+        if len(models) < 2 and not below_names and isinstance(key, str):
+            if key not in {*fields, *_data_at(data, keys, dict)}:
+                continue  # of a union of values, or of a section and a list of it
+        if below_names:
+            keys.append(key)
+            below_names = False
             continue
         if len(models) > 1 and not isinstance(key, int):
             models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
             continue
-        kept.append(key)
+        keys.append(key)
         if isinstance(key, str) and models:
             field = models[0].model_fields.get(key)
             models = list(dict.fromkeys(_models(field.annotation))) if field else []
-            named = _has_names(field)
-    return tuple(kept)
+            below_names = _has_names(field)
+    return tuple(keys)
 
 
-def _at(data: Any, location: Sequence[str | int], kind: type) -> Any:
-    """The part of plain data at a location; an empty one if it is of another kind."""
+def _data_at(data: Any, location: Sequence[str | int], kind: type) -> Any:
+    """Return the part of plain data at a location; an empty one if it is of another kind."""
     for key in location:
-        fits = isinstance(data, dict) or (
-            isinstance(data, list) and isinstance(key, int) and key < len(data)
-        )
-        data = data.get(key) if isinstance(data, dict) else data[key] if fits else None
+        if isinstance(data, dict):
+            data = data.get(key)
+        elif isinstance(data, list) and isinstance(key, int) and key < len(data):
+            data = data[key]
+        else:
+            data = None
     return data if isinstance(data, kind) else kind()
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
-    """Keys of the section at a location."""
-    return list(_found(location, data, case)[0].model_fields)
+    """Return the keys of the section at a location."""
+    return list(_section_at(location, data, case)[0].model_fields)
 
 
 def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
-    """The first words on a key, in brackets, with its unit."""
-    section, field = _found(location, data, case)
+    """Return the first words of a key's meaning, in brackets, with its unit."""
+    section, field = _section_at(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
-    words, unit = (
-        re.split(r"[;:.,] | \[", description)[0],
-        re.search(r"\[([^\[\]]+)\]$", description),
-    )
-    return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
+    words = re.split(r"[;:.,] | \[", description)[0]
+    if not words:
+        return ""
+    unit = re.search(r"\[([^\[\]]+)\]$", description)
+    return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})"
 
 
 def _example(value: Any, location: Location, data: Any, case: type[BaseModel]) -> str:
-    """How a mapping begins that was written as a word or a list of words."""
-    field = _found(location, data, case)[1]
-    parts = _parts(field.annotation if field else None)
-    keys, of = next((get_args(part) for part in parts if get_origin(part) is dict), (str, str))
+    """Return the begin of a mapping that was written as a word or a list of words."""
+    field = _section_at(location, data, case)[1]
+    annotations = _nested_annotations(field.annotation if field else None)
+    mappings = (get_args(each_type) for each_type in annotations if get_origin(each_type) is dict)
+    key_type, value_type = next(mappings, (str, str))
     words = value if isinstance(value, list) else [value]
-    named = [word for word in words if isinstance(word, str) and word.isidentifier()]
-    first = named or [*get_args(keys), "NAME"]
-    what = next((part for part in _parts(of) if isinstance(part, str)), "...")
-    return f"{first[0]}: {what}"
+    names = [word for word in words if isinstance(word, str) and word.isidentifier()]
+    first_key = (names or [*get_args(key_type), "NAME"])[0]
+    values = (part for part in _nested_annotations(value_type) if isinstance(part, str))
+    return f"{first_key}: {next(values, '...')}"
 
 
-def _parts(annotation: Any) -> Iterator[Any]:
-    """An annotation and all within it."""
+def _nested_annotations(annotation: Any) -> Iterator[Any]:
+    """Iterate over an annotation and all within it."""
     yield annotation
     for part in get_args(annotation):
-        yield from _parts(part)
+        yield from _nested_annotations(part)
 
 
-def _found(
+def _section_at(
     location: Location, data: Any, case: type[BaseModel]
 ) -> tuple[type[BaseModel], FieldInfo | None]:
-    """The innermost section at a location; and the last key, if it is one of a section."""
-    model, field, models, named = case, None, list[type[BaseModel]](), False
+    """Return the innermost section at a location, and the last key if it is one of a section."""
+    model, field, models, below_names = case, None, list[type[BaseModel]](), False
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
         # None: of a list or mapping of sections, or a part of a union
-        field = None if named else model.model_fields.get(str(key))
-        if field or not (named or isinstance(key, int)):
+        field = None if below_names else model.model_fields.get(str(key))
+        if field or not (below_names or isinstance(key, int)):
             models = _models(field.annotation) if field else []
-        named = _has_names(field)
-        if models and not named:
+        below_names = _has_names(field)
+        if models and not below_names:
             tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
             model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
     return model, field
 
 
 def _has_names(field: FieldInfo | None) -> bool:
-    """Whether the keys below a key are names that the user gives to sections."""
-    return (
-        field is not None
-        and get_origin(field.annotation) is dict
-        and bool(_models(field.annotation))
-    )
+    """Return whether the keys below a key are names that the user gives to sections."""
+    if field is None or get_origin(field.annotation) is not dict:
+        return False
+    return bool(_models(field.annotation))
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Every section class within an annotation."""
+    """Return every section class within an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]
 
 
 def _tag_key(models: list[type[BaseModel]]) -> str:
-    """The key that selects one of several section classes; empty without one."""
+    """Return the key that selects one of several section classes; empty without one."""
     return next(
         (key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), ""
     )
 
 
 def _tags(model: type[BaseModel]) -> list[str]:
-    """The values of that key that select a section class."""
+    """Return the values of that key that select a section class."""
     return [str(tag) for tag in get_args(model.model_fields[_tag_key([model])].annotation)]

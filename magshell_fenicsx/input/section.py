@@ -1,5 +1,4 @@
-"""The base of all sections of a case: strict types, no unknown keys, numbers with units, files, a
-choice of sections.
+"""The base of all sections of a case: strict types, no unknown keys, units, files, choices.
 
 Of sections that are chosen by a key, only the validators of chosen ones are built: a case has few
 of many. Targets with units become numbers over the sizes of their case at the door.
@@ -34,7 +33,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from magshell_fenicsx.platform.input_files import Files
-from magshell_fenicsx.quantities.quantity import Given, Unit
+from magshell_fenicsx.quantities.quantity import CaseSizes, Unit
 
 if TYPE_CHECKING:
     import pint
@@ -48,7 +47,7 @@ _NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*"
 
 @cache
 def _units() -> "pint.UnitRegistry":
-    """Pint's units, imported on first use: the import is slow, and most cases have no units."""
+    """Return pint's units, imported on first use: the import is slow, and rarely needed."""
     import pint
 
     return pint.UnitRegistry()
@@ -67,8 +66,10 @@ class Section(BaseModel):
     )
 
     def __setstate__(self, state: dict[Any, Any]) -> None:
-        """Of another rank, where its class may not have been needed yet: without its schema it
-        could not be written.
+        """Restore a section from another rank, and build the schema of its class if need be.
+
+        This rank may not have needed the class yet; without its schema the section could not be
+        written.
         """
         super().__setstate__(state)
         if not type(self).__pydantic_complete__:
@@ -76,12 +77,13 @@ class Section(BaseModel):
 
 
 def with_unit(unit: str) -> Any:
-    """The schema of text with a unit; only pint checks the names of units."""
-    return Annotated[str, Field(pattern=rf"^\s*{_NUMBER}[\s*]*[^\s\d*]", examples=[_example(unit)])]
+    """Return the schema of text with a unit; only pint checks the names of units."""
+    pattern = rf"^\s*{_NUMBER}[\s*]*[^\s\d*]"
+    return Annotated[str, Field(pattern=pattern, examples=[_example(unit)])]
 
 
 def _quantity(unit: str) -> Any:
-    """A validator: text with a unit -> a float in `unit`."""
+    """Return a validator: text with a unit -> a float in `unit`."""
 
     def convert(value: Any) -> float:
         if not isinstance(value, str):
@@ -92,6 +94,7 @@ def _quantity(unit: str) -> Any:
 
 
 def _converted(value: str, unit: str) -> float:
+    """Return a number with a unit in another unit; raise a ValueError if it is none."""
     import pint
 
     try:
@@ -106,8 +109,9 @@ def _converted(value: str, unit: str) -> float:
 
 
 def number_and_unit(text: str) -> tuple[str, str]:
-    """The number and the unit of a text, which is empty for a bare number; both are empty for a
-    word.
+    """Return the number and the unit of a text.
+
+    The unit of a bare number is empty; of a word both are.
 
     Examples
     --------
@@ -116,28 +120,30 @@ def number_and_unit(text: str) -> tuple[str, str]:
     """
     if re.fullmatch(_NUMBER, text.strip()):
         return text.strip(), ""
-    number = re.match(rf"\s*({_NUMBER})", text) if _NUMBER_AND_UNITS.fullmatch(text) else None
+    if not _NUMBER_AND_UNITS.fullmatch(text):
+        return "", ""
+    number = re.match(rf"\s*({_NUMBER})", text)
     return (number[1], text[number.end() :].strip(" *")) if number else ("", "")
 
 
 def in_unit(text: str, unit: str) -> float:
-    """A number with a unit in another unit; a bare zero has any.
+    """Return a number with a unit in another unit; a bare zero has any.
 
     Raises
     ------
     ValueError
         If it is none, or of another dimension.
     """
-    number, own = number_and_unit(text)
-    if not own and number and (not unit or float(number) == 0):
+    number, text_unit = number_and_unit(text)
+    if not text_unit and number and (not unit or float(number) == 0):
         return float(number)
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
-    return float(number) if own == unit else _converted(text, unit)
+    return float(number) if text_unit == unit else _converted(text, unit)
 
 
 def si_size(unit: str) -> float:
-    """What one of a unit is in SI; of no unit 1.
+    """Return the size of a unit in SI; 1 for no unit.
 
     Examples
     --------
@@ -148,7 +154,7 @@ def si_size(unit: str) -> float:
 
 
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
-    """A validator: text with a unit -> a float in `unit`; a number stays as it is.
+    """Return a validator: text with a unit -> a float in `unit`; a number stays as it is.
 
     With `bare`, the text is a unit without a number, and the result is its size.
     """
@@ -169,49 +175,62 @@ class WithUnit(BeforeValidator):
 
 
 def or_number(unit: str, number: Any = float) -> WithUnit:
-    """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the
-    schema.
-    """
-    return WithUnit(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
-
-
-def numbers_with_units(made: Any, data: Any, key: str) -> Iterator[str]:
-    """The keys within a section's plain data whose text became a number: it had a unit.
-
-    Not those of targets over a size of the case, which say themselves what they need.
+    """Return a validator: a number unchanged, or text converted to `unit`.
 
     Parameters
     ----------
-    made
-        What was made of the data: a section, or a list or mapping of sections and values.
-    key
-        That of the data in the case.
+    number
+        Type of the number in the schema.
     """
-    if isinstance(made, BaseModel) and isinstance(data, Mapping):
-        for name, field in type(made).model_fields.items():
+    schema_type = number | with_unit(unit)
+    return WithUnit(in_units(unit), json_schema_input_type=schema_type, unit=unit)
+
+
+def numbers_with_units(validated: Any, data: Any, key: str) -> Iterator[str]:
+    """Iterate over keys within a section's plain data whose text became a number.
+
+    These had a unit. Targets over a size of the case are left out; they say themselves what they
+    need.
+
+    Parameters
+    ----------
+    validated
+        The section, list or mapping that was made of the data.
+    data
+        Plain data of the case.
+    key
+        Key of the data in the case.
+    """
+    if isinstance(validated, BaseModel) and isinstance(data, Mapping):
+        for name, field in type(validated).model_fields.items():
             if name in data and not is_over_unit(field.annotation, field.metadata):
-                yield from numbers_with_units(getattr(made, name), data[name], f"{key}.{name}")
-    elif isinstance(made, Mapping) and isinstance(data, Mapping):
-        for name, value in made.items():
+                yield from numbers_with_units(getattr(validated, name), data[name], f"{key}.{name}")
+    elif isinstance(validated, Mapping) and isinstance(data, Mapping):
+        for name, value in validated.items():
             yield from numbers_with_units(value, data.get(name), f"{key}.{name}")
-    elif isinstance(made, list) and isinstance(data, list):
-        for i, (value, written) in enumerate(zip(made, data, strict=True)):
-            yield from numbers_with_units(value, written, f"{key}.{i}")
-    elif isinstance(made, float) and isinstance(data, str):
+    elif isinstance(validated, list) and isinstance(data, list):
+        for i, (value, item) in enumerate(zip(validated, data, strict=True)):
+            yield from numbers_with_units(value, item, f"{key}.{i}")
+    elif isinstance(validated, float) and isinstance(data, str):
         yield key
 
 
 def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
-    """Whether a field with this annotation takes a length with a unit, or a list of these."""
-    if any(isinstance(each, WithUnit) and each.unit == "metre" for each in metadata):
+    """Return whether a field with this annotation takes a length with a unit, or a list of them."""
+    validators = (validator for validator in metadata if isinstance(validator, WithUnit))
+    if any(validator.unit == "metre" for validator in validators):
         return True
     return any(is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
 
 
 @dataclass(frozen=True)
-class OrOfProgram:
-    """In the annotation of a union: one of its members is what a program gives and no file has,
-    with a `digest`.
+class OrInMemory:
+    """An annotation of a union, one of whose members only a program gives, as an object in memory.
+
+    Attributes
+    ----------
+    kind
+        The class of these objects, which have a `digest`.
     """
 
     kind: Any
@@ -220,17 +239,17 @@ class OrOfProgram:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         others = reduce(or_, (part for part in get_args(source) if part is not self.kind))
-        told = core_schema.wrap_serializer_function_ser_schema(self._told)
-        written = handler.generate_schema(others)
+        serialization = core_schema.wrap_serializer_function_ser_schema(self._serialized)
+        schema = handler.generate_schema(others)
         return core_schema.no_info_wrap_validator_function(
-            self._validated, written, serialization=told
+            self._validated, schema, serialization=serialization
         )
 
     def _validated(self, value: Any, validate: Callable[[Any], Any]) -> Any:
         return value if isinstance(value, self.kind) else validate(value)
 
-    def _told(self, value: Any, tell: Callable[[Any], Any]) -> Any:
-        return value.digest if isinstance(value, self.kind) else tell(value)
+    def _serialized(self, value: Any, serialize: Callable[[Any], Any]) -> Any:
+        return value.digest if isinstance(value, self.kind) else serialize(value)
 
 
 _EXAMPLES = {
@@ -248,8 +267,9 @@ _EXAMPLES = {
 
 
 def _example(unit: str) -> str:
-    over = re.sub(r"^1/(\w+)(?:\*\*(\d))?$", lambda below: f"{below[1]}^-{below[2] or 1}", unit)
-    return _EXAMPLES.get(unit, f"5 {over.replace('**', '^')}")
+    """Return an example of text with a unit."""
+    power = re.sub(r"^1/(\w+)(?:\*\*(\d))?$", lambda match: f"{match[1]}^-{match[2] or 1}", unit)
+    return _EXAMPLES.get(unit, f"5 {power.replace('**', '^')}")
 
 
 Length = Annotated[float, _quantity("metre")]
@@ -265,15 +285,14 @@ FluxDensity = Annotated[float, _quantity("tesla")]
 Density = Annotated[float, _quantity("kilogram/metre**3")]
 
 
-def _points_somewhere(v: list[float]) -> list[float]:
+def _not_zero(v: list[float]) -> list[float]:
     if not any(v):
         raise ValueError("must not be zero")
     return v
 
 
-Along = Annotated[
-    Vector, AfterValidator(_points_somewhere)
-]  # a direction, by a vector of any length
+# A direction, by a vector of any length.
+DirectionVector = Annotated[Vector, AfterValidator(_not_zero)]
 
 
 class AboutAxis(Section):
@@ -300,7 +319,7 @@ class Direction(Section):
     """Angle from e1 about e3 [degree]"""
 
     def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
-        """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
+        """Return the unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
         polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
         return np.array(
             [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
@@ -308,27 +327,28 @@ class Direction(Section):
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """In an annotation: which key chooses; each section has the values that choose it as the key's
-    `Literal`.
+class ChosenByKey:
+    """An annotation of a union of sections, one of which is chosen by a key.
+
+    Each section has the values that choose it as the key's `Literal`.
     """
 
-    by: str
+    key: str
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         choices = {
-            tag: handler.generate_schema(Annotated[section, Later(section)])
+            tag: handler.generate_schema(Annotated[section, LazyValidation(section)])
             for section in get_args(source)
-            for tag in get_args(section.model_fields[self.by].annotation)
+            for tag in get_args(section.model_fields[self.key].annotation)
         }
-        return core_schema.tagged_union_schema(choices, self.by)
+        return core_schema.tagged_union_schema(choices, self.key)
 
 
 @dataclass(frozen=True)
-class Later:
-    """In an annotation: a section whose validator is built when a case has it."""
+class LazyValidation:
+    """An annotation of a section whose validator is built when a case has it."""
 
     section: type[BaseModel]
 
@@ -348,7 +368,7 @@ class Later:
 
 
 class FileKeys(Section):
-    """Of sections that may read a file; its path is from the folder of the case."""
+    """A section that may read a file; its path is relative to the folder of the case."""
 
     file: str | None = None
     """From the folder of the case"""
@@ -357,13 +377,14 @@ class FileKeys(Section):
     _files: Files = PrivateAttr(default_factory=Files)
 
     def model_post_init(self, context: Any, /) -> None:
-        given = context or {}
-        self._folder = Path(given.get("folder", "")).absolute()
-        self._files = given.get("files") or Files()
+        """Take the folder and the files of the case from the context of its validation."""
+        options = context or {}
+        self._folder = Path(options.get("folder", "")).absolute()
+        self._files = options.get("files") or Files()
 
     @field_validator("file", check_fields=False)
     @classmethod
-    def _a_name(cls, name: str | None) -> str | None:
+    def _refuse_bad_name(cls, name: str | None) -> str | None:
         if name is not None and "\0" in name:
             raise ValueError(f"{name!r}: a file's name has no zero byte")
         if name == "":
@@ -372,7 +393,7 @@ class FileKeys(Section):
 
     @property
     def path(self) -> Path:
-        """Where the file is."""
+        """Path of the file."""
         return self._folder / (self.file or "")
 
     @property
@@ -387,15 +408,14 @@ class FileKeys(Section):
 
 
 def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
-    """Hashes of the files that sections read, by the keys of the files."""
+    """Return hashes of the files that sections read, by the keys of the files."""
     return {
         f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file
     }
 
 
-Rubberlike: TypeAlias = (
-    float | tuple[tuple[float, ...], tuple[float, ...]]
-)  # see `parts.rubber.LawKeys.rubber`
+# See `parts.rubber.LawKeys.rubber`.
+Rubberlike: TypeAlias = float | tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class Sized(Protocol):
@@ -420,26 +440,24 @@ class Sized(Protocol):
     def with_units(self) -> bool: ...
 
 
-def given(shell: Sized) -> Given:
-    """What a shell gives with units."""
-    in_pascals = shell.with_units or shell.geometry in (
-        "hemisphere",
-        "disc",
-        "strip",
-    )  # whose E always has a unit
+def case_sizes(shell: Sized) -> CaseSizes:
+    """Return the sizes that a shell has with units."""
+    # E of these geometries always has a unit.
+    in_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")
     R = shell.reference if shell.with_units else nan
     E = shell.youngs_modulus if in_pascals and shell.youngs_modulus else nan
     rho = shell.density if shell.with_units and shell.density else nan
-    return Given(shell.poisson_ratio, shell.R_over_h, R, E, rho)
+    return CaseSizes(shell.poisson_ratio, shell.R_over_h, R, E, rho)
 
 
-def _note(shell: Any, info: ValidationInfo) -> Any:
+def _put_sizes_into_context(shell: Any, info: ValidationInfo) -> Any:
     if isinstance(info.context, dict):
-        info.context["given"] = given(shell)
+        info.context["given"] = case_sizes(shell)
     return shell
 
 
-NOTED = AfterValidator(_note)  # of the shell, which comes before the loads
+# Annotation of the shell, which comes before the loads: their units need its sizes.
+NOTED = AfterValidator(_put_sizes_into_context)
 
 
 @dataclass(frozen=True, slots=True)
@@ -447,9 +465,10 @@ class OverUnit(BeforeValidator):
     """The validator of a number over a size of the case."""
 
 
-def over(unit: Unit) -> OverUnit:
-    """A validator: text with a unit -> a number over a size of the case, such as h; a number is one
-    already.
+def over_size(unit: Unit) -> OverUnit:
+    """Return a validator: text with a unit -> a number over a size of the case, such as h.
+
+    A number is one already.
     """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
@@ -458,8 +477,8 @@ def over(unit: Unit) -> OverUnit:
         exact = in_units(unit.text)(value)
         if info.context and "given" not in info.context:
             return 1.0  # the shell is wrong, and its own message says so: any number will do
-        shell = (info.context or {}).get("given")
-        size = unit.size(shell) if shell else nan
+        sizes = (info.context or {}).get("given")
+        size = unit.size(sizes) if sizes else nan
         if isnan(size):
             raise ValueError(f"has a unit: that needs {unit.needs}; a number is in {unit.key}")
         return exact / size
@@ -468,19 +487,17 @@ def over(unit: Unit) -> OverUnit:
 
 
 def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
-    """Whether a field with this annotation takes text with a unit as a number over a size of the
-    case.
-    """
-    within = (
-        each
+    """Return whether a field takes text with a unit as a number over a size of the case."""
+    nested = (
+        validator
         for part in (annotation, *get_args(annotation))
-        for each in getattr(part, "__metadata__", ())
+        for validator in getattr(part, "__metadata__", ())
     )
-    return any(isinstance(each, OverUnit) for each in (*metadata, *within))
+    return any(isinstance(validator, OverUnit) for validator in (*metadata, *nested))
 
 
 def over_unit(annotation: Any, text: str, shell: Sized) -> float:
-    """The number that such a field makes of text with a unit.
+    """Return the number that such a field makes of text with a unit.
 
     Raises
     ------
@@ -488,6 +505,7 @@ def over_unit(annotation: Any, text: str, shell: Sized) -> float:
         If it is none, of another dimension, or the shell lacks what it needs.
     """
     try:
-        return float(TypeAdapter(annotation).validate_python(text, context={"given": given(shell)}))
+        context = {"given": case_sizes(shell)}
+        return float(TypeAdapter(annotation).validate_python(text, context=context))
     except ValidationError as e:
         raise ValueError(e.errors()[0]["msg"].removeprefix("Value error, ")) from None

@@ -12,15 +12,14 @@ import yaml
 from magshell_fenicsx.platform.input_files import Files, read_bounded
 
 Location = tuple[str | int, ...]
-INSTEAD: dict[Location, str] = {
-    ("shell", "imperfections"): "defect"
-}  # a key of a setting -> the key beside it that it takes the place of
+# Key of a setting -> the key beside it that it replaces.
+REPLACED_KEYS: dict[Location, str] = {("shell", "imperfections"): "defect"}
 MERGE = "tag:yaml.org,2002:merge"  # of the key <<
-LARGEST, MOST_ENTRIES, DEEPEST = (
-    1_000_000,
-    10_000,
-    20,
-)  # bytes, keys and items, levels: far beyond any case
+
+# Far beyond any case.
+MAX_CASE_BYTES = 1_000_000
+MAX_ENTRIES = 10_000  # keys and items
+MAX_DEPTH = 20  # levels
 
 
 class CaseError(ValueError):
@@ -58,9 +57,9 @@ class Source:
     places
         Location of a key or item -> "file:line" or the `--set` that gave it.
     folder
-        Where the files that it names are.
+        Folder of the files that it names.
     files
-        The contents of these, each read once.
+        Contents of these files, each read once.
     """
 
     name: str
@@ -70,7 +69,7 @@ class Source:
     files: Files = field(default_factory=Files, compare=False)
 
     def place(self, location: Location) -> str:
-        """The place of a key, or of the innermost section around it."""
+        """Return the place of a key, or of the innermost section around it."""
         for length in range(len(location), 0, -1):
             if location[:length] in self.places:
                 return self.places[location[:length]]
@@ -86,14 +85,12 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
         If the file cannot be read, is no YAML mapping, or has a key twice, or a setting is none.
     """
     try:
-        text = read_bounded(file, LARGEST).decode("utf-8")
+        text = read_bounded(file, MAX_CASE_BYTES).decode("utf-8")
     except OSError as e:
-        large = e.errno == EFBIG
-        raise CaseError(
-            f"{file}: is larger than {LARGEST} bytes, too large for a case file"
-            if large
-            else f"{file}: cannot be read: {e.strerror}"
-        ) from None
+        problem = f"cannot be read: {e.strerror}"
+        if e.errno == EFBIG:
+            problem = f"is larger than {MAX_CASE_BYTES} bytes, too large for a case file"
+        raise CaseError(f"{file}: {problem}") from None
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     source = Source(str(file), {}, folder=file.parent.absolute())
@@ -102,7 +99,7 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
         raise CaseError(
             f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)"
         )
-    _walk(node, (), source)
+    _note_places(node, (), source)
     data = _parsed(source, lambda: _Loader(text).get_single_data())
     if not isinstance(data, dict):  # an explicit tag can make anything of a mapping
         raise CaseError(
@@ -115,28 +112,27 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
 
 
 def _parsed(source: Source, parse: Callable[[], Any]) -> Any:
-    """What PyYAML makes of a text, its many kinds of failure made one."""
+    """Return what PyYAML parses; raise a `CaseError` for each of its many kinds of failure."""
     try:
         return parse()
     except yaml.YAMLError as e:
         mark = getattr(e, "problem_mark", None)
-        where = f"{source.name}:{mark.line + 1}" if mark else source.name
-        said = getattr(e, "problem", None) or getattr(e, "reason", e)
-        raise CaseError(f"{where}: not valid YAML: {said}") from None
+        place = f"{source.name}:{mark.line + 1}" if mark else source.name
+        problem = getattr(e, "problem", None) or getattr(e, "reason", e)
+        raise CaseError(f"{place}: not valid YAML: {problem}") from None
     except RecursionError:
         raise CaseError(f"{source.name}: not valid YAML: it is nested too deeply") from None
-    except (
-        Exception
-    ) as e:  # a value that its explicit tag (!!timestamp, !!int) does not fit: any kind
+    except Exception as e:
+        # A value that does not fit its explicit tag, such as !!timestamp or !!int.
         raise CaseError(f"{source.name}: not valid YAML: {type(e).__name__}: {e}") from None
 
 
-def _walk(node: yaml.Node, location: Location, source: Source) -> None:
-    """Note the places of all keys and items; refuse what would grow without end, as aliases can."""
-    if len(source.places) > MOST_ENTRIES or len(location) > DEEPEST:
+def _note_places(node: yaml.Node, location: Location, source: Source) -> None:
+    """Note the places of all keys and items; refuse endless data, which aliases can make."""
+    if len(source.places) > MAX_ENTRIES or len(location) > MAX_DEPTH:
         raise CaseError(
-            f"{source.name}:{node.start_mark.line + 1}: more than {MOST_ENTRIES} entries, or deeper than {DEEPEST} "
-            "levels, are no case file (does an alias hold itself?)"
+            f"{source.name}:{node.start_mark.line + 1}: more than {MAX_ENTRIES} entries, or deeper "
+            f"than {MAX_DEPTH} levels, are no case file (does an alias hold itself?)"
         )
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
@@ -147,11 +143,11 @@ def _walk(node: yaml.Node, location: Location, source: Source) -> None:
             if inner in source.places:
                 raise CaseError(f"{place}: {dotted(inner)} is given twice")
             source.places[inner] = place
-            _walk(value, inner, source)
+            _note_places(value, inner, source)
     elif isinstance(node, yaml.SequenceNode):
         for i, value in enumerate(node.value):
             source.places[*location, i] = f"{source.name}:{value.start_mark.line + 1}"
-            _walk(value, (*location, i), source)
+            _note_places(value, (*location, i), source)
 
 
 def override(source: Source, assignment: str) -> None:
@@ -181,17 +177,15 @@ def override(source: Source, assignment: str) -> None:
             raise CaseError(f"--set {assignment}: {keys[i - 1]} is a value, not a section")
         location.append(int(key) if isinstance(section, list) else key)
         if i < len(keys) - 1:
-            section = (
-                section[int(key)] if isinstance(section, list) else section.setdefault(key, {})
-            )
-    given = Source(f"--set {assignment}", {})
-    _walk(
-        _parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""),
-        (),
-        given,
-    )
-    section[location[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
-    replaced = INSTEAD.get(tuple(location), "")
+            if isinstance(section, list):
+                section = section[int(key)]
+            else:
+                section = section.setdefault(key, {})
+    setting = Source(f"--set {assignment}", {})
+    node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
+    _note_places(node or yaml.ScalarNode("", ""), (), setting)
+    section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
+    replaced = REPLACED_KEYS.get(tuple(location), "")
     if not source.places.get((*location[:-1], replaced), "--set").startswith("--set"):
         section.pop(replaced, None)
     for length in range(1, len(keys) + 1):
@@ -200,5 +194,5 @@ def override(source: Source, assignment: str) -> None:
 
 
 def dotted(location: Location) -> str:
-    """shell.defect.width"""
+    """Return a location as text, such as shell.defect.width."""
     return ".".join(str(key) for key in location)

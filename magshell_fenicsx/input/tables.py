@@ -18,8 +18,11 @@ from magshell_fenicsx.platform.input_files import Files, npz_arrays, table_text
 
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")  # x, x [mm] or x (mm)
-LARGEST, MOST_POINTS = 200_000_000, 200_000  # bytes, control points
-GREATEST = 1e30  # measured number; squares of numbers that are larger have no finite sum
+MAX_TABLE_BYTES = 200_000_000
+MAX_CONTROL_POINTS = 200_000
+MAX_MEASURED_NUMBER = 1e30  # squares of larger numbers have no finite sum
+
+# Columns of files of vectors, by dimension.
 PLACES = {3: ("x", "y", "z"), 2: ("rho", "z")}
 VECTORS = {3: ("bx", "by", "bz"), 2: ("b_rho", "b_z")}
 
@@ -38,13 +41,13 @@ class TableRows:
 
 
 @dataclass(frozen=True)
-class _Cells:
+class _TableCells:
     """The cells of a file as numbers, nan where there is none.
 
     Attributes
     ----------
     lines
-        That of each row; empty of arrays.
+        Line of each row in the file; empty of arrays.
     word
         The first cell that has text in place of a number, as a message has it; "" without.
     """
@@ -55,7 +58,7 @@ class _Cells:
 
 
 def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, str | None]]:
-    """The columns of a CSV file or the arrays of an .npz file, and their units, by name.
+    """Return the columns of a CSV file or the arrays of an .npz file, and their units, by name.
 
     Raises
     ------
@@ -66,7 +69,7 @@ def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, st
 
 
 def read_rows(file: Path, files: Files) -> TableRows:
-    """Return the same of measured rows, in which a cell is a number, or without one (empty or nan).
+    """Return the measured rows of a file, whose cells are numbers, empty or nan.
 
     Raises
     ------
@@ -82,33 +85,37 @@ def read_rows(file: Path, files: Files) -> TableRows:
         raise TableError("its arrays have different lengths")
     lines = cells.lines or range(1, 1 + next(iter(lengths))[0])
     for name, column in columns.items():
-        for row in np.flatnonzero(np.abs(column) > GREATEST)[:1]:
+        for row in np.flatnonzero(np.abs(column) > MAX_MEASURED_NUMBER)[:1]:
             raise TableError(
-                f"line {lines[row]}: {name}: {column[row]:g}: allowed are numbers up to {GREATEST:g} in size"
+                f"line {lines[row]}: {name}: {column[row]:g}: allowed are numbers up to "
+                f"{MAX_MEASURED_NUMBER:g} in size"
             )
     return TableRows(columns, units, lines)
 
 
-def _cells(file: Path, files: Files) -> _Cells:
+def _cells(file: Path, files: Files) -> _TableCells:
     try:
         content = files.content(file)
     except OSError as e:
         raise TableError(f"cannot be read: {e.strerror or e}") from None
-    if len(content) > LARGEST:
-        raise TableError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
+    if len(content) > MAX_TABLE_BYTES:
+        raise TableError(f"is larger than {MAX_TABLE_BYTES // 1_000_000} MB; leave out rows")
     try:
-        return _Cells(npz_arrays(content)) if file.suffix == ".npz" else _csv_cells(table_text(content))
+        if file.suffix == ".npz":
+            return _TableCells(npz_arrays(content))
+        return _csv_cells(table_text(content))
     except TableError:
         raise
     except (ValueError, csv.Error) as e:
         raise TableError(str(e)) from None
 
 
-def _by_name(cells: _Cells) -> tuple[dict[str, Array], dict[str, str | None]]:
-    named = [_name_and_unit(header) for header in cells.columns]
-    _refuse_double([name for name, _ in named])
+def _by_name(cells: _TableCells) -> tuple[dict[str, Array], dict[str, str | None]]:
+    """Return columns and units by the names in the headers."""
+    headers = [_name_and_unit(header) for header in cells.columns]
+    _refuse_double([name for name, _ in headers])
     values = [np.asarray(v, dtype=float) for v in cells.columns.values()]
-    return {name: v for (name, _), v in zip(named, values, strict=True)}, dict(named)
+    return {name: v for (name, _), v in zip(headers, values, strict=True)}, dict(headers)
 
 
 def _refuse_double(names: Sequence[str]) -> None:
@@ -116,23 +123,29 @@ def _refuse_double(names: Sequence[str]) -> None:
         raise TableError(f"has a column twice: {shorten(', '.join(names), 200)}")
 
 
-def column_size(name: str, unit: str, of: str) -> float:
-    """What one of a column's unit is in another, such as metre or tesla.
+def column_size(name: str, unit: str, target_unit: str) -> float:
+    """Return the size of a column's unit in another unit, such as metre or tesla.
 
     Raises
     ------
     TableError
-        If it is none of that dimension.
+        If the unit has another dimension.
     """
     try:
-        return float(in_units(of, bare=True)(unit))
+        return float(in_units(target_unit, bare=True)(unit))
     except ValueError as e:
         raise TableError(f"column {name}: its unit {unit} {e}") from None
 
 
 def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Array, Array]:
-    """Places (n, 3) and vectors (n, 3), or both (n, 2), of a CSV file with the columns x, y, z, bx,
-    by, bz or rho, z, b_rho, b_z.
+    """Return the places and vectors of a CSV file.
+
+    Its columns are x, y, z, bx, by, bz or rho, z, b_rho, b_z.
+
+    Returns
+    -------
+    tuple
+        Places and vectors, both (n, 3) or both (n, 2).
 
     Raises
     ------
@@ -157,7 +170,7 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
 
 
 def write_vectors(file: Path, places: Array, vectors: Array) -> None:
-    """Write such a file, with all digits."""
+    """Write a CSV file of places and vectors, see `read_vectors`, with all digits."""
     dim = places.shape[1]
     lines = [",".join((*PLACES[dim], *VECTORS[dim]))]
     lines += [",".join(repr(float(v)) for v in row) for row in np.hstack([places, vectors])]
@@ -178,9 +191,10 @@ def _points_and_vectors(
         ).reshape(-1, 2 * dim)
     except (ValueError, IndexError):
         raise CaseError(f"{key}: {file}: has a row without a number in each column") from None
-    if not 0 < len(values) <= MOST_POINTS or not np.isfinite(values).all():
+    if not 0 < len(values) <= MAX_CONTROL_POINTS or not np.isfinite(values).all():
         raise CaseError(
-            f"{key}: {file}: has {len(values)} rows of numbers; allowed are 1 to {MOST_POINTS}, all finite"
+            f"{key}: {file}: has {len(values)} rows of numbers; allowed are 1 to "
+            f"{MAX_CONTROL_POINTS}, all finite"
         )
     return values[:, :dim], values[:, dim:]
 
@@ -190,16 +204,16 @@ def _name_and_unit(header: str) -> tuple[str, str | None]:
     return (parts[1], parts[2]) if parts else (header, None)
 
 
-def _csv_cells(text: str) -> _Cells:
+def _csv_cells(text: str) -> _TableCells:
     header, begin = _header(text)
-    mark, names = _mark(header), _names(header)
+    separator, names = _separator(header), _names(header)
     _refuse_double(names)
     values, lines, word = array("d"), list[int](), ""
-    for line, row in _rows(text, mark, begin):
+    for line, row in _rows(text, separator, begin):
         if len(row) != len(names):
             raise TableError(
-                f"has {len(names)} names in its header and {len(row)} columns in line {line}: every row "
-                "has as many cells as the header, and decimal points"
+                f"has {len(names)} names in its header and {len(row)} columns in line {line}: every "
+                "row has as many cells as the header, and decimal points"
             )
         for name, cell in zip(names, row, strict=True):
             value = _number(cell)
@@ -213,12 +227,14 @@ def _csv_cells(text: str) -> _Cells:
     if not lines:
         raise TableError("has no rows of numbers below a header with the names of its columns")
     rows = np.array(values).reshape(-1, len(names))
-    return _Cells(dict(zip(names, rows.T, strict=True)), lines, word)
+    return _TableCells(dict(zip(names, rows.T, strict=True)), lines, word)
 
 
 def _header(text: str) -> tuple[str, int]:
-    """The line with the names, and its number: the first one without a #, or a comment above it if
-    that has numbers."""
+    """Return the line with the names, and its number.
+
+    It is the first line without a #, or a comment above it if that line has numbers.
+    """
     comments = list[tuple[str, int]]()
     for number, line in enumerate(io.StringIO(text), 1):
         bare = line.strip()
@@ -227,28 +243,28 @@ def _header(text: str) -> tuple[str, int]:
         elif bare:
             cells = [cell for cell in re.split(r"[;,\s]+", bare.replace('"', "")) if cell]
             if comments and any(_number(cell) is not None for cell in cells):
-                return max(comments, key=lambda each: len(_names(each[0])) == len(cells))
+                return max(comments, key=lambda comment: len(_names(comment[0])) == len(cells))
             return bare, number
     return "", 0
 
 
-def _mark(header: str) -> str | None:
+def _separator(header: str) -> str | None:
     """Return what separates columns; None for blanks."""
     return next((mark for mark in (";", "\t", ",") if mark in header), None)
 
 
 def _names(header: str) -> list[str]:
-    if mark := _mark(header):
-        return [cell.strip() for cell in next(csv.reader([header], delimiter=mark))]
+    if separator := _separator(header):
+        return [cell.strip() for cell in next(csv.reader([header], delimiter=separator))]
     return re.findall(r"[\w.]+(?:\s*[\[(][^\])]*[\])])?", header)
 
 
-def _rows(text: str, mark: str | None, begin: int) -> Iterator[tuple[int, list[str]]]:
-    """Lines below that of the header as rows of cells, without comments and what is empty."""
+def _rows(text: str, separator: str | None, begin: int) -> Iterator[tuple[int, list[str]]]:
+    """Iterate over rows of cells below the header, without comments and empty rows."""
     numbered = enumerate(io.StringIO(text), 1)
     bare = (line.partition("#")[0] if number > begin else "" for number, line in numbered)
-    if mark:
-        reader = csv.reader(bare, delimiter=mark)
+    if separator:
+        reader = csv.reader(bare, delimiter=separator)
         rows = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
     else:
         rows = ((i, line.replace('"', "").split()) for i, line in enumerate(bare, 1))

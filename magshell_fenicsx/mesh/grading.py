@@ -1,4 +1,9 @@
-"""Element size over a surface: small where the solution varies over the length sqrt(Rh)."""
+"""Element size over a surface: small where the solution varies over the length sqrt(Rh).
+
+A `Grading` is the least size that its features ask for: discs, rings, lines and squares of a chart
+with small elements, which grow away from there. It gives the size at a point, the distance of grid
+lines, and an estimate of the number of triangles. Lengths are over R.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,44 +14,51 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape
+from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape
 
-Size = Callable[[NDArray[np.float64]], float]
+Array = NDArray[np.float64]
+Size = Callable[[Array], float]
 PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
-# of the size, from where triangles are seen to take theirs: sizes grow, and they do not overshoot
-# them
-TOWARDS = 0.4
-ALIKE, ENOUGH = (
-    0.5,
-    1e-5,
-)  # parts whose numbers of triangles differ less, over their own and over all, are not divided
-MOST_PARTS, MOST_SIZES = (
-    1000,
-    5_000_000,
-)  # parts of an estimate, and sizes that they need from all features
+# distance over the size, at which triangles are seen to take their size: sizes grow, and triangles
+# do not overshoot them
+SIZE_SAMPLING_DISTANCE = 0.4
+# cells of an estimate are not divided whose triangles differ less over their own number, or over
+# that of all
+CELL_TOLERANCE, TOTAL_TOLERANCE = 0.5, 1e-5
+MIN_CELL_BUDGET = 1000  # cells that any estimate may have
+MAX_SIZE_EVALUATIONS = 5_000_000  # of single features in an estimate
+STANDARD_GROWTH = 0.4  # of the size per distance
+RADIAL_CELLS, ANGULAR_CELLS = 8, 24  # first cells of the estimate of a disc
+CELLS_OF_REACH = 8  # first cells of the estimate of other shapes, along their extent
 
 
 class Feature(Protocol):
-    """A place with small elements around it."""
+    """A place in a chart with small elements around it."""
 
     @property
     def size(self) -> float:
-        """The smallest."""
+        """The least element size."""
 
-    def across(self, axis: int, x: float) -> float:
-        """Wanted distance of grid lines across an axis, at a coordinate."""
+    def line_spacing(self, axis: int, x: float) -> float:
+        """Return the largest distance of grid lines across an axis, at a coordinate."""
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
-        """Wanted element size at a point of the chart."""
+    def __call__(self, x: Array) -> float:
+        """Return the largest element size at a point (2,) of the chart."""
 
-    def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Bounds of the sizes at most `away` (n,) from points (n, 2): the largest, of negative ones
-        the least.
+    def size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes near points.
+
+        Parameters
+        ----------
+        x
+            (n, 2) points of the chart.
+        distance
+            (n,); positive: the largest size at most so far from the point, negative: the least.
         """
 
 
 @dataclass(frozen=True)
-class Disc:
+class DiscFeature:
     """Elements of `size` within `radius` of `centre` (chart coordinates), growing outside."""
 
     centre: tuple[float, float]
@@ -54,94 +66,105 @@ class Disc:
     size: float
     growth: float
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
+    def __call__(self, x: Array) -> float:
         distance = np.hypot(x[0] - self.centre[0], x[1] - self.centre[1])
         return float(self.size + self.growth * max(0.0, distance - self.radius))
 
-    def across(self, axis: int, x: float) -> float:
+    def line_spacing(self, axis: int, x: float) -> float:
         return self.size + self.growth * max(0.0, abs(x - self.centre[axis]) - self.radius)
 
-    def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        beyond = np.hypot(x[:, 0] - self.centre[0], x[:, 1] - self.centre[1]) - self.radius + away
-        return np.asarray(self.size + self.growth * np.maximum(beyond, 0.0))
+    def size_bound(self, x: Array, distance: Array) -> Array:
+        from_centre = np.hypot(x[:, 0] - self.centre[0], x[:, 1] - self.centre[1])
+        from_disc = from_centre - self.radius + distance
+        return np.asarray(self.size + self.growth * np.maximum(from_disc, 0.0))
 
     def cells(self, reach: float) -> float:
-        """Number up to the distance `reach`: the integral of 2 pi t/(s + g max(0, t - a))^2 over t.
+        """Return the number of triangles up to a distance from the centre.
 
-        a is the radius or, if that is less, the reach.
+        It is the integral of 2 pi t/(s + g max(0, t - a))^2 over t up to `reach`, with the size s,
+        the growth g and the radius a or, if that is less, the reach.
         """
         s, g, a = self.size, self.growth, min(self.radius, reach)
         outer = g * (reach - a) / s
-        around = (
-            2
-            * pi
-            * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - outer / (1 + outer)) / g**2)
-        )
-        return PER_AREA * (pi * a**2 / s**2 + around)
+        ratio = outer / (1 + outer)
+        outside = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - ratio) / g**2)
+        return PER_AREA * (pi * a**2 / s**2 + outside)
 
 
 @dataclass(frozen=True)
-class Squares:
-    """Elements of some sizes (n,) within squares with `centres` (n, 2) and half sides (n,), growing
-    outside.
+class SquaresFeature:
+    """Elements of given sizes within squares, growing outside.
+
+    Attributes
+    ----------
+    centres
+        (n, 2) of the squares, in the chart.
+    halves
+        (n,) half their sides.
+    sizes
+        (n,) element sizes.
+    growth
+        Growth of the size per distance.
     """
 
-    centres: NDArray[np.float64]
-    halves: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    growth: float = 0.4
+    centres: Array
+    halves: Array
+    sizes: Array
+    growth: float = STANDARD_GROWTH
 
     @property
     def size(self) -> float:
         return float(self.sizes.min())
 
-    def finer(self, refinement: float) -> "Squares":
-        """With elements that are smaller by a factor."""
+    def finer(self, refinement: float) -> "SquaresFeature":
+        """Return the squares with elements that are smaller by a factor."""
         return replace(self, sizes=np.asarray(self.sizes / refinement, dtype=np.float64))
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
-        away = np.maximum(np.abs(x - self.centres) - self.halves[:, None], 0.0)
-        return float((self.sizes + self.growth * np.hypot(*away.T)).min())
+    def __call__(self, x: Array) -> float:
+        offsets = np.maximum(np.abs(x - self.centres) - self.halves[:, None], 0.0)
+        return float((self.sizes + self.growth * np.hypot(*offsets.T)).min())
 
-    def across(self, axis: int, x: float) -> float:
-        away = np.maximum(np.abs(x - self.centres[:, axis]) - self.halves, 0.0)
-        return float((self.sizes + self.growth * away).min())
+    def line_spacing(self, axis: int, x: float) -> float:
+        distances = np.maximum(np.abs(x - self.centres[:, axis]) - self.halves, 0.0)
+        return float((self.sizes + self.growth * distances).min())
 
-    def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        beyond = np.abs(x[:, None] - self.centres) - self.halves[:, None]
-        inwards = np.minimum(beyond.max(axis=-1), 0.0)
-        beyond = np.hypot(*np.moveaxis(np.maximum(beyond, 0.0), -1, 0)) + inwards + away[:, None]
-        return np.asarray((self.sizes + self.growth * np.maximum(beyond, 0.0)).min(axis=1))
+    def size_bound(self, x: Array, distance: Array) -> Array:
+        offsets = np.abs(x[:, None] - self.centres) - self.halves[:, None]
+        depth = np.minimum(offsets.max(axis=-1), 0.0)
+        outside = np.hypot(*np.moveaxis(np.maximum(offsets, 0.0), -1, 0))
+        from_squares = outside + depth + distance[:, None]
+        return np.asarray((self.sizes + self.growth * np.maximum(from_squares, 0.0)).min(axis=1))
 
     def cells(self, reach: float) -> float:
-        """Those in the squares, and around a disc of their area."""
+        """Return the number of triangles in the squares, and around a disc of their area."""
         area, s, g = 4 * self.halves**2, self.size, self.growth
-        disc = Disc((0.0, 0.0), sqrt(float(area.sum()) / pi), s, g)
-        within = Disc((0.0, 0.0), disc.radius, s, g).cells(min(disc.radius, reach))
-        return float(PER_AREA * (area / self.sizes**2).sum() + max(disc.cells(reach) - within, 0.0))
+        disc = DiscFeature((0.0, 0.0), sqrt(float(area.sum()) / pi), s, g)
+        cells_within = DiscFeature((0.0, 0.0), disc.radius, s, g).cells(min(disc.radius, reach))
+        cells_outside = max(disc.cells(reach) - cells_within, 0.0)
+        return float(PER_AREA * (area / self.sizes**2).sum() + cells_outside)
 
 
 @dataclass(frozen=True)
-class Ring:
+class RingFeature:
     """Elements of `size` at the distance `radius` from the origin of the chart, growing away."""
 
     radius: float
     size: float
     growth: float
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
+    def __call__(self, x: Array) -> float:
         return float(self.size + self.growth * abs(np.hypot(x[0], x[1]) - self.radius))
 
-    def across(self, axis: int, x: float) -> float:
+    def line_spacing(self, axis: int, x: float) -> float:
         return inf  # a ring belongs to discs, which are no grids
 
-    def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        beyond = np.abs(np.hypot(x[:, 0], x[:, 1]) - self.radius) + away
-        return np.asarray(self.size + self.growth * np.maximum(beyond, 0.0))
+    def size_bound(self, x: Array, distance: Array) -> Array:
+        from_ring = np.abs(np.hypot(x[:, 0], x[:, 1]) - self.radius) + distance
+        return np.asarray(self.size + self.growth * np.maximum(from_ring, 0.0))
 
 
 @dataclass(frozen=True)
-class Line:
+class LineFeature:
     """Elements of `size` at the line x[axis] = place of a grid, growing away."""
 
     axis: int
@@ -149,104 +172,107 @@ class Line:
     size: float
     growth: float
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
-        return self.across(self.axis, float(x[self.axis]))
+    def __call__(self, x: Array) -> float:
+        return self.line_spacing(self.axis, float(x[self.axis]))
 
-    def across(self, axis: int, x: float) -> float:
+    def line_spacing(self, axis: int, x: float) -> float:
         return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
 
-    def bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(
-            self.size + self.growth * np.maximum(np.abs(x[:, self.axis] - self.place) + away, 0.0)
-        )
+    def size_bound(self, x: Array, distance: Array) -> Array:
+        from_line = np.abs(x[:, self.axis] - self.place) + distance
+        return np.asarray(self.size + self.growth * np.maximum(from_line, 0.0))
 
 
 @dataclass(frozen=True)
 class Grading:
-    """The smallest size of all features, at most `largest`."""
+    """The least size of all features, at most `largest`."""
 
     features: Sequence[Feature]
     largest: float
 
-    def __call__(self, x: NDArray[np.float64]) -> float:
-        centre, radius, size, growth = self._discs
-        around = size + growth * np.maximum(0.0, np.hypot(*(x - centre).T) - radius)
-        others = (feature(x) for feature in self.features if not isinstance(feature, Disc))
-        return float(min([self.largest, around.min(initial=inf), *others]))
+    def __call__(self, x: Array) -> float:
+        centres, radii, sizes, growths = self._discs
+        distances = np.maximum(0.0, np.hypot(*(x - centres).T) - radii)
+        of_discs = sizes + growths * distances
+        others = (feature(x) for feature in self.features if not isinstance(feature, DiscFeature))
+        return float(min([self.largest, of_discs.min(initial=inf), *others]))
 
     @cached_property
-    def _discs(self) -> tuple[NDArray[np.float64], ...]:
-        """Centres (n, 2), radii, sizes and growths (n,): there may be hundreds."""
-        discs = [f for f in self.features if isinstance(f, Disc)]
-        numbers = (
-            np.array([[*f.centre, f.radius, f.size, f.growth] for f in discs]).reshape(-1, 5).T
-        )
-        return numbers[:2].T, *numbers[2:]
+    def _discs(self) -> tuple[Array, ...]:
+        """Centres (n, 2), radii, sizes and growths (n,) of the discs: there may be hundreds."""
+        discs = [f for f in self.features if isinstance(f, DiscFeature)]
+        rows = np.array([[*f.centre, f.radius, f.size, f.growth] for f in discs]).reshape(-1, 5)
+        columns = rows.T
+        return columns[:2].T, *columns[2:]
 
-    def across(self, axis: int, x: float) -> float:
-        """Wanted distance of grid lines, see `Feature`."""
-        return min([self.largest, *(feature.across(axis, x) for feature in self.features)])
+    def line_spacing(self, axis: int, x: float) -> float:
+        """Return the largest distance of grid lines across an axis, at a coordinate."""
+        return min([self.largest, *(feature.line_spacing(axis, x) for feature in self.features)])
 
-    def cells(self, shape: Shape) -> float:
-        """Approximate number of triangles in a shape: the integral of one over the square of the
-        least size.
+    def cells(self, shape: PlaneShape) -> float:
+        """Return the approximate number of triangles in a shape.
 
-        Over parts of the shape, which are divided until the sizes in each are nearly alike.
+        It is the integral of one over the square of the size, over cells of the shape that are
+        divided until the size varies little in each.
         """
-        most = max(
-            MOST_PARTS,
-            MOST_SIZES
-            // max(1, sum(len(f.halves) if isinstance(f, Squares) else 1 for f in self.features)),
+        feature_count = sum(
+            len(f.halves) if isinstance(f, SquaresFeature) else 1 for f in self.features
         )
-        parts, cells = _Parts.first(shape), 0.0
+        budget = max(MIN_CELL_BUDGET, MAX_SIZE_EVALUATIONS // max(1, feature_count))
+        parts, total = _EstimateCells.of_shape(shape), 0.0
         while len(parts.low):
-            x, area, away = parts.measured()
-            sizes, largest, least = (self._bound(x, factor * away) for factor in (0.0, 1.0, -1.0))
-            now = area / self._bound(x, -TOWARDS * sizes) ** 2
-            rough = area / least**2 - area / largest**2
-            again = (rough > ALIKE * now) & (rough > ENOUGH * (cells + now.sum()))
-            if again.sum() * 4 > most:
-                again[:] = False
-            cells += float(now[~again].sum())
-            parts, most = parts.quarters(again), most - len(again)
-        return PER_AREA * cells + 2 * shape.reach / self.largest  # of a thin strip
+            x, area, radius = parts.centres_areas_radii()
+            sizes, max_sizes, min_sizes = (
+                self._size_bound(x, factor * radius) for factor in (0.0, 1.0, -1.0)
+            )
+            triangles = area / self._size_bound(x, -SIZE_SAMPLING_DISTANCE * sizes) ** 2
+            uncertainty = area / min_sizes**2 - area / max_sizes**2
+            divided = (uncertainty > CELL_TOLERANCE * triangles) & (
+                uncertainty > TOTAL_TOLERANCE * (total + triangles.sum())
+            )
+            if divided.sum() * 4 > budget:
+                divided[:] = False
+            total += float(triangles[~divided].sum())
+            parts, budget = parts.quarters(divided), budget - len(divided)
+        along_thin_strip = 2 * shape.reach / self.largest
+        return PER_AREA * total + along_thin_strip
 
-    def _bound(self, x: NDArray[np.float64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Feature`; of all of them."""
+    def _size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes of all features, see `Feature.size_bound`."""
         sizes = np.full(len(x), self.largest)
         for feature in self.features:
-            np.minimum(sizes, feature.bound(x, away), out=sizes)
+            np.minimum(sizes, feature.size_bound(x, distance), out=sizes)
         return sizes
 
 
 @dataclass(frozen=True)
-class _Parts:
-    """Parts of a shape between coordinates `low` and `high` (n, 2): of a disc polar ones, else
-    those of the chart.
+class _EstimateCells:
+    """Rectangular cells of a shape between coordinates `low` and `high` (n, 2).
+
+    The coordinates of a disc are `polar`: radius and angle. Else they are those of the chart.
     """
 
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    low: Array
+    high: Array
     polar: bool
 
     @classmethod
-    def first(cls, shape: Shape) -> "_Parts":
+    def of_shape(cls, shape: PlaneShape) -> "_EstimateCells":
         polar = isinstance(shape, DiscShape)
         low, high = shape.box
-        number = (
-            (8, 12 if shape.half else 24)
-            if polar
-            else np.maximum(1, np.ceil(8 * (high - low) / shape.reach))
-        )
-        t = [np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, number, strict=True)]
+        if polar:
+            counts = np.array([RADIAL_CELLS, ANGULAR_CELLS // 2 if shape.half else ANGULAR_CELLS])
+        else:
+            counts = np.maximum(1, np.ceil(CELLS_OF_REACH * (high - low) / shape.reach))
+        t = [np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, counts, strict=True)]
         low, high = (
-            np.stack(np.meshgrid(*each, indexing="ij"), axis=-1).reshape(-1, 2)
-            for each in ([v[:-1] for v in t], [v[1:] for v in t])
+            np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+            for axes in ([v[:-1] for v in t], [v[1:] for v in t])
         )
         return cls(low, high, polar)
 
-    def measured(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Their centres in the chart (n, 2), areas, and largest distances from the centres (n,)."""
+    def centres_areas_radii(self) -> tuple[Array, Array, Array]:
+        """Return centres in the chart (n, 2), areas, and distances of the corners (n,)."""
         middle, (width, height) = (self.low + self.high) / 2, (self.high - self.low).T
         if not self.polar:
             return middle, width * height, np.hypot(width, height) / 2
@@ -254,8 +280,8 @@ class _Parts:
         x = r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         return x, r * width * height, np.hypot(width, self.high[:, 0] * height) / 2
 
-    def quarters(self, chosen: NDArray[np.bool_]) -> "_Parts":
-        """Those of some."""
-        low, half = self.low[chosen], (self.high - self.low)[chosen] / 2
+    def quarters(self, divided: NDArray[np.bool_]) -> "_EstimateCells":
+        """Return the four quarters of each of some cells."""
+        low, half = self.low[divided], (self.high - self.low)[divided] / 2
         low = np.concatenate([low + half * corner for corner in ([0, 0], [0, 1], [1, 0], [1, 1])])
-        return _Parts(low, low + np.tile(half, (4, 1)), self.polar)
+        return _EstimateCells(low, low + np.tile(half, (4, 1)), self.polar)

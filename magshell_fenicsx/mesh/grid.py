@@ -1,5 +1,7 @@
-"""A grid of quadrilaterals on a rectangular chart, each cut into four triangles; opposite sides may
-be glued.
+"""Triangulated grids: quadrilaterals on a rectangular chart, each divided into four triangles.
+
+Opposite sides may be one line of the surface: their nodes are then glued. Grid lines pass through
+the named points; lines that nearly coincide are one line, which is bent to the points.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,19 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.distinct import NEAR, grouped_by_distance
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
-from magshell_fenicsx.mesh.shapes import Faces, Glued, within
+from magshell_fenicsx.mesh.shapes import Faces, GluedSides, faces_within
+from magshell_fenicsx.mesh.vertex_spacing import MIN_VERTEX_DISTANCE, grouped_by_distance
 
 Array = NDArray[np.float64]
-Side = tuple[str, int, int]  # name, axis across it, and which end of that axis
-CLOSE = 1e-9  # over the chart's extent
-SAMPLES = 2001  # of a size that varies
+CHART_TOLERANCE = 1e-9  # over the chart's extent: coordinates that differ by rounding
+COUNT_TOLERANCE = 1e-6  # of a number of quadrilaterals, which is rounded up
+SIZE_SAMPLES = 2001  # of a size that varies, along an axis
+MIN_GLUED_COUNT = 3  # quadrilaterals around: with fewer, the glued mesh would be degenerate
 
 
 @dataclass(frozen=True)
 class Grid:
-    """low <= (x, y) <= high.
+    """The rectangle low <= (x, y) <= high of a chart, and the size of its quadrilaterals.
 
     Attributes
     ----------
@@ -34,10 +37,10 @@ class Grid:
         Names of x = low, x = high, y = low and y = high.
     glued
         Whether the two ends of each axis are one line of the surface.
-    through
+    fixed_lines
         Coordinates across each axis at which there is a straight grid line.
-    movable
-        Coordinates at which there is one too, that near places may draw to themselves.
+    movable_lines
+        Coordinates at which there is one too, which is moved to places nearby.
     """
 
     low: tuple[float, float]
@@ -45,113 +48,123 @@ class Grid:
     size: float | Callable[[int, float], float]
     sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
     glued: tuple[bool, bool] = (False, False)
-    through: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
-    movable: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    fixed_lines: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    movable_lines: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def edges(self) -> tuple[str, ...]:
         """Names of the surface's edges: the sides that are not glued."""
-        return tuple(
-            dict.fromkeys(name for i, name in enumerate(self.sides) if not self.glued[i // 2])
-        )
+        names = (name for i, name in enumerate(self.sides) if not self.glued[i // 2])
+        return tuple(dict.fromkeys(names))
 
     @property
     def corners(self) -> Array:
         """Chart coordinates (4, 2) of the corners."""
-        return np.array(
-            [[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])]
-        )
+        (x0, y0), (x1, y1) = self.low, self.high
+        return np.array([[x, y] for x in (x0, x1) for y in (y0, y1)])
 
     @property
     def cells(self) -> float:
         """Approximate number of triangles."""
-        quadrilaterals = [max(self._counts[axis][1][-1], 1.0) for axis in range(2)]
-        return float(4 * quadrilaterals[0] * quadrilaterals[1])
+        counts = [max(self._counts[axis][1][-1], 1.0) for axis in range(2)]
+        return float(4 * counts[0] * counts[1])
 
     @cached_property
     def _counts(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Of both axes: see `_counted`."""
-        return self._counted(0), self._counted(1)
+        """Numbers of quadrilaterals along both axes, see `_cumulative_count`."""
+        return self._cumulative_count(0), self._cumulative_count(1)
 
-    def _counted(self, axis: int) -> tuple[Array, Array]:
-        """Coordinates across an axis, and the number of sides of quadrilaterals up to each of them."""
+    def _cumulative_count(self, axis: int) -> tuple[Array, Array]:
+        """Return coordinates across an axis, and the number of quadrilaterals up to each."""
         low, high, size = self.low[axis], self.high[axis], self.size
         if not callable(size):
             return np.array([low, high]), np.array([0.0, (high - low) / size])
-        x = np.linspace(low, high, SAMPLES, dtype=np.float64)
+        x = np.linspace(low, high, SIZE_SAMPLES, dtype=np.float64)
         per_length = 1 / np.array([size(axis, float(c)) for c in x])
-        return x, np.concatenate(
-            [[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))]
-        )
+        steps = (per_length[1:] + per_length[:-1]) / 2 * np.diff(x)
+        return x, np.concatenate([[0.0], np.cumsum(steps)])
 
     def size_at(self, axis: int, x: float) -> float:
-        """Largest distance of grid lines across an axis, at a coordinate."""
+        """Return the largest distance of grid lines across an axis, at a coordinate."""
         return self.size(axis, x) if callable(self.size) else self.size
 
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
-        """Coordinates of the grid lines across an axis, with distances up to the size.
+        """Return the coordinates of the grid lines across an axis, with distances up to the size.
 
         One is at every point, or near it where points nearly have the same coordinate.
         """
         low, high = self.low[axis], self.high[axis]
-        straight = self._straight(axis)
-        movable = [middle for _, middle in self._groups(axis, points)]
-        given = np.unique([*straight, *movable])
-        given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
-        given[-1] = high
-        x, sides = self._counts[axis]
-        counts = np.interp(given, x, sides)
-        parts = [max(int(np.ceil(b - a - 1e-6)), 1) for a, b in pairwise(counts)]
-        if self.glued[axis] and sum(parts) < 3:
-            parts = [
-                max(n, -(-3 // len(parts))) for n in parts
-            ]  # with fewer, the glued mesh would be degenerate
-        inner = []
-        for a, b, n, first, last in zip(
-            given[:-1], given[1:], parts, counts[:-1], counts[1:], strict=True
-        ):
-            between = np.linspace(a, b, n + 1)[1:]
+        movable = [line for _, line in self._movable_groups(axis, points)]
+        required = np.unique([*self._straight_lines(axis), *movable])
+        is_new = np.diff(required) > CHART_TOLERANCE * (high - low)
+        required = required[np.concatenate([[True], is_new])]
+        required[-1] = high
+        x, cumulative_count = self._counts[axis]
+        counts = np.interp(required, x, cumulative_count)
+        intervals = [max(int(np.ceil(b - a - COUNT_TOLERANCE)), 1) for a, b in pairwise(counts)]
+        if self.glued[axis] and sum(intervals) < MIN_GLUED_COUNT:
+            least = -(-MIN_GLUED_COUNT // len(intervals))
+            intervals = [max(n, least) for n in intervals]
+        lines = [required[:1]]
+        for i, n in enumerate(intervals):
+            following = np.linspace(required[i], required[i + 1], n + 1)[1:]
             if callable(self.size):
-                between[:-1] = np.interp(np.linspace(first, last, n + 1)[1:-1], sides, x)
-            inner.append(between)
-        return np.concatenate([given[:1], *inner])
+                inner_counts = np.linspace(counts[i], counts[i + 1], n + 1)[1:-1]
+                following[:-1] = np.interp(inner_counts, cumulative_count, x)
+            lines.append(following)
+        return np.concatenate(lines)
 
-    def _straight(self, axis: int) -> Array:
-        """Coordinates of lines that stay where they are, both ends among them."""
+    def _straight_lines(self, axis: int) -> Array:
+        """Return the coordinates of lines that stay where they are, with both ends."""
         low, high = self.low[axis], self.high[axis]
-        lines = np.unique([low, high, *self.through[axis]])
-        return np.asarray(lines[np.concatenate([[True], np.diff(lines) > CLOSE * (high - low)])])
+        lines = np.unique([low, high, *self.fixed_lines[axis]])
+        is_new = np.diff(lines) > CHART_TOLERANCE * (high - low)
+        return np.asarray(lines[np.concatenate([[True], is_new])])
 
     def straight_line_at(self, axis: int, x: float) -> float | None:
-        """The straight line that a coordinate is too near to for a line of its own, or on; None if
-        there is none."""
-        straight = self._straight(axis)
-        nearest = float(straight[np.abs(straight - x).argmin()])
-        rounding = CLOSE * (self.high[axis] - self.low[axis])
-        return nearest if abs(nearest - x) <= max(rounding, NEAR * self.size_at(axis, x)) else None
+        """Return the straight line so near to a coordinate that this has no line of its own.
 
-    def _groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
-        """Groups of coordinates that are near each other, beside no straight line, and the line of
-        each."""
-        rounding = CLOSE * (self.high[axis] - self.low[axis])
-        given = np.unique([*(float(x[axis]) for x in points), *self.movable[axis]])
-        free = np.array([x for x in given if self.straight_line_at(axis, float(x)) is None])
-        groups = grouped_by_distance(free, lambda x: self.size_at(axis, x), rounding)
-        return [(g, float(g[0] if np.ptp(g) <= rounding else (g[0] + g[-1]) / 2)) for g in groups]
+        None if there is none.
+        """
+        lines = self._straight_lines(axis)
+        nearest = float(lines[np.abs(lines - x).argmin()])
+        rounding = CHART_TOLERANCE * (self.high[axis] - self.low[axis])
+        min_distance = max(rounding, MIN_VERTEX_DISTANCE * self.size_at(axis, x))
+        return nearest if abs(nearest - x) <= min_distance else None
+
+    def _movable_groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
+        """Return groups of coordinates near each other and near no straight line.
+
+        Each with the coordinate of its line.
+        """
+        rounding = CHART_TOLERANCE * (self.high[axis] - self.low[axis])
+        coordinates = np.unique([*(float(x[axis]) for x in points), *self.movable_lines[axis]])
+        movable = np.array(
+            [x for x in coordinates if self.straight_line_at(axis, float(x)) is None]
+        )
+        groups = list[tuple[Array, float]]()
+        for group in grouped_by_distance(movable, lambda x: self.size_at(axis, x), rounding):
+            is_one_place = np.ptp(group) <= rounding
+            line = group[0] if is_one_place else (group[0] + group[-1]) / 2
+            groups.append((group, float(line)))
+        return groups
 
     def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
-        """Numbers (n, 2) of the grid lines whose crossing each point takes; of glued ends the
-        first."""
+        """Return the numbers (n, 2) of the grid lines whose crossing each point takes.
+
+        Of glued ends the first.
+        """
         numbers = np.zeros((len(points), 2), dtype=np.int64)
         for axis in range(2):
-            lines, groups = self.lines(axis, points), self._groups(axis, points)
+            lines, groups = self.lines(axis, points), self._movable_groups(axis, points)
             for i, point in enumerate(points):
                 x = float(point[axis])
                 line = self.straight_line_at(axis, x)
                 if line is None:
-                    line = next(middle for group, middle in groups if group[0] <= x <= group[-1])
+                    line = next(line for group, line in groups if group[0] <= x <= group[-1])
                 number = int(np.abs(lines - line).argmin())
-                numbers[i, axis] = 0 if self.glued[axis] and number == len(lines) - 1 else number
+                is_second_end = self.glued[axis] and number == len(lines) - 1
+                numbers[i, axis] = 0 if is_second_end else number
         return numbers
 
 
@@ -161,79 +174,85 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     Raises
     ------
     MeshError
-        If a point lies outside.
+        If a point lies outside, or two take one vertex.
     """
-    for name, x in points.items():
-        extent = np.subtract(grid.high, grid.low)
-        if (x < grid.low - CLOSE * extent).any() or (x > grid.high + CLOSE * extent).any():
+    extent = np.subtract(grid.high, grid.low)
+    tolerance = CHART_TOLERANCE * extent
+    for name, point in points.items():
+        if (point < grid.low - tolerance).any() or (point > grid.high + tolerance).any():
             raise MeshError(f"the point {name} is not on the surface")
     x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
     n, m = len(x) - 1, len(y) - 1
     vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    _draw_to_points(vertices, grid, points)
+    _move_to_points(vertices, grid, points)
     centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
     nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
     number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
     centre = number.size + np.arange(n * m).reshape(n, m)
-    around = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
+    corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     cells = np.concatenate(
         [
-            np.stack([around[i], around[(i + 1) % 4], centre], axis=-1).reshape(-1, 3)
+            np.stack([corners[i], corners[(i + 1) % 4], centre], axis=-1).reshape(-1, 3)
             for i in range(4)
         ]
     )
-    one = np.arange(len(nodes))
+    representative = np.arange(len(nodes))
     if grid.glued[0]:
-        one[number[-1]] = one[number[0]]
+        representative[number[-1]] = representative[number[0]]
     if grid.glued[1]:
-        one[number[:, -1]] = one[number[:, 0]]
+        representative[number[:, -1]] = representative[number[:, 0]]
     edges: dict[str, NDArray[np.int64]] = {}
-    for name, row in zip(
-        grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True
-    ):
+    numbers_of_sides = (number[0], number[-1], number[:, 0], number[:, -1])
+    for name, numbers in zip(grid.sides, numbers_of_sides, strict=True):
         if name in grid.edges:  # two sides may have one name
-            line = one[np.stack([row[:-1], row[1:]], axis=-1)]
-            edges[name] = np.concatenate([edges[name], line]) if name in edges else line
-    return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one)
+            pairs = representative[np.stack([numbers[:-1], numbers[1:]], axis=-1)]
+            edges[name] = np.concatenate([edges[name], pairs]) if name in edges else pairs
+    return PatchMesh(nodes, cells, embedding, edges, dict(points), representative=representative)
 
 
-def _draw_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
+def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
     """Move vertices (n, m, 2) to the points that take them, where lines are not exactly there.
 
     Raises
     ------
     MeshError
-        If two points take one vertex, or one would draw a straight line.
+        If two points take one vertex, or one would move a straight line.
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
-    taken = dict[tuple[int, int], tuple[str, Array]]()
+    point_of_vertex = dict[tuple[int, int], tuple[str, Array]]()
     numbers = grid.vertices_of(places)
-    for which, (name, place) in enumerate(points.items()):
-        i, j = int(numbers[which, 0]), int(numbers[which, 1])
-        before, at = taken.setdefault((i, j), (name, place))
-        off = np.asarray(place - vertices[i, j])
-        off -= np.where(grid.glued, np.round(off / extent) * extent, 0.0)
-        apart = place - at - np.where(grid.glued, np.round((place - at) / extent) * extent, 0.0)
-        if (np.abs(apart) > CLOSE * extent).any():
+    for number, (name, place) in enumerate(points.items()):
+        i, j = int(numbers[number, 0]), int(numbers[number, 1])
+        first_name, first_place = point_of_vertex.setdefault((i, j), (name, place))
+        offset = np.asarray(place - vertices[i, j])
+        offset -= np.where(grid.glued, np.round(offset / extent) * extent, 0.0)
+        distance = place - first_place
+        distance = distance - np.where(grid.glued, np.round(distance / extent) * extent, 0.0)
+        if (np.abs(distance) > CHART_TOLERANCE * extent).any():
             raise MeshError(
-                f"the points {before} and {name} are too near to each other for the elements there"
+                f"the points {first_name} and {name} are too near to each other "
+                "for the elements there"
             )
         for axis in range(2):
             line = grid.straight_line_at(axis, float(place[axis]))
-            end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
-            if abs(off[axis]) <= CLOSE * extent[axis]:
-                off[axis] = 0.0
-            elif line is not None and not end:
+            is_glued_end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
+            if abs(offset[axis]) <= CHART_TOLERANCE * extent[axis]:
+                offset[axis] = 0.0
+            elif line is not None and not is_glued_end:
                 raise MeshError(f"the point {name} is too near to an edge or a plane of symmetry")
         rows = (0, -1) if grid.glued[0] and i == 0 else (i,)
         columns = (0, -1) if grid.glued[1] and j == 0 else (j,)
-        for copy in product(rows, columns) if before == name else ():
-            vertices[copy] += off
+        if first_name == name:
+            for vertex in product(rows, columns):
+                vertices[vertex] += offset
 
 
 @dataclass(frozen=True)
 class RimmedGrid:
-    """A grid's rectangle with closed curves, points (n, 2) each, that element edges follow."""
+    """A grid's rectangle with closed curves, points (n, 2) each, that element edges follow.
+
+    It is a `PlaneShape` for gmsh.
+    """
 
     grid: Grid
     rims: tuple[Array, ...]
@@ -241,6 +260,7 @@ class RimmedGrid:
 
     @property
     def extent(self) -> Array:
+        """Lengths (2,) of the sides of the rectangle."""
         return np.subtract(self.grid.high, self.grid.low)
 
     @property
@@ -256,41 +276,41 @@ class RimmedGrid:
         return np.array(self.grid.low), np.array(self.grid.high)
 
     @property
-    def glued(self) -> tuple[Glued, ...]:
+    def glued(self) -> tuple[GluedSides, ...]:
         return tuple(
             (i, self.grid.low[i], self.grid.high[i]) for i in range(2) if self.grid.glued[i]
         )
 
     def faces(self, occ: Any) -> Faces:
-        """The rectangle, the rims with their images across glued sides, and the lines of the grid's
-        `through`.
+        """Make the rectangle, the rims with their images across glued sides, and the grid lines.
+
+        These are the fixed and the movable ones.
         """
-        (x0, y0), (x1, y1) = self.grid.low, self.grid.high
+        grid = self.grid
+        (x0, y0), (x1, y1) = grid.low, grid.high
 
         def rectangle() -> tuple[int, int]:
             return 2, occ.addRectangle(x0, y0, 0, x1 - x0, y1 - y0)
 
-        steps = [(-1, 0, 1) if glued else (0,) for glued in self.grid.glued]
+        steps = [(-1, 0, 1) if glued else (0,) for glued in grid.glued]
         images = [
             points + np.multiply(step, self.extent)
             for points in self.rims
             for step in product(*steps)
         ]
-        near = [
-            p
-            for p in images
-            if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()
-        ]
-        surfaces = [rectangle(), *within(occ, near, rectangle)]
+        rims_inside = list[Array]()
+        for points in images:
+            begins_inside = (points.min(axis=0) < grid.high).all()
+            if (points.max(axis=0) > grid.low).all() and begins_inside:
+                rims_inside.append(points)
+        surfaces = [rectangle(), *faces_within(occ, rims_inside, rectangle)]
         for axis, other in ((0, 1), (1, 0)):
-            for across in (*self.grid.through[axis], *self.grid.movable[axis]):
-                if not self.grid.low[axis] < across < self.grid.high[axis]:
+            for coordinate in (*grid.fixed_lines[axis], *grid.movable_lines[axis]):
+                if not grid.low[axis] < coordinate < grid.high[axis]:
                     continue
-                ends = np.array([self.grid.low, self.grid.high])
-                ends[:, axis], ends[:, other] = (
-                    across,
-                    (self.grid.low[other], self.grid.high[other]),
-                )
+                ends = np.array([grid.low, grid.high])
+                ends[:, axis] = coordinate
+                ends[:, other] = (grid.low[other], grid.high[other])
                 surfaces.append((1, occ.addLine(*(occ.addPoint(*end, 0) for end in ends))))
         return surfaces
 
@@ -299,6 +319,6 @@ class RimmedGrid:
         for i, name in enumerate(self.grid.sides):
             axis, end = i // 2, (self.grid.low, self.grid.high)[i % 2]
             if name in self.grid.edges and not self.grid.glued[axis]:
-                on = np.abs(x[:, axis] - end[axis]) < CLOSE * self.reach
-                edges[name] = edges[name] | on if name in edges else on
+                on_side = np.abs(x[:, axis] - end[axis]) < CHART_TOLERANCE * self.reach
+                edges[name] = edges[name] | on_side if name in edges else on_side
         return edges

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self, TypeAlia
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from magshell_fenicsx.input.section import Pressure, Section, over
+from magshell_fenicsx.input.section import Pressure, Section, over_size
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.quantities.quantity import VOLUME
 
@@ -43,7 +43,7 @@ class GasSection(Section):
     """Pressure outside, with a unit"""
     ambient_over_pc: float | None = Field(default=None, gt=0, le=1e12)
     """The same without one [p_c]"""
-    volume: Annotated[float, over(VOLUME)] | None = Field(default=None, gt=0, le=1e6)
+    volume: Annotated[float, over_size(VOLUME)] | None = Field(default=None, gt=0, le=1e6)
     """Volume of the gas under the undeformed shell; by default the volume under the shell itself [R³]"""
 
     @model_validator(mode="after")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.section import Along, over
+from magshell_fenicsx.input.section import DirectionVector, over_size
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.course import Target
@@ -14,7 +14,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.platform.lazy_import import lazy_import
-from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
+from magshell_fenicsx.quantities.quantity import NEEDS_DENSITY, Quantity, Unit
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ ACCELERATION = Unit(
     "m/s²",
     lambda g: g.E / (g.rho * g.R),
     text="metre/second**2",
-    needs=DENSITY_TOO,
+    needs=NEEDS_DENSITY,
     symbol="g",
 )
 
@@ -58,9 +58,9 @@ class GravityStep(BodyForceStep):
         ),
     )
     kind: Literal["gravity"]
-    direction: Along = Field(default=[0.0, 0.0, -1.0])
+    direction: DirectionVector = Field(default=[0.0, 0.0, -1.0])
     """Its three components, of any length; by default down e3"""
-    acceleration: Annotated[float, over(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
+    acceleration: Annotated[float, over_size(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
 
     @property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
-from magshell_fenicsx.input.section import Chosen, Section
+from magshell_fenicsx.input.section import ChosenByKey, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.laminate import LaminateSection
@@ -43,7 +43,7 @@ def section_of(room: str, kind: str) -> type[Section]:
 
 def _any_of(room: str) -> Any:
     sections = tuple(section_of(room, kind) for kind in REGISTERED[room])
-    return Annotated[Union[sections], Chosen("kind")]  # noqa: UP007
+    return Annotated[Union[sections], ChosenByKey("kind")]  # noqa: UP007
 
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.input.section import Section, given, or_number
+from magshell_fenicsx.input.section import Section, case_sizes, or_number
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.part import Ability, Context
-from magshell_fenicsx.shape.symmetry import Leaves, nothing, unit
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, no_plane, unit
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.laminate import Laminate
@@ -193,7 +193,7 @@ class Laminated(Ability):
         plies.
         """
         section = self.section
-        if section.with_units == isnan(given(context.shell).E):
+        if section.with_units == isnan(case_sizes(context.shell).E):
             moduli = (
                 "have a unit: youngs_modulus has none"
                 if section.with_units
@@ -212,12 +212,12 @@ class Laminated(Ability):
                 "at the same distance from the middle",
             )
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """All symmetry of isotropic plies, else that of the directions if nothing twists."""
         return [] if self.section.isotropic else [_leaves(self.section, context.shell.geometry)]
 
 
-def _leaves(section: LaminateSection, geometry: str) -> Leaves:
+def _leaves(section: LaminateSection, geometry: str) -> SymmetryConstraint:
     along = section.direction(geometry)
     reason = None
     if section.twists:
@@ -233,8 +233,8 @@ def _leaves(section: LaminateSection, geometry: str) -> Leaves:
         else tuple(float(np.arctan2(along[1], along[0])) + turn for turn in (0.0, np.pi / 2))
     )
     if section.twists:
-        return Leaves(reason, mirrors=nothing)
-    return Leaves(reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside)
+        return SymmetryConstraint(reason, mirrors=no_plane)
+    return SymmetryConstraint(reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside)
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:

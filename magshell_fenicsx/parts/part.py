@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.quantities.quantity import Given, Quantity
+from magshell_fenicsx.quantities.quantity import CaseSizes, Quantity
 from magshell_fenicsx.quantities.registry import register
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import Deviation
     from magshell_fenicsx.models.shell.patterns import Inside
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline
-    from magshell_fenicsx.shape.sections import ShellSection, Surface
+    from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 Array = NDArray[np.float64]
 Kind = TypeVar("Kind")
@@ -311,7 +311,7 @@ class Ability:
         """Its keys with values by patch -> the names of these."""
         return {}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """The symmetry that it leaves of a shell."""
         return []
 
@@ -340,7 +340,7 @@ class Ability:
         """Lines of `magshell check` with its numbers on the undeformed shell."""
         return []
 
-    def units(self, context: Context, units: Given) -> Given:
+    def units(self, context: Context, units: CaseSizes) -> CaseSizes:
         """The sizes of units, with those that it gives."""
         return units
 

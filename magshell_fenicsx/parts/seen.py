@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
-from magshell_fenicsx.quantities.registry import take
+from magshell_fenicsx.quantities.registry import register_for_all_cases
 
 if TYPE_CHECKING:
     from dolfinx import fem
@@ -143,7 +143,7 @@ class Seen:
     before_points: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
-        take(cls.quantities, cls.varied)
+        register_for_all_cases(cls.quantities, cls.varied)
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
         """Its amplitudes."""

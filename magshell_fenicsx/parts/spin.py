@@ -5,20 +5,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from magshell_fenicsx.input.section import over
+from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
+from magshell_fenicsx.quantities.quantity import NEEDS_DENSITY, Quantity, Unit
 
 if TYPE_CHECKING:
     from ufl.core.expr import Expr
 
 SPEED = Unit(
-    "√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO
+    "√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=NEEDS_DENSITY
 )
 SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2), symbol="ω²")
 
@@ -52,7 +52,7 @@ class SpinStep(BodyForceStep):
         ),
     )
     kind: Literal["spin"]
-    speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(
+    speed: Annotated[float, over_size(SPEED), BeforeValidator(_of_angles)] | None = Field(
         default=None, ge=0, le=1e3
     )
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""

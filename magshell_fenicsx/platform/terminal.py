@@ -21,7 +21,8 @@ STATUS_SECONDS = 30.0  # without a line, after which a pipe gets one
 POLL_FRACTION = 0.1  # of that, between two checks whether it is time
 output_failures: list[str] = []  # why standard output is not written
 
-# Environment variables of launchers: mpirun gives every rank a terminal, even if its own output is a file
+# Environment variables of launchers: mpirun gives every rank a terminal, even if its own output
+# is a file.
 LAUNCHER_VARIABLES = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
 
 
@@ -157,7 +158,7 @@ def fit_to_columns(parts: Sequence[str], columns: int) -> str:
 
     Examples
     --------
-    >>> fitting(["5 points", "w/h 14 -> 20", "1:50, about 0:30 left", "du/h 0.1"], 50)
+    >>> fit_to_columns(["5 points", "w/h 14 -> 20", "1:50, about 0:30 left", "du/h 0.1"], 50)
     '5 points  w/h 14 -> 20  1:50, about 0:30 left'
     """
     first, *others = parts

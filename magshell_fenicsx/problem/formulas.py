@@ -1,5 +1,9 @@
-"""The formulas of a case in the undeformed place: that they have sensible values, and where
-elements must be small.
+"""Formulas of a case at undeformed places: their bounds, and the element sizes that resolve them.
+
+A formula may vary within narrow parts of the surface. Squares of the chart are divided until
+polynomials resolve the formula in each, which gives the element sizes there; places that samples
+may miss come from an adaptive division of the surface. After meshing, `unresolved_formulas` says
+what the cells miss. Lengths are over R.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -12,185 +16,173 @@ import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import Together, formula
-from magshell_fenicsx.input.messages import shown
+from magshell_fenicsx.input.expressions import FormulaGroup, formula
+from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grading import PER_AREA, Squares
+from magshell_fenicsx.mesh.grading import PER_AREA, SquaresFeature
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
+from magshell_fenicsx.mesh.msh import MeshFile, read_msh, space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
 from magshell_fenicsx.models.shell.fitted import Cells, fitted, sampling
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
 from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
 from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.part import Context, Formulas
-from magshell_fenicsx.shape.outline import ANY, Outline
+from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
 
 Array = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+# places (squares, n, 3) over R, whether each is on the chart, side of the squares -> element sizes
+Sizes = Callable[[Array, Masks, float], Array]
 THICKNESS = "shell.thickness_factor"
 SAMPLES = 20  # along each side of a square of the chart
-COARSEST, MOST_FIRST, MOST_SQUARES = (
-    0.2,
-    800,
-    3000,
-)  # side of the first squares over R, how many, and how many later
-DEGREE = 4  # of the polynomials that are compared
-SHOWN, SMALLEST_SQUARE = (
-    0.25,
-    0.1,
-)  # of sqrt(Rh) and of h: elements of this size show loads, and all else
-SMALLEST_FLAW = 0.25  # of h
-TOTAL, SQUARE = (
-    1e-3,
-    0.02,
-)  # of the integrals of a formula's size and of its square, which cells may miss
-CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
-SMALLEST_EXTENT = 1e-9  # over R, of a surface along an axis
-STIFFNESS = 1e-3  # of it, which cells may miss by a thickness that varies within them
-MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
-SEEN, HALF = (
-    6,
-    0.5,
-)  # places along each side of a part of the surface; of a formula's square, which samples miss
-NARROW, PLACES = (
-    0.02,
-    300,
-)  # over R, parts that samples may miss, and how many of each formula are looked at
 LOCAL = (
     np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5
-) / SAMPLES - 0.5
+) / SAMPLES - 0.5  # (n, 2) samples of a square of side one around the origin
+DEGREE = 4  # of the polynomials that are compared
 _POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 BASIS = np.linalg.qr(
     np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1)
 )[0]
+FIRST_SIDE = 0.2  # over R: largest side of the first squares
+MAX_FIRST_SQUARES, MAX_SQUARES = 800, 3000  # at the beginning, and of one size later
+LOAD_SIZE = 0.25  # over sqrt(Rh): elements of this size resolve loads
+MIN_SQUARE = 0.1  # over h: the least square of formulas that are no loads
+MIN_IMPERFECTION_SQUARE = 0.25  # over h
+INTEGRAL_TOLERANCE = 1e-3  # of the integral of a formula's size, which cells may miss
+SQUARE_TOLERANCE = 0.02  # of the integral of its square, which cells may miss
+STIFFNESS_TOLERANCE = 1e-3  # which cells may miss by a thickness that varies within them
+VARIANCE_TOLERANCE = 0.003  # of a formula: what polynomials on squares may miss of it
+GRADED_MESH_GAIN = 0.5  # of as many elements as equal ones: then a graded mesh is worth while
+RESOLVED_LOAD = 4.0  # times LOAD_SIZE sqrt(Rh): larger elements smooth a load
+MIN_EXTENT = 1e-9  # over R, of a surface along an axis
+CELL_SAMPLES = 6  # along each side of an adaptive cell
+SAMPLED_SHARE = 0.5  # of the integral of a formula's square, below which samples miss it
+NARROW_SIZE = 0.02  # over R: adaptive cells so small may lie between samples
+MAX_NARROW_PLACES = 300  # of each formula
 
 
 @dataclass(frozen=True)
-class Written:
+class PlacedFormulas:
     """A key of the case with formulas of the undeformed place.
 
     Attributes
     ----------
-    given
-        Its numbers and formulas, and what they may be.
+    spec
+        Key, numbers and formulas, and their bounds.
     texts
         The formulas.
     formulas
-        Of places over R in the frame of the case, in the case's unit.
+        Functions of places over R in the frame of the case, in the case's unit.
     """
 
-    given: Formulas
+    spec: Formulas
     texts: tuple[str, ...]
-    formulas: Together
+    formulas: FormulaGroup
 
-    def of_place(self, x: Array) -> Array:
-        """Places (n, 3) -> each formula's values (n, formulas)."""
+    def values_at(self, x: Array) -> Array:
+        """Return each formula's values (n, formulas) at places (n, 3)."""
         return self.formulas.values(x)
 
 
-def written(context: Context) -> list[Written]:
-    """Those of thickness, remanence, dead loads and natural shape."""
-    return list(_written(context))
-
-
-def _written(context: Context) -> Iterator[Written]:
-    factor = context.shell.thickness_factor
-    for each in (
-        *(
-            [Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)]
-            if isinstance(factor, str)
-            else []
-        ),
-        *(formulas for section in context.abilities for formulas in section.formulas(context)),
-        *(formulas for step in context.steps for formulas in step.load.formulas(step.key, context)),
-    ):
-        texts = tuple(value for value in each.values if isinstance(value, str))
+def case_formulas(context: Context) -> list[PlacedFormulas]:
+    """Return the formulas of thickness, remanence, dead loads and natural shape."""
+    key_formulas = list[PlacedFormulas]()
+    for spec in _specs(context):
+        texts = tuple(value for value in spec.values if isinstance(value, str))
         if texts:
-            of_place = Together([formula(text) for text in texts], None, each.length)
-            yield Written(each, texts, of_place)
+            functions = FormulaGroup([formula(text) for text in texts], None, spec.length)
+            key_formulas.append(PlacedFormulas(spec, texts, functions))
+    return key_formulas
 
 
-def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
-    """Look at the values at places (n, 3) over R of the undeformed shell.
+def _specs(context: Context) -> Iterator[Formulas]:
+    factor = context.shell.thickness_factor
+    if isinstance(factor, str):
+        yield Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
+    for section in context.abilities:
+        yield from section.formulas(context)
+    for step in context.steps:
+        yield from step.load.formulas(step.key, context)
+
+
+def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:
+    """Refuse formulas with values out of bounds at places (n, 3) over R of the undeformed shell.
 
     Raises
     ------
     CaseError
         With the first place where one is not finite or out of bounds.
     """
-    for each in formulas:
-        values = each.of_place(x)
-        bad = ~((values >= each.given.least) & (values <= each.given.most))
-        if bad.any():
-            row, i = np.argwhere(bad)[0]
+    for key_formulas in formulas:
+        spec, values = key_formulas.spec, key_formulas.values_at(x)
+        out_of_bounds = ~((values >= spec.least) & (values <= spec.most))
+        if out_of_bounds.any():
+            row, i = np.argwhere(out_of_bounds)[0]
             place = ", ".join(f"{c:.3g}" for c in x[row])
-            bounds = f"{each.given.least:.4g} to {each.given.most:.4g}"
+            bounds = f"{spec.least:.4g} to {spec.most:.4g}"
             raise CaseError(
-                f"{each.given.key}: {shown(each.texts[i])}: is {values[row, i]:.4g} at (x, y, z)/R = ({place}): "
-                f"allowed {bounds}"
+                f"{spec.key}: {shown_value(key_formulas.texts[i])}: is {values[row, i]:.4g} "
+                f"at (x, y, z)/R = ({place}): allowed {bounds}"
             )
 
 
-def squares(
-    places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", finest: float
-) -> Squares | None:
-    """Squares of the chart in which elements must be small; None if there are none, or the chart is
-    a mesh file's.
+def refined_squares(
+    places: Callable[[Array], Array], outline: Outline, sizes: Sizes, min_size: float
+) -> SquaresFeature | None:
+    """Return squares of the chart in which elements must be small.
 
     Squares are divided until the elements that they need are no smaller than they, or as small as
-    `finest`.
+    `min_size`. None if no square needs small elements, or if the chart is a mesh file's.
 
     Parameters
     ----------
     places
         Chart (n, 2) -> places (n, 3) over R in the frame of the case.
     sizes
-        Places (squares, n, 3), which of them are inside, and the side of the squares -> size of
-        elements of each.
+        Element sizes that squares need.
+    min_size
+        Least side of a square, over R.
     """
-    shape = outline.chart(None, ANY)
+    shape = outline.chart(None, ANY_GRADING)
     if isinstance(shape, MeshFile):
         return None
     low, high = extent(shape)
-    side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
-    t = [
-        a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5)
-        for a, b in zip(low, high, strict=True)
-    ]
+    least_side = float(np.sqrt(np.prod(high - low) / MAX_FIRST_SQUARES))
+    first_side = side = max(min(FIRST_SIDE, *(high - low)), least_side)
+    counts = [ceil((b - a) / side - 1e-9) for a, b in zip(low, high, strict=True)]
+    t = [a + side * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True)]
     centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
-    chosen, largest = list[tuple[Array, float, Array]](), side
-    while len(centres) and len(centres) <= MOST_SQUARES:
+    refined = list[tuple[Array, Array, Array]]()  # centres, sides and element sizes
+    while len(centres) and len(centres) <= MAX_SQUARES:
         chart = centres[:, None] + side * LOCAL
-        inside = within(shape, chart)
-        kept = inside.any(axis=1)
-        centres, chart, inside = centres[kept], chart[kept], inside[kept]
-        size = sizes(places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3), inside, side)
-        small = (size < side) & (side > finest)
-        leaves = ~small & (np.maximum(size, finest) < largest)
-        chosen.append((centres[leaves], side, np.maximum(size[leaves], finest)))
+        on_chart = within_chart(shape, chart)
+        has_samples = on_chart.any(axis=1)
+        centres, chart, on_chart = centres[has_samples], chart[has_samples], on_chart[has_samples]
+        x = places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3)
+        size = sizes(x, on_chart, side)
+        divided = (size < side) & (side > min_size)
+        bounded_size = np.maximum(size, min_size)
+        needed = ~divided & (bounded_size < first_side)
+        sides = np.full(int(needed.sum()), side)
+        refined.append((centres[needed], sides, bounded_size[needed]))
         side /= 2
         offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        centres = (centres[small][:, None] + offsets).reshape(-1, 2)
-    if len(centres):  # so many that they are all alike: as small as can be paid for
-        chosen.append((centres, side, np.full(len(centres), max(side, finest))))
-    if not sum(len(each) for each, _, _ in chosen):
+        centres = (centres[divided][:, None] + offsets).reshape(-1, 2)
+    if len(centres):  # so many that they all get the least size that can be paid for
+        sides = np.full(len(centres), side)
+        refined.append((centres, sides, np.full(len(centres), max(side, min_size))))
+    if not sum(len(sides) for _, sides, _ in refined):
         return None
-    sides = np.concatenate([np.full(len(each), s) for each, s, _ in chosen])
-    return Squares(
-        np.concatenate([c for c, _, _ in chosen]),
-        sides / 2,
-        np.concatenate([s for _, _, s in chosen]),
-    )
+    all_centres, all_sides, all_sizes = (np.concatenate(v) for v in zip(*refined, strict=True))
+    return SquaresFeature(all_centres, all_sides / 2, all_sizes)
 
 
-Sizes = Callable[[Array, NDArray[np.bool_], float], Array]
-
-
-def extent(shape: Shape | Grid) -> tuple[Array, Array]:
-    """Lower and upper corner of a chart."""
+def extent(shape: PlaneShape | Grid) -> tuple[Array, Array]:
+    """Return the lower and upper corner (2,) of a chart."""
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
     if isinstance(shape, StripShape):
@@ -198,243 +190,311 @@ def extent(shape: Shape | Grid) -> tuple[Array, Array]:
     return np.full(2, -shape.reach), np.full(2, shape.reach)
 
 
-def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
-    """Whether points (..., 2) belong to a chart."""
+def within_chart(shape: PlaneShape | Grid, chart: Array) -> Masks:
+    """Return whether points (..., 2) belong to a chart."""
     if isinstance(shape, DiscShape):
         return np.asarray(np.hypot(chart[..., 0], chart[..., 1]) <= shape.reach)
     low, high = extent(shape)
     return np.asarray(((chart >= low) & (chart <= high)).all(axis=-1))
 
 
-def looked_at(formulas: Together, outline: Outline) -> Leaves:
-    """Parts of the perfect surface in which a formula has no values that their places do not show,
-    in the case's frame.
+def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> Leaves:
+    """Return a division of the perfect surface so fine that places in each cell show the formulas.
 
-    They divide triangles of the chart, of a disc those of a square that is mapped onto it, or of a
-    mesh file.
+    The cells divide triangles of the chart, of a disc those of a square that is mapped onto it, or
+    of a mesh file. Places are in the frame of the case.
     """
-    shape = outline.chart(None, ANY)
+    shape = outline.chart(None, ANY_GRADING)
     if isinstance(shape, MeshFile):
         mesh = read_msh(shape, {})
-        triangles, embedded = mesh.nodes[mesh.cells[:, :3]], in_space
+        triangles, embedding = mesh.nodes[mesh.cells[:, :3]], space_embedding
     else:
-        low, high = extent(shape)
+        triangles = _chart_triangles(shape)
         radius = shape.reach if isinstance(shape, DiscShape) else None
-        t = [
-            np.linspace(a, b, ceil((b - a) / COARSEST) + 1) for a, b in zip(low, high, strict=True)
-        ]
-        corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
-        a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
-        triangles = np.concatenate(
-            [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
-        )
 
-        def embedded(x: Array) -> Array:
-            return outline.perfect(x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x)
+        def embedding(x: Array) -> Array:
+            # the square is mapped onto the disc
+            on_disc = x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x
+            return outline.perfect(on_disc)
 
-    lattice = Lattice.of(basix.CellType.triangle, SEEN)
+    lattice = Lattice.of(basix.CellType.triangle, CELL_SAMPLES)
 
-    def look(parts: Parts) -> tuple[Array, Array]:
-        X, three = (
-            parts.rule(lattice.places, np.ones(len(lattice.places)))[0],
-            triangles[parts.cell],
-        )
-        x = three[:, None, 0] + np.matmul(X, three[:, 1:] - three[:, :1])
-        x = embedded(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:2], 3)
+    def places_and_areas(parts: Parts) -> tuple[Array, Array]:
+        X = parts.rule(lattice.places, np.ones(len(lattice.places)))[0]
+        corners = triangles[parts.cell]
+        x = corners[:, None, 0] + np.matmul(X, corners[:, 1:] - corners[:, :1])
+        x = embedding(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:2], 3)
         area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
         return x, area
 
-    first = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2))).of(
-        np.arange(len(triangles))
+    reference = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
+    first = reference.of(np.arange(len(triangles)))
+    return leaves_of(formulas, first, places_and_areas, lattice, len(triangles))
+
+
+def _chart_triangles(shape: PlaneShape | Grid) -> Array:
+    """Return corners (m, 3, 2) of triangles that cover the bounds of a chart."""
+    low, high = extent(shape)
+    t = [np.linspace(a, b, ceil((b - a) / FIRST_SIDE) + 1) for a, b in zip(low, high, strict=True)]
+    corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
+    a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
+    return np.concatenate(
+        [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
     )
-    return leaves_of(formulas, first, look, lattice, len(triangles))
 
 
 def narrow_places(leaves: Sequence[Leaves]) -> Array:
-    """Places (n, 3) at which formulas have what samples may miss."""
-    few: list[Array] = [np.zeros((0, 3))]
-    for each in leaves:
-        small = np.flatnonzero(each.size < NARROW)
-        order = small[np.argsort(-each.area[small] * each.away[small])]
-        few += [
-            each.centre[order[:PLACES]],
-            each.centre[order[PLACES :: max(1, len(order) // PLACES)]],
-        ]
-    return np.concatenate(few)
+    """Return places (n, 3) at which formulas have values that samples may miss."""
+    places: list[Array] = [np.zeros((0, 3))]
+    for cells in leaves:
+        narrow_cells = np.flatnonzero(cells.size < NARROW_SIZE)
+        by_variance = narrow_cells[np.argsort(-cells.area[narrow_cells] * cells.away[narrow_cells])]
+        stride = max(1, len(by_variance) // MAX_NARROW_PLACES)
+        places.append(cells.centre[by_variance[:MAX_NARROW_PLACES]])
+        places.append(cells.centre[by_variance[MAX_NARROW_PLACES::stride]])
+    return np.concatenate(places)
 
 
-def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None = None) -> Sizes:
-    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials
-    miss most of it.
+def polynomial_sizes(values: Callable[[Array], Array], leaves: Leaves | None = None) -> Sizes:
+    """Return the sizes of elements that resolve a formula.
 
-    What samples of a square do not have and the leaves in it have is missed too.
+    They are half the squares in which polynomials miss most of it, else the squares. What samples
+    of a square do not have and the adaptive cells in it have is missed too.
+
+    Parameters
+    ----------
+    values
+        Places (n, 3) -> values (n, formulas).
+    leaves
+        See `adaptive_cells`; None where there is nothing between samples.
     """
-    whole: float = 0.0
-    of_leaves: float = float(leaves.area @ leaves.away) if leaves else 0.0
+    variance: float = 0.0
+    variance_of_leaves: float = float(leaves.area @ leaves.away) if leaves else 0.0
     mean: Array | None = None
 
-    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
-        nonlocal whole, mean
+    def sizes(x: Array, on_chart: Masks, side: float) -> Array:
+        nonlocal variance, mean
         f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
-        good = inside & np.isfinite(f).all(axis=-1)
-        mean = f[good].mean(axis=0) if mean is None else mean
-        f = np.where(good[..., None], f - mean, 0.0)
+        is_valid = on_chart & np.isfinite(f).all(axis=-1)
+        mean = f[is_valid].mean(axis=0) if mean is None else mean
+        f = np.where(is_valid[..., None], f - mean, 0.0)
         missed = f - BASIS @ (BASIS.T @ f)
-        for i in np.flatnonzero(~good.all(axis=1)):
-            Q = np.linalg.qr(BASIS[good[i]])[0]
-            missed[i], g = 0.0, f[i][good[i]]
-            missed[i][good[i]] = g - Q @ (Q.T @ g)
+        for i in np.flatnonzero(~is_valid.all(axis=1)):
+            Q = np.linalg.qr(BASIS[is_valid[i]])[0]
+            missed[i], g = 0.0, f[i][is_valid[i]]
+            missed[i][is_valid[i]] = g - Q @ (Q.T @ g)
         area = (side / SAMPLES) ** 2
-        whole = max(whole, area * float((f**2).sum()))
-        whole = of_leaves if whole < HALF * of_leaves else whole
-        squared = area * (missed**2).sum(axis=(1, 2))
+        variance = max(variance, area * float((f**2).sum()))
+        if variance < SAMPLED_SHARE * variance_of_leaves:
+            variance = variance_of_leaves
+        missed_variance = area * (missed**2).sum(axis=(1, 2))
         if leaves:
             middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]
-            squared = np.maximum(
-                squared, _unsampled(leaves, middle, side, area * (f**2).sum(axis=(1, 2)))
-            )
-        order = np.argsort(squared)
-        fine = np.empty(len(f), dtype=bool)
-        fine[order] = np.cumsum(squared[order]) <= MISSED * whole
-        return np.where(fine, side, side / 2)
+            sampled = area * (f**2).sum(axis=(1, 2))
+            unsampled = _unsampled_variance(leaves, middle, side, sampled)
+            missed_variance = np.maximum(missed_variance, unsampled)
+        order = np.argsort(missed_variance)
+        is_resolved = np.empty(len(f), dtype=bool)
+        is_resolved[order] = np.cumsum(missed_variance[order]) <= VARIANCE_TOLERANCE * variance
+        return np.where(is_resolved, side, side / 2)
 
     return sizes
 
 
-def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
-    """The squares' integrals of the square of a formula, less those of samples that have not half
-    of it.
+def _unsampled_variance(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
+    """Return the integral (squares,) of the square of a formula that the samples do not show.
+
+    Zero in squares whose samples have half of it.
+
+    Parameters
+    ----------
+    middle
+        (squares, 3) centres.
+    sampled
+        (squares,) the integral by the samples.
     """
-    away, square = scipy.spatial.cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
-    missed = np.isfinite(away) & (leaves.size < side)
-    whole = np.bincount(square[missed], (leaves.area * leaves.away)[missed], len(middle))
-    return np.where(sampled < HALF * whole, whole, 0.0)
+    tree = scipy.spatial.cKDTree(middle)
+    distance, square = tree.query(leaves.centre, distance_upper_bound=side)
+    in_square = np.isfinite(distance) & (leaves.size < side)
+    of_leaves = (leaves.area * leaves.away)[in_square]
+    total = np.bincount(square[in_square], of_leaves, len(middle))
+    return np.where(sampled < SAMPLED_SHARE * total, total, 0.0)
 
 
-def refinements(
-    formulas: Sequence[Written],
-    narrow: Sequence[Leaves | None],
-    drawn: Outline,
+def formula_refinements(
+    formulas: Sequence[PlacedFormulas],
+    leaves_of_formulas: Sequence[Leaves | None],
+    outline: Outline,
     turn: float,
     h: float,
-) -> list[Squares]:
-    """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad).
+) -> list[SquaresFeature]:
+    """Return where formulas need small elements.
 
-    `narrow` has what was seen between samples; None: there is nothing.
+    Parameters
+    ----------
+    leaves_of_formulas
+        For each the division that shows it, see `adaptive_cells`; None if squares do.
+    outline
+        With imperfections that do not grow.
+    turn
+        Angle about e3 of the frame of the chart (rad).
+    h
+        Thickness over R.
     """
     Q = rotation(turn)
 
     def places(chart: Array) -> Array:
-        return drawn.embedding(chart) @ Q
+        return outline.embedding(chart) @ Q
 
-    finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
-    areas = (
-        squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.given.load])
-        for each, leaves in zip(formulas, narrow, strict=True)
-    )
-    return [each for each in areas if each]
+    refined = list[SquaresFeature]()
+    for key_formulas, leaves in zip(formulas, leaves_of_formulas, strict=True):
+        sizes = polynomial_sizes(key_formulas.values_at, leaves)
+        min_size = LOAD_SIZE * sqrt(h) if key_formulas.spec.load else MIN_SQUARE * h
+        if squares := refined_squares(places, outline, sizes, min_size):
+            refined.append(squares)
+    return refined
 
 
-def of_imperfections(
-    flaws: Iterable[Flaw], perfect: Outline, turn: float, h: float
-) -> tuple[list[Squares], float]:
-    """Where imperfections without a centre need small elements, and the size that shows the others
-    everywhere.
+def imperfection_refinements(
+    imperfections: Iterable[Flaw], perfect: Outline, turn: float, h: float
+) -> tuple[list[SquaresFeature], float]:
+    """Return where imperfections without a centre need small elements.
+
+    Parameters
+    ----------
+    turn
+        Angle about e3 of the frame of the chart (rad).
+    h
+        Thickness over R.
+
+    Returns
+    -------
+    squares
+        Of imperfections that are local.
+    size
+        Element size everywhere that resolves the others.
     """
-    Q, everywhere, local = rotation(turn), inf, list[Squares]()
-    shape = perfect.chart(None, ANY)
+    Q, size_everywhere, local = rotation(turn), inf, list[SquaresFeature]()
+    shape = perfect.chart(None, ANY_GRADING)
 
     def places(chart: Array) -> Array:
         return perfect.perfect(chart) @ Q
 
-    for flaw in flaws:
-        area = flaw.sizes and squares(places, perfect, _smallest(flaw.sizes), SMALLEST_FLAW * h)
-        if area is None:
-            everywhere = min(everywhere, flaw.size)
+    for imperfection in imperfections:
+        squares = imperfection.sizes and refined_squares(
+            places, perfect, _least_sizes(imperfection.sizes), MIN_IMPERFECTION_SQUARE * h
+        )
+        if squares is None:
+            size_everywhere = min(size_everywhere, imperfection.size)
             continue
         assert not isinstance(shape, MeshFile)  # it has no squares
         low, high = extent(shape)
-        alike = PER_AREA * float(np.prod(high - low)) / area.size**2
-        if area.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
-            local.append(area)
+        count_of_equal = PER_AREA * float(np.prod(high - low)) / squares.size**2
+        count = squares.cells(float(np.linalg.norm(high - low)) / 2)
+        if count < GRADED_MESH_GAIN * count_of_equal:
+            local.append(squares)
         else:
-            everywhere = min(everywhere, area.size)
-    return local, everywhere
+            size_everywhere = min(size_everywhere, squares.size)
+    return local, size_everywhere
 
 
-def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
-    """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places
-    is looked at.
+def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
+    """Return the least of the sizes that places (n, 3) of a square need.
+
+    A quarter of the samples is evaluated.
     """
 
-    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
-        fewer = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
-        needed = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
-        return np.asarray(
-            np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], needed, inf).min(
-                axis=(1, 2)
-            )
-        )
+    def sizes(x: Array, on_chart: Masks, side: float) -> Array:
+        some_places = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
+        some_on_chart = on_chart.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2]
+        needed = size_at(some_places.reshape(-1, 3)).reshape(some_places.shape[:-1])
+        return np.asarray(np.where(some_on_chart, needed, inf).min(axis=(1, 2)))
 
     return sizes
 
 
-def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) -> list[str]:
-    """What the cells miss of formulas, in words; collective."""
-    Q, element, said = rotation(turn), cells.element, list[str]()
-    for each in formulas:
+def unresolved_formulas(
+    formulas: Sequence[PlacedFormulas], cells: Cells, turn: float, h: float
+) -> list[str]:
+    """Return messages about what the cells miss of formulas; collective.
 
-        def values(x: Array, n: Array, each: Written = each) -> Array:
-            return each.of_place(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
+    Parameters
+    ----------
+    turn
+        Angle about e3 of the frame of the cells (rad).
+    h
+        Thickness over R.
+    """
+    Q, messages = rotation(turn), list[str]()
+    for key_formulas in formulas:
+        messages += _unresolved_formula(key_formulas, cells, Q, h)
+    return messages
 
-        x, normals, _ = cells.at(element.points)
-        turned = replace(each.formulas, frame=Q)
-        bounded = each.given.key == THICKNESS
-        fit = fitted(
-            values,
-            cells,
-            values(x, normals),
-            element,
-            element.degree,
-            bounded=bounded,
-            formulas=turned,
+
+def _unresolved_formula(
+    key_formulas: PlacedFormulas, cells: Cells, Q: Array, h: float
+) -> list[str]:
+    """Return messages about one key, see `unresolved_formulas`."""
+    spec, element, messages = key_formulas.spec, cells.element, list[str]()
+
+    def values(x: Array, n: Array) -> Array:
+        return key_formulas.values_at(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
+
+    x, normals, _ = cells.at(element.points)
+    is_thickness = spec.key == THICKNESS
+    fit = fitted(
+        values,
+        cells,
+        values(x, normals),
+        element,
+        element.degree,
+        bounded=is_thickness,
+        formulas=replace(key_formulas.formulas, frame=Q),
+    )
+    missed_square = fit.rest**2
+    if fit.open:
+        messages.append(
+            f"{spec.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its "
+            "variation may not be seen"
         )
-        missed = fit.rest**2
-        if fit.open:
-            said.append(
-                f"{each.given.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its variation may not "
-                "be seen"
-            )
-        wrong = _wrong_stiffness(values, cells, fit.nodal) if each.given.key == THICKNESS else 0.0
-        lost = max(fit.missed, missed if each.given.deformed and missed > SQUARE else 0.0)
-        if lost > TOTAL:
-            off = f"{100 * lost:.2g} %"
-            said.append(
-                f"{each.given.key}: varies so much within elements that its integral may be wrong by {off}"
-            )
-        elif wrong > STIFFNESS:
-            said.append(
-                f"{each.given.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
-                f"integral is right, but the stiffness may be wrong by {100 * wrong:.2g} %; take a smaller mesh.size "
-                "or a larger mesh.refinement"
-            )
-        elif missed > SQUARE and not (each.given.load and fit.widest < 4 * SHOWN * sqrt(h)):
-            said.append(
-                f"{each.given.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
-                f"integral is right, but that of its square lacks {100 * missed:.2g} %; take a smaller mesh.size or a "
-                "larger mesh.refinement"
-            )
-    return said
+    stiffness_error = _stiffness_error(values, cells, fit.nodal) if is_thickness else 0.0
+    counts_square = spec.deformed and missed_square > SQUARE_TOLERANCE
+    missed_integral = max(fit.missed, missed_square if counts_square else 0.0)
+    is_resolved_load = spec.load and fit.widest < RESOLVED_LOAD * LOAD_SIZE * sqrt(h)
+    if missed_integral > INTEGRAL_TOLERANCE:
+        messages.append(
+            f"{spec.key}: varies so much within elements that its integral may be wrong by "
+            f"{100 * missed_integral:.2g} %"
+        )
+    elif stiffness_error > STIFFNESS_TOLERANCE:
+        messages.append(
+            f"{spec.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+            f"integral is right, but the stiffness may be wrong by {100 * stiffness_error:.2g} %; "
+            "take a smaller mesh.size or a larger mesh.refinement"
+        )
+    elif missed_square > SQUARE_TOLERANCE and not is_resolved_load:
+        messages.append(
+            f"{spec.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+            f"integral is right, but that of its square lacks {100 * missed_square:.2g} %; "
+            "take a smaller mesh.size or a larger mesh.refinement"
+        )
+    return messages
 
 
-def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
-    """By how much the stiffness t^3 or the compliance 1/t^3 of the cells differs, over that of all;
-    collective.
+def _stiffness_error(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
+    """Return the error of the stiffness t^3 or the compliance 1/t^3 of the cells; collective.
 
-    Parts of a shell that carry side by side add their stiffness, those in a row their compliance.
-    That of a cell is what polynomial curvatures of its degree less two show under a constant
-    moment. The squares of moments may be alike everywhere or fall to zero along an axis, as those
-    of a cantilever: the largest difference counts.
+    It is over the exact value of all cells. Parts of a shell that carry side by side add their stiffness,
+    those in a row their compliance. That of a cell is what polynomial curvatures of its degree less
+    two show under a constant moment. The squares of moments may be equal everywhere or fall to zero
+    along an axis, as those of a cantilever: the largest difference counts.
+
+    Parameters
+    ----------
+    values
+        Places and normals -> exact thickness factors.
+    nodal
+        (cells, nodes, 1) thickness factors of the cells.
     """
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
     x, normals, area = cells.at(X)
@@ -446,26 +506,25 @@ def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, noda
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
     moment = np.einsum("cq,qi->ci", area * w, phi)
     A = np.einsum("cq,cq,qi,qj->cij", area * w, p[..., 0] ** 3, phi, phi, optimize=True)
-    shown = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
-    true = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
-    off = np.abs(true - np.stack([(weight * p**3).sum(axis=(1, 2)), shown], axis=1))
-    middle, least, most = (
-        x.mean(axis=1),
-        x.min(axis=(0, 1), initial=inf),
-        x.max(axis=(0, 1), initial=-inf),
+    compliance = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
+    stiffness = (weight * p**3).sum(axis=(1, 2))
+    exact = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
+    error = np.abs(exact - np.stack([stiffness, compliance], axis=1))
+    middle = x.mean(axis=1)
+    low = np.min(cells.comm.allgather(x.min(axis=(0, 1), initial=inf)), axis=0)
+    high = np.max(cells.comm.allgather(x.max(axis=(0, 1), initial=-inf)), axis=0)
+    position = (middle - (low + high) / 2) / np.maximum((high - low) / 2, MIN_EXTENT)
+    # squares of moments: constant, and falling to zero along each axis in either direction
+    moments = [np.ones((len(x), 1)), (1 + position) ** 2, (1 - position) ** 2]
+    squared_moments = np.concatenate(moments, axis=1)
+    error_integral, exact_integral = (
+        cells.sum(v[..., None] * squared_moments[:, None]) for v in (error, exact)
     )
-    least, most = (
-        np.min(cells.comm.allgather(least), axis=0),
-        np.max(cells.comm.allgather(most), axis=0),
-    )
-    along = (middle - (least + most) / 2) / np.maximum((most - least) / 2, SMALLEST_EXTENT)
-    loaded = np.concatenate([np.ones((len(x), 1)), (1 + along) ** 2, (1 - along) ** 2], axis=1)
-    shares = [cells.sum(each[..., None] * loaded[:, None]) for each in (off, true)]
-    return float((shares[0] / shares[1]).max())
+    return float((error_integral / exact_integral).max())
 
 
 def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:
-    """The cells of a triangulation, with the places of a model of that degree."""
+    """Return the cells of a triangulation, with the places of a model of that degree."""
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.gll_warped
     )

@@ -1,5 +1,4 @@
-"""A quantity observed along a path, an amplitude that varies, their units, and the spelling of
-their symbols.
+"""Quantities observed along a path, amplitudes that vary, their units and their symbols.
 
 A unit is data: what one of a dimensionless number is, as a function of the shell's sizes.
 """
@@ -28,8 +27,8 @@ SUPERSCRIPTS = str.maketrans("²³⁴", "234")
 
 
 @dataclass(frozen=True)
-class Given:
-    """What a case gives with units; nan for what it gives without.
+class CaseSizes:
+    """Sizes of a shell with units, from which units of columns follow; nan where a case has none.
 
     Attributes
     ----------
@@ -97,7 +96,7 @@ class Unit:
     si: str = ""
     ending: str = ""
     shown: str = ""
-    size: Callable[[Given], float] = lambda given: nan
+    size: Callable[[CaseSizes], float] = lambda sizes: nan
     text: str = ""
     needs: str = "youngs_modulus and lengths of the shell with units"
     formula: str | None = None
@@ -105,16 +104,16 @@ class Unit:
     symbol: str | None = None
 
     @property
-    def written(self) -> str:
+    def formula_text(self) -> str:
         """The unit as a formula."""
         return self.key if self.formula is None else self.formula
 
 
-DENSITY_TOO = "density, youngs_modulus and lengths of the shell with units"
+NEEDS_DENSITY = "density, youngs_modulus and lengths of the shell with units"
 
 
-def _in_si(given: Given) -> float:
-    return given.in_si
+def _in_si(sizes: CaseSizes) -> float:
+    return sizes.in_si
 
 
 PRESSURE = Unit(
@@ -158,14 +157,14 @@ FORCE = Unit("force", "N", "N", "N", _in_si, formula="")
 TORQUE = Unit("torque", "N m", "N_m", "N m", _in_si, formula="")
 WORK = Unit("work", "J", "J", "J", _in_si, formula="")
 TIME = Unit("t", "", "s", "s", lambda g: g.second, formula="")
-WAY = Unit("way", "", "mm", "mm", formula="")  # of motions, each of its own size
+DISTANCE = Unit("way", "", "mm", "mm", formula="")  # of motions, each with its own size
 TURN = Unit("turn", "", "degrees", "degrees", formula="")
-SECONDS = Unit("s", "s")
+SECOND_UNIT = Unit("s", "s")
 DEGREES = Unit("degrees", "degrees")
 
 
 def _letter(greek: str) -> str:
-    """The name of a Greek letter, as TeX spells it.
+    """Return the name of a Greek letter, as TeX spells it.
 
     Examples
     --------
@@ -177,7 +176,7 @@ def _letter(greek: str) -> str:
 
 
 def plain_text(text: str) -> str:
-    """Text with Greek letters and powers, for a terminal.
+    """Return text with Greek letters and powers in ASCII, for a terminal.
 
     Examples
     --------
@@ -195,12 +194,12 @@ def _tex(text: str) -> str:
     return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
 
-def spelled(value: float, form: str) -> str:
-    """A number in a format, without the sign of a zero.
+def format_number(value: float, form: str) -> str:
+    """Return a number in a format, without the sign of a zero.
 
     Examples
     --------
-    >>> spelled(-1e-9, "8.4f"), spelled(-0.0, "+.1e"), spelled(-2, ".4g")
+    >>> format_number(-1e-9, "8.4f"), format_number(-0.0, "+.1e"), format_number(-2, ".4g")
     ('  0.0000', '+0.0e+00', '-2')
     """
     text = f"{value:{form}}"
@@ -209,7 +208,7 @@ def spelled(value: float, form: str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of path.csv.
+    """A quantity: a column of path.csv.
 
     Attributes
     ----------
@@ -251,20 +250,20 @@ class Quantity:
     @property
     def unit(self) -> str:
         """The unit as a formula such as "E h R²"; empty for a pure number."""
-        return self.units[0].written if self.units else ""
+        return self.units[0].formula_text if self.units else ""
 
     @property
     def si(self) -> str:
-        """That unit in SI."""
+        """The unit in SI."""
         return self.units[0].si if self.units else ""
 
     @property
-    def plain(self) -> str:
+    def ascii_symbol(self) -> str:
         """The symbol for a terminal.
 
         Examples
         --------
-        >>> [Quantity("", "", "", "load", symbol).plain for symbol in ("p/p_c", "λ_m", "ΔV/R³")]
+        >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in ("p/p_c", "λ_m", "ΔV/R³")]
         ['p/pc', 'lambda_m', 'dV/R^3']
         """
         return plain_text(re.sub(r"(?<=[A-Za-z])_", "", self.symbol)) or self.words
@@ -278,8 +277,8 @@ class Quantity:
         >>> [Quantity("", "", "", "load", symbol).latex for symbol in ("p/p_c", "λ_m", "F R/(2πD)")]
         ['$p/p_\\\\mathrm{c}$', '$\\\\lambda_\\\\mathrm{m}$', '$F R/(2\\\\pi D)$']
         """
-        spelled = re.sub(r" ?_(\w+)", r"_\\mathrm{\1}", _tex(self.symbol))
-        return f"${spelled}$" if self.symbol else self.words
+        tex = re.sub(r" ?_(\w+)", r"_\\mathrm{\1}", _tex(self.symbol))
+        return f"${tex}$" if self.symbol else self.words
 
     @property
     def html(self) -> str:
@@ -307,40 +306,38 @@ class Quantity:
         return f"{words}  ({self.unit})" if self.unit else words
 
     def on_axis(self, row: Mapping[str, float | int | str]) -> float:
-        """Its value in a row of path.csv, with the sign of the axis."""
+        """Return its value in a row of path.csv, with the sign of the axis."""
         return self.sign * float(row[self.name])
 
     @property
     def scale(self) -> str:
         """The key of its unit; of a number without one the kind, also of the factor of a motion."""
-        return self.units[0].key if self.units and self.units[0] is not WAY else self.kind
+        return self.units[0].key if self.units and self.units[0] is not DISTANCE else self.kind
 
-    def of(self, name: str) -> "Quantity":
-        """The column of one of several."""
+    def for_name(self, name: str) -> "Quantity":
+        """Return the column of one of several, by its name."""
         return replace(self, name=f"{self.name}_{name}", words=f"{self.words} {name}", note="")
 
     def in_unit(self, unit: Unit) -> "Quantity":
-        """The column in the unit that is shown for one of its units."""
-        stem, symbol = (
-            self.stem or self.name.replace("_over_h", ""),
-            re.split("[ /]", self.symbol)[0],
-        )
+        """Return the column in the unit that is displayed for one of its units."""
+        stem = self.stem or self.name.replace("_over_h", "")
+        symbol = re.split("[ /]", self.symbol)[0]
         words = self.words if unit.words is None else unit.words
-        symbol = symbol if unit.symbol is None or not symbol else unit.symbol
-        shown = Unit(unit.shown, unit.shown)
-        return replace(
-            self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,)
-        )
+        if unit.symbol is not None and symbol:
+            symbol = unit.symbol
+        displayed = Unit(unit.shown, unit.shown)
+        name = f"{stem}_{unit.ending}"
+        return replace(self, name=name, words=words, symbol=symbol, units=(displayed,))
 
     @cached_property
     def in_units(self) -> tuple["Quantity", ...]:
-        """The same in the units of a case, one of which is a column of its own where the case has
-        units.
+        """The columns in the units of a case, one of which is there where the case has units.
 
         Examples
         --------
         >>> from magshell_fenicsx.quantities.quantity import THICKNESS
-        >>> [q.name for q in Quantity("w_over_h", "", "", "displacement", "w/h", (THICKNESS,)).in_units]
+        >>> w = Quantity("w_over_h", "", "", "displacement", "w/h", (THICKNESS,))
+        >>> [q.name for q in w.in_units]
         ['w_mm']
         """
         return tuple(self.in_unit(unit) for unit in self.units if unit.ending)

@@ -1,5 +1,6 @@
-"""Every amplitude and every column of path.csv, in the order of the file, and those columns in a
-case's units.
+"""The registry of amplitudes and of columns of path.csv, in the order of the file.
+
+Each column may have a second one in the units of a case.
 """
 
 import re
@@ -10,6 +11,7 @@ from math import isnan, nan
 
 from magshell_fenicsx.quantities.quantity import (
     DEGREES,
+    DISTANCE,
     ENERGY,
     FIELD,
     MOMENT,
@@ -17,25 +19,21 @@ from magshell_fenicsx.quantities.quantity import (
     POINT_FORCE,
     PRESSURE,
     REACTION,
-    SECONDS,
+    SECOND_UNIT,
     STRENGTH,
     THICKNESS,
     TIME,
     TURN,
     VOLUME,
-    WAY,
     Amplitude,
-    Given,
+    CaseSizes,
     Kind,
     Quantity,
     Unit,
 )
 
-OWN_MODES = (
-    "",
-    "symmetric",
-    "asymmetric",
-)  # in the column of modes: those of the model itself; it excludes all others
+# Modes of the model itself in the column of modes; its symmetry excludes all others.
+OWN_MODES = ("", "symmetric", "asymmetric")
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -62,8 +60,8 @@ OF_EVERY_RUN = (
     Quantity(
         "lambda_m",
         "field",
-        "|Br||Ba|/(μ0 E), of a shell that is soft alone |Ba|/√(μ0 E), with the sign of the case; in SI the applied "
-        "flux density.",
+        "|Br||Ba|/(μ0 E), of a shell that is soft alone |Ba|/√(μ0 E), with the sign of the case; "
+        "in SI the applied flux density.",
         "load",
         "λ_m",
         (FIELD, STRENGTH),
@@ -81,7 +79,8 @@ OF_EVERY_RUN = (
     _w(
         "w_over_h",
         "",
-        "Inward displacement at the force (its mean over a patch), along the dead loads, or else of the pole.",
+        "Inward displacement at the force (its mean over a patch), along the dead loads, or else "
+        "of the pole.",
     ),
     _w(
         "w_from_field_over_h",
@@ -91,12 +90,14 @@ OF_EVERY_RUN = (
     _w(
         "w_pole_over_h",
         "of the pole",
-        "Inward displacement of the pole, a disc's centre or a strip's tip; of the first named point if there is one.",
+        "Inward displacement of the pole, a disc's centre or a strip's tip; of the first named "
+        "point if there is one.",
     ),
     Quantity(
         "volume_change",
         "change of volume",
-        "Change of the volume under the shell, with rigid lids on closed edges that move; negative where it shrinks.",
+        "Change of the volume under the shell, with rigid lids on closed edges that move; negative "
+        "where it shrinks.",
         "displacement",
         "ΔV/R³",
         (VOLUME,),
@@ -106,8 +107,8 @@ OF_EVERY_RUN = (
     Quantity(
         "negative_pivots",
         "unstable directions",
-        "Number of unstable directions of the model, with all amplitudes fixed except those whose conjugate is held; "
-        "at a fold, the number before it.",
+        "Number of unstable directions of the model, with all amplitudes fixed except those whose "
+        "conjugate is held; at a fold, the number before it.",
         "count",
     ),
     Quantity(
@@ -118,7 +119,7 @@ OF_EVERY_RUN = (
     ),
     Quantity("iterations", "iterations", "Iterations of Newton's method.", "count"),
     Quantity("factorisations", "factorisations", "Factorisations of the tangent.", "count"),
-    Quantity("wall_s", "time", "Time since the start of the run.", "time", units=(SECONDS,)),
+    Quantity("wall_s", "time", "Time since the start of the run.", "time", units=(SECOND_UNIT,)),
     _energy("stretching", "stretching", "Membrane energy; not of a solid."),
     _energy("bending", "bending", "Bending energy, including the edges; not of a solid."),
     _energy("magnetic", "magnetic", "Magnetic energy."),
@@ -158,7 +159,8 @@ OF_EVERY_RUN = (
     Quantity(
         "error_over_h",
         "error of u",
-        "Estimate of the algebraic error: the next Newton step; with errors: motion, that of steps in time.",
+        "Estimate of the algebraic error: the next Newton step; with errors: motion, that of steps "
+        "in time.",
         "error",
         "",
         (THICKNESS,),
@@ -194,12 +196,14 @@ IN_TIME = (  # of runs with a step of kind: time
     _energy(
         "work",
         "work",
-        "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored.",
+        "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was "
+        "stored.",
     ),
     _energy(
         "imbalance",
         "error of the balance",
-        "Kinetic + stored + dissipated - work less its value where the step begins: what steps in time gain or lose.",
+        "Kinetic + stored + dissipated - work less its value where the step begins: what steps in "
+        "time gain or lose.",
     ),
 )
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *IN_TIME)}
@@ -216,7 +220,8 @@ AMPLITUDES = {
 }
 # names of terms, and of amplitudes that only the solvers use
 INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
-TAKEN = {*AMPLITUDES, *INTERNAL}  # names that neither an energy of one's own nor a factor may have
+# Names that neither a user-defined energy nor a factor may have.
+RESERVED_NAMES = {*AMPLITUDES, *INTERNAL}
 
 
 def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
@@ -225,47 +230,50 @@ def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = (
     AMPLITUDES.update({a.name: a for a in amplitudes})
 
 
-def take(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
-    """Add those that every case may have: no energy of one's own has the name of one."""
+def register_for_all_cases(
+    quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()
+) -> None:
+    """Add columns and amplitudes of every case; user-defined energies cannot have their names."""
     quantities, amplitudes = [*quantities], [*amplitudes]
     register(quantities, amplitudes)
-    TAKEN.update(each.name for q in quantities for each in (q, *q.in_units))
-    TAKEN.update(a.name for a in amplitudes)
+    RESERVED_NAMES.update(column.name for q in quantities for column in (q, *q.in_units))
+    RESERVED_NAMES.update(a.name for a in amplitudes)
 
 
-take(QUANTITIES.values())
+register_for_all_cases(QUANTITIES.values())
 
 
 def units_in_use() -> tuple[Unit, ...]:
-    """The units of all columns, those of supports and points too."""
+    """Return the units of all columns, those of supports and points too."""
     columns = (*QUANTITIES.values(), *map(quantity, ("_ux", "_fx", "_mx")))
     return tuple(dict.fromkeys(unit for q in columns for unit in q.units))
 
 
 def endings() -> dict[str, str]:
-    """Ending of a column in units -> the unit in words."""
+    """Return a mapping: ending of a column in units -> the unit in words."""
     return {unit.ending: unit.shown for unit in units_in_use() if unit.ending}
 
 
 def quantity(name: str) -> Quantity:
-    """The quantity of a column; a named point's displacement or a user-defined amplitude has its
-    own name.
+    """Return the quantity of a column.
+
+    A named point's displacement or a user-defined amplitude has its own name.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
-    if again := re.fullmatch(r"(force|load)_(\d+)", name):
-        of = QUANTITIES[AMPLITUDES[again[1]].column]
+    if further_load := re.fullmatch(r"(force|load)_(\d+)", name):
+        first_load = QUANTITIES[AMPLITUDES[further_load[1]].column]
         return replace(
-            of,
+            first_load,
             name=name,
-            words=f"{of.words} {again[2]}",
-            symbol=of.symbol and f"F_{again[2]} R/(2πD)",
+            words=f"{first_load.words} {further_load[2]}",
+            symbol=first_load.symbol and f"F_{further_load[2]} R/(2πD)",
         )
-    if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
+    if conjugate := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(
             name,
-            f"at {again[1].replace('_', ' ')}",
-            f"Displacement conjugate to {again[1]}, as w_over_h.",
+            f"at {conjugate[1].replace('_', ' ')}",
+            f"Displacement conjugate to {conjugate[1]}, as w_over_h.",
         )
     numbered = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
     first = QUANTITIES.get(numbered[1]) if numbered else None
@@ -275,45 +283,47 @@ def quantity(name: str) -> Quantity:
         q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)
     ]:
         longest = max(several, key=lambda q: len(q.name))
-        return longest.of(name.removeprefix(f"{longest.name}_"))
+        return longest.for_name(name.removeprefix(f"{longest.name}_"))
     kinds: dict[str, tuple[Kind, Unit]] = {
         "u": ("place", PLACE),
         "f": ("reaction", REACTION),
         "m": ("moment", MOMENT),
     }
     ending = re.search(r"_([ufm])[xyz]$", name)
-    kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (WAY, TURN))
+    kind, units = (
+        (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (DISTANCE, TURN))
+    )
     return Quantity(name, name.replace("_", " "), "", kind, units=units)
 
 
-def shown(name: str, columns: Collection[str]) -> Quantity:
-    """The quantity of a column, in the case's units if one of the columns has it in these."""
-    quantity_of_column = quantity(name)
-    return next(
-        (each for each in quantity_of_column.in_units if each.name in columns), quantity_of_column
-    )
+def shown_quantity(name: str, columns: Collection[str]) -> Quantity:
+    """Return the quantity of a column, in the case's units if one of the columns has these."""
+    dimensionless = quantity(name)
+    in_units = (q for q in dimensionless.in_units if q.name in columns)
+    return next(in_units, dimensionless)
 
 
 def amplitude(name: str) -> Amplitude:
-    """The amplitude with a name; a user-defined one has a column of the same name.
+    """Return the amplitude with a name; a user-defined one has a column of the same name.
 
     A second force or list of dead loads has its own columns: force_2 and w_force_2_over_h.
     """
-    if again := re.fullmatch(r"(force|load)_\d+", name):
-        return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[again[1]].place)
+    if further_load := re.fullmatch(r"(force|load)_\d+", name):
+        return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[further_load[1]].place)
     if name in AMPLITUDES:
         return AMPLITUDES[name]
-    for each in AMPLITUDES.values():
-        if each.each and name.startswith(f"{each.name}_"):
-            which = name.removeprefix(each.name)
-            return replace(
-                each, name=name, column=each.column + which, conjugate=each.conjugate + which
-            )
+    for several in AMPLITUDES.values():
+        if several.each and name.startswith(f"{several.name}_"):
+            suffix = name.removeprefix(several.name)
+            column, conjugate = several.column + suffix, several.conjugate + suffix
+            return replace(several, name=name, column=column, conjugate=conjugate)
     return Amplitude(name, name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
-    """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
+    """Return the quantities on the x and y axis of an amplitude's curve.
+
+    They are its conjugate displacement and its value.
 
     An angle, the time and the factor of a motion are on the x axis, and the displacement or the
     reaction on the y axis.
@@ -325,39 +335,42 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
         its own.
     """
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
-    for reaction in (
-        (*(f"{each}_{name}" for each in reactions), *reactions) if name not in AMPLITUDES else ()
-    ):
+    if name in AMPLITUDES:
+        candidates = []
+    else:
+        candidates = [*(f"{reaction}_{name}" for reaction in reactions), *reactions]
+    for reaction in candidates:
         if reaction in row:
-            return shown(name, row), shown(reaction, row)
-    varied, own = amplitude(name), f"w_{name}_over_h"
-    over, drawn = shown(own if own in row else varied.conjugate, row), shown(varied.column, row)
-    if varied.conjugate == "w_over_h":
-        over = replace(over, note=varied.place)
-    return (drawn, over) if varied.sideways else (over, drawn)
+            return shown_quantity(name, row), shown_quantity(reaction, row)
+    varying, own_column = amplitude(name), f"w_{name}_over_h"
+    conjugate = shown_quantity(own_column if own_column in row else varying.conjugate, row)
+    value = shown_quantity(varying.column, row)
+    if varying.conjugate == "w_over_h":
+        conjugate = replace(conjugate, note=varying.place)
+    return (value, conjugate) if varying.sideways else (conjugate, value)
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What one of a dimensionless number, or of a number in SI, is in the units that are shown.
+    """Sizes of dimensionless numbers, or of numbers in SI, in the units of a case.
 
     Attributes
     ----------
-    given
-        What the case gives with units; None for nothing.
+    case
+        Sizes that the case has with units; None without.
     moments
         Columns of reactions that are moments.
-    ways
-        Columns of motions -> the unit of their way, and its size.
+    distances
+        Columns of motions -> the unit of their distance or angle, and its size.
     """
 
-    given: Given | None = None
+    case: CaseSizes | None = None
     moments: Collection[str] = ()
-    ways: Mapping[str, tuple[Unit, float]] = field(default_factory=dict)
+    distances: Mapping[str, tuple[Unit, float]] = field(default_factory=dict)
 
     @cached_property
-    def of(self) -> Mapping[str, float]:
-        """Key of a unit -> its size, without those that the case lacks."""
+    def by_unit(self) -> Mapping[str, float]:
+        """Mapping: key of a unit -> its size, without those that the case lacks."""
         return {unit.key: size for unit in units_in_use() if (size := self._size(unit)) is not None}
 
     @property
@@ -366,36 +379,39 @@ class Sizes:
         return (STRENGTH if self._size(STRENGTH) else FIELD).shown
 
     def _size(self, unit: Unit) -> float | None:
-        size = unit.size(self.given) if self.given and unit.ending else nan
+        size = unit.size(self.case) if self.case and unit.ending else nan
         return None if isnan(size) else size
 
     def unit(self, name: str) -> Unit | None:
-        """The unit in which a column is shown; None if it has none in this case."""
-        if name in self.ways:
-            return self.ways[name][0]
+        """Return the unit of a column in this case; None if it has none."""
+        if name in self.distances:
+            return self.distances[name][0]
         units = [unit for unit in quantity(name).units if self._size(unit) is not None]
         if name in self.moments:
             units = [unit for unit in units if unit is MOMENT]
         return next(iter(units), None)
 
     def column(self, name: str) -> Quantity | None:
-        """The column in units for a dimensionless one; None if there is none."""
+        """Return the column in units of a dimensionless one; None if there is none."""
         unit = self.unit(name)
         return quantity(name).in_unit(unit) if unit else None
 
     def columns(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The columns in units for some columns."""
-        return tuple(shown.name for name in names if (shown := self.column(name)))
+        """Return the names of the columns in units of some columns."""
+        return tuple(in_unit.name for name in names if (in_unit := self.column(name)))
 
     def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
-        """The values of a row in units."""
-        units = ((name, unit) for name in row if (unit := self.unit(name)))
-        return {
-            quantity(name).in_unit(unit).name: float(row[name]) * self.size(name) + 0.0
-            for name, unit in units
-        }
+        """Return the values of a row in units, by the names of their columns."""
+        values = {}
+        for name in row:
+            if unit := self.unit(name):
+                column = quantity(name).in_unit(unit).name
+                values[column] = float(row[name]) * self.size(name) + 0.0
+        return values
 
     def size(self, name: str) -> float:
-        """What one of a column is in the unit in which it is shown; one without."""
+        """Return the size of one of a column in its unit; one without a unit."""
+        if name in self.distances:
+            return self.distances[name][1]
         unit = self.unit(name)
-        return self.ways[name][1] if name in self.ways else self.of[unit.key] if unit else 1.0
+        return self.by_unit[unit.key] if unit else 1.0

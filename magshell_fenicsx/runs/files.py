@@ -14,7 +14,7 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.section import given
+from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.output.fields.gathering import gatherer
@@ -284,9 +284,9 @@ class RunFiles:
         halved = problem.mirror and not isinstance(
             problem.mirror, Sector
         )  # of which ParaView has one half
-        mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror and halved else None
+        mirror = problem.mirror.rotated(problem.azimuth).plane if problem.mirror and halved else None
         self._of_whole = mirror is None
-        self._R = given(problem.context.shell).R
+        self._R = case_sizes(problem.context.shell).R
         about = About(problem.material.h, problem.material.nu, mirror, self._R)
         drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
         moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)

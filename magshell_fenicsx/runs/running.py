@@ -32,8 +32,8 @@ from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.quantities.quantity import spelled
-from magshell_fenicsx.quantities.registry import amplitude, shown
+from magshell_fenicsx.quantities.quantity import format_number
+from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 from magshell_fenicsx.runs.files import RunFiles, open_folder
 from magshell_fenicsx.runs.modes import frequencies_after, modes_after, wanted
 from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
@@ -495,7 +495,7 @@ def _line(row: Row) -> str:
 
 def _value(name: str, row: Row, form: str, words: str = "") -> str:
     """A column, in the case's units with five digits if it has any, else in a format."""
-    q = shown(name, row)
+    q = shown_quantity(name, row)
     rounding = q.kind == "displacement" and abs(float(row[name])) < ROUNDING
-    measured = spelled(0.0 if rounding else float(row[q.name]), "9.5g" if q.name != name else form)
-    return f"{words or q.plain} {measured}{f' {q.si}' if q.name != name else ''}"
+    measured = format_number(0.0 if rounding else float(row[q.name]), "9.5g" if q.name != name else form)
+    return f"{words or q.ascii_symbol} {measured}{f' {q.si}' if q.name != name else ''}"

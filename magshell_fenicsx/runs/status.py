@@ -11,8 +11,8 @@ from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.quantities.quantity import spelled
-from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown
+from magshell_fenicsx.quantities.quantity import format_number
+from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown_quantity
 from magshell_fenicsx.simulate.scene import Scene
 
 WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}
@@ -65,10 +65,10 @@ class Aim:
         >>> Aim("w_over_h", 20.0).text({"w_over_h": 5.0})
         'w/h 5 -> 20'
         """
-        q, of = shown(self.column, row), self.sizes.of.get(quantity(self.column).scale, 1.0)
+        q, of = shown_quantity(self.column, row), self.sizes.by_unit.get(quantity(self.column).scale, 1.0)
         size, unit = (of, f" {q.si}") if q.name != self.column else (1.0, "")
         end = self.words if self.end is None else f"{self.end * size:.4g}{unit}"
-        return f"{q.plain} {spelled(float(row[q.name]), '.4g')}{unit * (self.end is None)} -> {end}"
+        return f"{q.ascii_symbol} {format_number(float(row[q.name]), '.4g')}{unit * (self.end is None)} -> {end}"
 
 
 def aim(scene: Scene, step: ProgrammeStep) -> Aim:

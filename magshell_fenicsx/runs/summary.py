@@ -19,7 +19,7 @@ from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
-from magshell_fenicsx.shape.sections import ShellSection, Surface
+from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.record import Record
@@ -389,7 +389,7 @@ def _with_units(row: Row) -> set[str]:
 
 def in_units(result: Result) -> dict[str, float]:
     """The numbers of a case with units, with these in their names; none of a case without."""
-    of, shell = result.scene.sizes.of, result.scene.problem.context.shell
+    of, shell = result.scene.sizes.by_unit, result.scene.problem.context.shell
     sizes = {}
     if "p_c" in of:
         sizes["classical_pressure_Pa"] = of["p_c"]

@@ -69,7 +69,7 @@ def _number(scene: Scene, name: str, where: str, amount: Any, of_load: bool) -> 
         needed = "youngs_modulus and lengths of the shell with units"
         raise ValueError(f"{where}: has a unit: that needs {needed}; a number is in {scale}")
     try:
-        number = in_units(text)(amount) / scene.sizes.of[unit.key]
+        number = in_units(text)(amount) / scene.sizes.by_unit[unit.key]
     except ValueError as e:
         raise ValueError(f"{where}: {e}") from None
     return number if of_load else number * scene.conjugate_unit(name)

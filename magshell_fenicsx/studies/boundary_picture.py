@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.output.pictures.lines import smooth
-from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
 from magshell_fenicsx.studies.naming import key_label
 
 MARKS = {"cusp": "o", "turn": "s", "meeting": "D", "crossing": "X"}
@@ -119,7 +119,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
 
 def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
     """Rows whose load is in the case's units if they have it in these, and the label of its axis."""
-    of = shown(amplitude(load).column, {name for row in rows for name in row})
+    of = shown_quantity(amplitude(load).column, {name for row in rows for name in row})
     return [{**row, "load": row.get(of.name, row["load"])} for row in rows], of.label
 
 

@@ -385,7 +385,7 @@ def _value(result: Result, name: str) -> float | None:
         points = (
             p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"]
         )
-        size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0
+        size = result.scene.sizes.by_unit[SCALES[name]] if name in SCALES else 1.0
         return next((size * float(p["value"]) for p in points), None)
     if name == BARRIER:
         return result.barrier

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.input.tables import GREATEST, TableError, TableRows, column_size, read_rows
+from magshell_fenicsx.input.tables import (
+    MAX_MEASURED_NUMBER,
+    TableError,
+    TableRows,
+    column_size,
+    read_rows,
+)
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
@@ -240,9 +246,9 @@ def refuse_size(deviation: float, given: Amount, where: str) -> None:
     """
     if not deviation > 0:
         raise CaseError(f"{where}: must be positive, here {_text(given)}")
-    if not 1 / GREATEST <= deviation <= GREATEST:
+    if not 1 / MAX_MEASURED_NUMBER <= deviation <= MAX_MEASURED_NUMBER:
         raise CaseError(
-            f"{where}: {_text(given)}: allowed are numbers from {1 / GREATEST:g} to {GREATEST:g}"
+            f"{where}: {_text(given)}: allowed are numbers from {1 / MAX_MEASURED_NUMBER:g} to {MAX_MEASURED_NUMBER:g}"
         )
 
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown
+from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown_quantity
 from magshell_fenicsx.studies.points import short
 
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
@@ -68,8 +68,8 @@ def load_said(row: Mapping[str, Any], name: str) -> str:
     >>> load_said({"load": 0.5}, "pressure"), load_said({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
     ('p/pc = 0.5', 'p = 61.25 Pa')
     """
-    of = shown(amplitude(name).column, row)
-    return f"{of.plain} = {row.get(of.name, row['load']):.9g}" + (
+    of = shown_quantity(amplitude(name).column, row)
+    return f"{of.ascii_symbol} = {row.get(of.name, row['load']):.9g}" + (
         f" {of.si}" if of.name in row else ""
     )
 

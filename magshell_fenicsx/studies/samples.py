@@ -161,7 +161,7 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) ->
         One message with every such key.
     """
     middle, refused = (
-        {key: json.dumps(each.at(0.5)) for key, each in section.keys.items()},
+        {key: json.dumps(each.quantile(0.5)) for key, each in section.keys.items()},
         list[str](),
     )
     changed = copy.deepcopy(source)
@@ -174,7 +174,7 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) ->
     try:
         made(changed)
     except InvalidCase as e:
-        refused += e.of(*OF_KEYS)
+        refused += e.lines_of_kinds(*OF_KEYS)
     except CaseError:
         pass  # a matter of the values
     if refused:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magshell_fenicsx.input.section import given
+from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
 from magshell_fenicsx.studies.naming import key_label, key_symbol, key_words
 from magshell_fenicsx.studies.points import Axis, SweepPoint, along
@@ -94,7 +94,7 @@ def _fixed(axes: Sequence[Axis], points: Sequence[SweepPoint]) -> str:
     """R/h and Poisson's ratio, where all points have the same."""
     parts = []
     for symbol, values in (
-        ("$R/h$", {round(given(point.case.shell).R_over_h, 9) for point in points}),
+        ("$R/h$", {round(case_sizes(point.case.shell).R_over_h, 9) for point in points}),
         (r"$\nu$", {point.case.shell.poisson_ratio for point in points}),
     ):
         if len(values) == 1:

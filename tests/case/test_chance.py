@@ -37,19 +37,19 @@ LAWS = [
 def test_quantiles_are_those_of_scipy(section: dict[str, Any], law: Any) -> None:
     made = DistributionSection(**section)
     for part in (1e-6, 0.1, 0.5, 0.99):
-        assert made.at(part) == pytest.approx(law.ppf(part), rel=1e-9)
+        assert made.quantile(part) == pytest.approx(law.ppf(part), rel=1e-9)
 
 
 def test_lognormal_moments_are_those_of_the_number() -> None:
-    drawn = [DistributionSection(**LAWS[1][0]).at((i + 0.5) / 2_000) for i in range(2_000)]
+    drawn = [DistributionSection(**LAWS[1][0]).quantile((i + 0.5) / 2_000) for i in range(2_000)]
     assert np.mean(drawn) == pytest.approx(1, abs=1e-3)
     assert np.std(drawn) == pytest.approx(0.5, abs=1e-2)
 
 
 def test_choices_have_their_weights_and_units() -> None:
     made = DistributionSection(kind="choice", values=[1.5, "b"], weights=[3, 1])
-    assert [made.at(part) for part in (0.0, 0.7499, 0.7501, 1 - 1e-12)] == [1.5, 1.5, "b", "b"]
-    assert DistributionSection(kind="uniform", above=1.0, below=1.5, unit="mm").at(0.5) == "1.25 mm"
+    assert [made.quantile(part) for part in (0.0, 0.7499, 0.7501, 1 - 1e-12)] == [1.5, 1.5, "b", "b"]
+    assert DistributionSection(kind="uniform", above=1.0, below=1.5, unit="mm").quantile(0.5) == "1.25 mm"
 
 
 def test_places_are_uniform_in_area_and_apart() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx.input.expressions import FUNCTIONS, formula, with_derivatives
+from magshell_fenicsx.input.expressions import FUNCTIONS, formula, formula_with_derivatives
 
 PLACES = np.random.default_rng(0).uniform(0.2, 1.0, (20, 3))
 FORMULAS = [
@@ -33,12 +33,12 @@ def slope(f, i: int, step: float = 1e-3):  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("text", FORMULAS)
 def test_derivatives(text: str) -> None:
-    found = with_derivatives(text)(PLACES)
+    found = formula_with_derivatives(text)(PLACES)
     assert found.value == pytest.approx(formula(text)(*PLACES.T), rel=1e-14)
     for i in range(3):
         gradient = slope(lambda x: formula(text)(*x.T), i)
         assert found.gradient[i] == pytest.approx(gradient, rel=1e-9, abs=1e-9)
-        hessian = slope(lambda x: with_derivatives(text)(x).gradient, i)
+        hessian = slope(lambda x: formula_with_derivatives(text)(x).gradient, i)
         assert found.hessian[i] == pytest.approx(hessian, rel=1e-9, abs=1e-9)
 
 
@@ -46,12 +46,12 @@ def test_powers_at_zero() -> None:
     """x, x**2 and x**3 have derivatives there, the root has none."""
     zero = np.zeros((1, 3))
     for power, first, second in ((0, 0, 0), (1, 1, 0), (2, 0, 2), (3, 0, 0)):
-        found = with_derivatives(f"x**{power}")(zero)
+        found = formula_with_derivatives(f"x**{power}")(zero)
         assert (found.gradient[0, 0], found.hessian[0, 0, 0]) == (first, second)
-    assert not np.isfinite(with_derivatives("sqrt(x)")(zero).gradient).all()
+    assert not np.isfinite(formula_with_derivatives("sqrt(x)")(zero).gradient).all()
 
 
 def test_every_function_has_derivatives() -> None:
     for name, function in FUNCTIONS.items():
-        found = with_derivatives(f"{name}({', '.join(['x'] * function.nin)})")(PLACES)
+        found = formula_with_derivatives(f"{name}({', '.join(['x'] * function.nin)})")(PLACES)
         assert found.hessian.shape == (3, 3, 20)

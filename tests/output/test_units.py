@@ -221,7 +221,7 @@ def test_sign_of_the_field_and_strength_of_sources() -> None:
         }
         case = Case.from_source(Source("units", data))
         sizes = sizes_of(case.context)
-        return case.lambda_m * sizes.of["λ_m"], sizes.field
+        return case.lambda_m * sizes.by_unit["λ_m"], sizes.field
 
     value, unit = full(
         {"remanent": {"flux_density": "-63 mT"}, "applied": {"flux_density": "20 mT"}}

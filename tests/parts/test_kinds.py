@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal, get_args
 import pytest
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.input.section import Section, numbers_with_units, over
+from magshell_fenicsx.input.section import Section, numbers_with_units, over_size
 from magshell_fenicsx.parts.kinds import REGISTERED, section_of
 from magshell_fenicsx.quantities.quantity import PRESSURE
-from magshell_fenicsx.shape.ground import Coordinates
+from magshell_fenicsx.shape.reference_shell import Coordinates
 
 PARTS = "magshell_fenicsx.parts"
 
@@ -80,7 +80,7 @@ class Placed(Section):
     kind: Literal["placed"]
     through: list[Coordinates]
     name: str
-    target: Annotated[float, over(PRESSURE)] | None = None
+    target: Annotated[float, over_size(PRESSURE)] | None = None
 
 
 def test_numbers_with_units_are_found_by_what_is_made_of_them() -> None:

@@ -14,7 +14,7 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.platform import environment
-from magshell_fenicsx.problem.memory import Memory
+from magshell_fenicsx.problem.memory import MemoryEstimate
 
 DIMPLE, BRACKET = CASES / "dimple_buckling.yaml", CASES / "bracket.yaml"
 FULL = ["--set", "symmetry=none"]
@@ -88,8 +88,8 @@ def test_estimates(
     path past its fold.
     """
     case = ms.Case.load(DIMPLE, [f"mesh.degree={degree}"])
-    found = Memory.of(case.context, unknowns, half=half)
-    for measured, estimated in ((least, found.least), (most, found.most)):
+    found = MemoryEstimate.for_unknowns(case.context, unknowns, half=half)
+    for measured, estimated in ((least, found.min_bytes), (most, found.max_bytes)):
         assert measured is None or estimated / 1e9 == pytest.approx(measured, rel=0.15)
 
 

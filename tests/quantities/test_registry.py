@@ -51,7 +51,7 @@ def test_labels_can_be_drawn(name: str) -> None:
     assert known.meaning.endswith(".")
     for text in (known.latex, known.label):
         assert parser.parse(text).width > 0
-    assert known.plain.isascii()
+    assert known.ascii_symbol.isascii()
 
 
 @pytest.mark.parametrize("name", AMPLITUDES)
@@ -79,4 +79,4 @@ def test_only_named_points_have_the_unit_of_lengths() -> None:
 
 def test_force_has_one_symbol_in_all_spellings() -> None:
     force = quantity("force")
-    assert (force.plain, force.latex, force.html) == ("F R/(2piD)", r"$F R/(2\pi D)$", "F R/(2πD)")
+    assert (force.ascii_symbol, force.latex, force.html) == ("F R/(2piD)", r"$F R/(2\pi D)$", "F R/(2πD)")

@@ -166,7 +166,7 @@ def test_results_in_units(tmp_path: Path) -> None:
             )
         )
         assert result.knockdown
-        return result.knockdown * result.scene.sizes.of["p_c"]
+        return result.knockdown * result.scene.sizes.by_unit["p_c"]
 
     slope = (buckling(1.301e6) - buckling(1.299e6)) / 2e3
     for name in ("buckling_pressure_Pa", "pressure_Pa"):

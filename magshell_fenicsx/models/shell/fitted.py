@@ -20,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import Together
+from magshell_fenicsx.input.expressions import FormulaGroup
 from magshell_fenicsx.models.shell.unseen import AT_ONCE, CHILDREN, Lattice, Parts, leaves
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ def fitted(
     degree: int,
     *,
     bounded: bool = False,
-    formulas: Together | None = None,
+    formulas: FormulaGroup | None = None,
 ) -> Fit:
     """A formula whose values at the nodes of each cell are known; collective.
 
@@ -257,7 +257,7 @@ class _Narrow:
         return Parts.together([alike.of(chosen[~deep]), *small, parts])
 
 
-def _narrow(values: Values, formulas: Together, cells: Cells, coarse: Array) -> _Narrow:
+def _narrow(values: Values, formulas: FormulaGroup, cells: Cells, coarse: Array) -> _Narrow:
     """Integrals (cells, components) compared with those over leaves, see `unseen.leaves`;
     collective.
     """

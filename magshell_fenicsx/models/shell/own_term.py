@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import function
+from magshell_fenicsx.input.expressions import formula_function
 from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
@@ -86,7 +86,7 @@ class ByPlace:
     @property
     def of_place(self) -> Callable[[Array, Array, Array], Array]:
         """The formula as a function of arrays of coordinates in the model's frame."""
-        of_case = function(self.text)
+        of_case = formula_function(self.text)
         if not self.turn:
             return of_case
         Q = rotation(self.turn)

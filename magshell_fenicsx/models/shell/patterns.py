@@ -10,11 +10,11 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import Together, together
-from magshell_fenicsx.mesh.assembly import Place
-from magshell_fenicsx.mesh.given import stored
+from magshell_fenicsx.input.expressions import FormulaGroup, formula_group
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.mesh.patch import GivenField, MeshError, refuse_places
+from magshell_fenicsx.mesh.multi_shell import ShellPose
+from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
+from magshell_fenicsx.mesh.user_mesh import lagrange_element
 from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
 from magshell_fenicsx.models.shell.own_term import ByPlace
 
@@ -78,8 +78,8 @@ class Components:
         return np.stack([f(*np.moveaxis(r0, -1, 0)) for f in self.of_position], axis=-1)
 
     @property
-    def formulas(self) -> Together | None:
-        return together(self.of_position, self.frame)
+    def formulas(self) -> FormulaGroup | None:
+        return formula_group(self.of_position, self.frame)
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class Placed:
     """The pattern of one shell of several in its own frame, times a factor."""
 
     pattern: Pattern
-    place: Place
+    place: ShellPose
     factor: float = 1.0
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        own = self.pattern(self.place.own(r0), n0 @ self.place.Q)
+        own = self.pattern(self.place.to_shell_frame(r0), n0 @ self.place.Q)
         return np.asarray(self.factor * own @ self.place.Q.T)
 
 
@@ -188,7 +188,7 @@ class Carried:
         return X
 
 
-def carried(given: GivenField, midsurface: Midsurface, cells: Cells) -> Carried:
+def carried(given: UserField, midsurface: Midsurface, cells: Cells) -> Carried:
     """What was given on the mesh, in the cells of this rank.
 
     Raises
@@ -201,7 +201,7 @@ def carried(given: GivenField, midsurface: Midsurface, cells: Cells) -> Carried:
             f"{given.name}: is a function of degree {given.degree}; allowed is at most that of the displacement, "
             f"{cells.element.degree}"
         )
-    return Carried(midsurface.in_cells(given), stored(given.degree), cells)
+    return Carried(midsurface.in_cells(given), lagrange_element(given.degree), cells)
 
 
 def by_patch(

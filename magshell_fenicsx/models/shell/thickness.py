@@ -9,9 +9,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.expressions import Together
-from magshell_fenicsx.mesh.assembly import Place
-from magshell_fenicsx.mesh.patch import GivenField, MeshError, refuse_places
+from magshell_fenicsx.input.expressions import FormulaGroup
+from magshell_fenicsx.mesh.multi_shell import ShellPose
+from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.parameters import OwnMaterial
@@ -32,8 +32,8 @@ class Thickness:
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
     patches: "Mapping[str, float | PlacedFactor] | None" = None
-    formulas: Together | None = None
-    given: GivenField | None = None
+    formulas: FormulaGroup | None = None
+    given: UserField | None = None
     carried: Carried | None = None
 
     def at(self, x: Array) -> Array:
@@ -68,7 +68,7 @@ class PlacedFactor:
     """The thickness of a shell that has a place, times a number."""
 
     own: Thickness
-    place: Place
+    place: ShellPose
     times: float
 
     def in_cells(self, cells: Cells) -> Array:
@@ -76,9 +76,9 @@ class PlacedFactor:
         collective.
         """
         if cells.nodal.shape[-1] == 3:
-            nodal = x = self.place.own(cells.nodal)
+            nodal = x = self.place.to_shell_frame(cells.nodal)
         else:
-            x = self.place.own(np.insert(cells.nodal, 1, 0.0, axis=-1))
+            x = self.place.to_shell_frame(np.insert(cells.nodal, 1, 0.0, axis=-1))
             nodal = np.stack([np.hypot(x[..., 0], x[..., 1]), x[..., 2]], axis=-1)
         return self.times * self.own.shown(replace(cells, nodal=nodal), self.own.at(x))
 

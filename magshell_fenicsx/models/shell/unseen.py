@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import Together
+from magshell_fenicsx.input.expressions import FormulaGroup
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -152,7 +152,7 @@ class Leaves:
 
 
 def leaves(
-    formulas: Together,
+    formulas: FormulaGroup,
     first: Parts,
     look: Look,
     lattice: Lattice,
@@ -229,7 +229,7 @@ class _Seen:
         )
 
 
-def _seen(formulas: Together, parts: Parts, look: Look, lattice: Lattice) -> _Seen:
+def _seen(formulas: FormulaGroup, parts: Parts, look: Look, lattice: Lattice) -> _Seen:
     """A look at each part, with the box of its places and of what bulges between them."""
     x, area = look(parts)
     low, high = x.min(axis=1), x.max(axis=1)

@@ -25,7 +25,7 @@ from magshell_fenicsx.output.fields.surface import (
 )
 from magshell_fenicsx.output.store.durable import Damaged, write_whole
 from magshell_fenicsx.output.store.table import read_rows
-from magshell_fenicsx.quantities.registry import amplitude, shown
+from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -153,7 +153,7 @@ def read_grid(file: Path, made: "Callable[[vtkUnstructuredGrid], Read]") -> "Rea
         raise Damaged(
             f"{file}: is damaged: {'it is cut off' if file.exists() else 'it is missing'}"
         )
-    errors, reader, shown = (
+    errors, reader, vtk_warnings = (
         list[str](),
         vtkXMLUnstructuredGridReader(),
         vtkObject.GetGlobalWarningDisplay(),
@@ -167,7 +167,7 @@ def read_grid(file: Path, made: "Callable[[vtkUnstructuredGrid], Read]") -> "Rea
     except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
         raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     finally:
-        vtkObject.SetGlobalWarningDisplay(shown)
+        vtkObject.SetGlobalWarningDisplay(vtk_warnings)
     if errors or reader.GetErrorCode():
         raise Damaged(f"{file}: is damaged: VTK cannot read it")
     return read
@@ -352,12 +352,12 @@ def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     if rows and "time" in rows[0]:
         times = list[float]()
         for row in rows:
-            t = float(row[shown("time", row).name])
+            t = float(row[shown_quantity("time", row).name])
             times.append(max(t, times[-1] + LATER) if times else t)
         return times
     if len(varied) != 1:
         return numbers
-    column = shown(amplitude(next(iter(varied))).column, rows[0]).name
+    column = shown_quantity(amplitude(next(iter(varied))).column, rows[0]).name
     loads = [float(row[column]) for row in rows]
     return loads if all(a < b for a, b in pairwise(loads)) else numbers
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.quantities.quantity import spelled
-from magshell_fenicsx.quantities.registry import amplitude, shown
+from magshell_fenicsx.quantities.quantity import format_number
+from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -144,7 +144,7 @@ def caption(h: float, nu: float, row: Row, driven: Iterable[str] = ()) -> str:
 
 def named_value(name: str, row: Row, digits: int = 4) -> str:
     """A column of a row, in the case's units if it has any."""
-    q = shown(name, row)
+    q = shown_quantity(name, row)
     unit = q.si.replace("%", r"\%") if q.name != name else ""
     return f"{q.latex} = {in_mathematics(float(row[q.name]), digits)}{f' {unit}' if unit else ''}"
 
@@ -157,7 +157,7 @@ def in_mathematics(value: float, digits: int) -> str:
     >>> in_mathematics(0.32623, 4), in_mathematics(-5.5, 4), in_mathematics(-1.5e-06, 4)
     ('0.3262', '−5.5', '$-1.5 \\\\times 10^{-6}$')
     """
-    mantissa, _, exponent = spelled(value, f".{digits}g").partition("e")
+    mantissa, _, exponent = format_number(value, f".{digits}g").partition("e")
     return (
         rf"${mantissa} \times 10^{{{int(exponent)}}}$" if exponent else mantissa.replace("-", "−")
     )

@@ -20,16 +20,16 @@ from magshell_fenicsx.output.pictures.lines import (
     axes_for,
     drawn_parts,
     is_unstable,
-    lines_of,
+    line_coordinates,
     named,
     of_load,
     place,
 )
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import shown
+from magshell_fenicsx.quantities.registry import shown_quantity
 from magshell_fenicsx.shells.modes import TORSION
 
 if TYPE_CHECKING:  # takes long to import
@@ -190,7 +190,7 @@ def draw_lines(
     """
     drawn, at = list[Array](), place_of or (lambda row: place(row, of.amplitude))
     load = None if place_of else of_load(of.amplitude)
-    for line in lines_of(of):
+    for line in line_coordinates(of):
         curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
         drawn.append(curve)
         crossings = [row for row in of.rows if row["label"] in LOCATED and row not in line.rows]
@@ -246,7 +246,7 @@ def hidden(axes: "Axes", of: Part) -> Array | None:
     """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can
     be seen.
     """
-    for line in lines_of(of):
+    for line in line_coordinates(of):
         places = [place(row, of.amplitude) for row in line.rows]
         curve = line.joined(*zip(*places, strict=True), of_load=of_load(of.amplitude))
         for first, last, unstable in line.pieces:
@@ -308,7 +308,7 @@ def frequencies_figure(
     from matplotlib.ticker import MaxNLocator
 
     varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
-    column = shown(registered(varied).column, rows[0]) if varied else None
+    column = shown_quantity(registered(varied).column, rows[0]) if varied else None
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
     vibrating = (it for it in frequencies if it.omega2 > 0 and not np.isnan(it.hertz))
     of_root = max(

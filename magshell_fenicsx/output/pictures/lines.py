@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown
+from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown_quantity
 from magshell_fenicsx.quantities.registry import amplitude as registered
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def axes_for(part: Part) -> tuple[Quantity, Quantity]:
     if part.amplitude == "load" and all(
         row["w_over_h"] == row["w_pole_over_h"] for row in part.rows
     ):
-        x = shown("w_pole_over_h", part.rows[0])  # moments have no conjugate displacement
+        x = shown_quantity("w_pole_over_h", part.rows[0])  # moments have no conjugate displacement
     return x, y
 
 
@@ -171,7 +171,7 @@ class Line:
         return smooth(x, y, [row["label"] in LOCATED for row in self.rows], level)
 
 
-def lines_of(part: Part) -> list[Line]:
+def line_coordinates(part: Part) -> list[Line]:
     """The branches of a part of a path, in their order."""
     path = [row for row in part.rows if row["label"] != SOLUTION]
     in_time = part.amplitude == "time"

@@ -37,8 +37,8 @@ from magshell_fenicsx.output.pictures.picture import Background, spread
 from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
 from magshell_fenicsx.output.pictures.view import Camera, Window
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
-from magshell_fenicsx.problem.wanted import OutputSection
-from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown
+from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown_quantity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -281,7 +281,7 @@ def _null_vector(
         column = amplitude(str(row["amplitude"])).column
         largest = max(abs(float(each[column])) for each in rows)
         rounded = row if abs(float(row[column])) > ZERO * largest else {**row, column: 0.0}
-        rounded = rounded if rounded is row else {**rounded, shown(column, row).name: 0.0}
+        rounded = rounded if rounded is row else {**rounded, shown_quantity(column, row).name: 0.0}
         where = f"\n{named_value(column, rounded, 5)}"
     which = ", ".join(str(numbers[int(each["point"])]) for each in met[int(row["point"])])
     return surface, f"{which}: {row['label']}{kind}{where}"

@@ -8,9 +8,9 @@ from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, columns,
 from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import shown
+from magshell_fenicsx.quantities.registry import shown_quantity
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ def readings_figure(
     from matplotlib.figure import Figure
 
     names, part = list(case["sensors"]), worth_drawing(drawn_parts(rows, amplitude))[-1]
-    load = shown(registered(part.amplitude).column, part.rows[0])
+    load = shown_quantity(registered(part.amplitude).column, part.rows[0])
     size, unit = unit_of(case)
 
     def over_load(column: str) -> PlaceOf:

@@ -31,7 +31,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import headline, is_flat, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
-from magshell_fenicsx.quantities.registry import amplitude, shown
+from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
 NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # a table with at least so many points is folded
@@ -166,7 +166,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
 
 def _head(name: str, line: Line) -> Markup:
     """The heading of a column with its unit, and its size where the symbol does not have it."""
-    of_column = shown(name, line)
+    of_column = shown_quantity(name, line)
     where = pole_head(line) if name == "w_pole_over_h" else head(of_column)
     return Markup("{} ({})").format(where, of_column.shown_unit) if of_column.shown_unit else where
 
@@ -249,13 +249,13 @@ def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[st
         "mode": line["mode"] or "–",
         "branch": int(line["branch"]),
         "load": value(line, summary),
-        "w": amount(shown("w_over_h", line).name, line, lines),
-        "pole": amount(shown("w_pole_over_h", line).name, line, lines),
+        "w": amount(shown_quantity("w_over_h", line).name, line, lines),
+        "pole": amount(shown_quantity("w_pole_over_h", line).name, line, lines),
     }
 
 
 def _solution(it: dict[str, Any]) -> list[Markup | str]:
-    names = (shown(name, it).name for name in SOLUTION_COLUMNS)
+    names = (shown_quantity(name, it).name for name in SOLUTION_COLUMNS)
     numbers = (number(it[name]) for name in names)
     return [
         f"{it['point']}",

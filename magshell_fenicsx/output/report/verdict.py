@@ -17,7 +17,13 @@ from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import is_flat, pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
-from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, quantity, shown
+from magshell_fenicsx.quantities.registry import (
+    OWN_MODES,
+    amplitude,
+    axes_of,
+    quantity,
+    shown_quantity,
+)
 
 ROUNDING = (
     1e-15,
@@ -136,7 +142,7 @@ def head(of_column: Quantity) -> Markup:
 def pole_head(line: Line, pole: str = POLE) -> Markup:
     """The heading of w_pole_over_h, with the point that it belongs to."""
     return Markup("{}, {}").format(
-        head(shown("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the ")
+        head(shown_quantity("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the ")
     )
 
 
@@ -155,7 +161,7 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     """
     first_line = lines[0] if lines else {}
     in_units = {
-        of_column.name for name in first_line if (of_column := shown(name, first_line)).name != name
+        of_column.name for name in first_line if (of_column := shown_quantity(name, first_line)).name != name
     }
     names = [name for name in first_line if name != "point" and name not in in_units]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
@@ -170,7 +176,7 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     energies = _energies(lines, [name for name in varying if quantity(name).kind == "energy"])
     table = {}
     for name in varying:
-        of_column = shown(name, first_line)
+        of_column = shown_quantity(name, first_line)
         of_all = energies if of_column.kind == "energy" else ()
         table[name] = _column(
             of_column, [line.get(of_column.name, "") for line in lines], length_unit, of_all
@@ -182,7 +188,7 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
 
 def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
     """All energies of a path: their columns have one power of ten, so that they can be compared."""
-    return [float(line[shown(name, line).name]) for line in lines for name in names]
+    return [float(line[shown_quantity(name, line).name]) for line in lines for name in names]
 
 
 def _column(
@@ -325,7 +331,7 @@ def value(line: Line, summary: Summary) -> Markup:
     """
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
-    size = shown(name, line)
+    size = shown_quantity(name, line)
     in_that_unit = size.symbol == quantity(name).symbol and float(line[size.name]) == float(
         line[name]
     )
@@ -459,7 +465,7 @@ def _untouched(line: Line) -> Markup:
     gap = -float(line[name])
     if above_rounding(gap, ()) <= 0:
         return Markup("")
-    of_gap = shown(name, line)
+    of_gap = shown_quantity(name, line)
     unit = f" {of_gap.shown_unit}" if of_gap.shown_unit else " h"
     return Markup(" The body has not touched the shell: there is a gap of {}{}.").format(
         number(-float(line[of_gap.name])), unit
@@ -469,7 +475,7 @@ def _untouched(line: Line) -> Markup:
 def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     """The displacement, and the force on what moves."""
     varied = amplitude(line["amplitude"])
-    at_pole = Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line, lines), pole)
+    at_pole = Markup("{} at {}").format(_amount(shown_quantity("w_pole_over_h", line), line, lines), pole)
     force = [
         q
         for q in axes_of(line["amplitude"], line)
@@ -478,7 +484,7 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     if force and varied.column != "force":
         return Markup("{}, {}").format(_amount(force[0], line, lines), at_pole)
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
-        return Markup("{} {}").format(_amount(shown("w_over_h", line), line, lines), varied.place)
+        return Markup("{} {}").format(_amount(shown_quantity("w_over_h", line), line, lines), varied.place)
     return at_pole
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.input_files import read_bounded
+from magshell_fenicsx.platform.processes import on_first_rank
 
 if TYPE_CHECKING:  # a refused case does without
     from mpi4py import MPI

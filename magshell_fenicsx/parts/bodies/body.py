@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.section import Along, Section, or_number
+from magshell_fenicsx.input.section import DirectionVector, Section, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.quantities.registry import endings
-from magshell_fenicsx.shape.ground import At, Coordinates
-from magshell_fenicsx.shape.solids import Solid
-from magshell_fenicsx.shape.symmetry import unit
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import At, Coordinates
+from magshell_fenicsx.shape.symmetry_constraint import unit
 
 Array = NDArray[np.float64]
-Axis = Along
+Axis = DirectionVector
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e9)]
 ALONG = 1e-6  # part of an axis across the approach that counts as none
 

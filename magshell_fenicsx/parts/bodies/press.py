@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.input.section import Name, over
+from magshell_fenicsx.input.section import Name, over_size
 from magshell_fenicsx.parts.course import Control, Course, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import Count, PathStep
@@ -50,9 +50,9 @@ class ContactSection(PathStep):
     control: Literal["approach", "force", "arc"] = "arc"
     """What is prescribed step by step: the approach, the force, or arc length, which passes every fold"""
     until: Until = "target"
-    approach: Annotated[float, over(THICKNESS)] | None = Field(default=None, ge=-1e6, le=1e6)
+    approach: Annotated[float, over_size(THICKNESS)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the approach, from where the body is at first; with control: approach or arc [h]"""
-    force: Annotated[float, over(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over_size(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the force on the body; with control: force or arc [2πD/R]"""
     points: Count = 20
 

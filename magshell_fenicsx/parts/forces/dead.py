@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from magshell_fenicsx.input.expressions import Formula, function, is_formula, symbolic
+from magshell_fenicsx.input.expressions import Formula, formula_function, is_formula, symbolic
 from magshell_fenicsx.input.section import Section, in_units, or_number
-from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
@@ -21,8 +21,18 @@ from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.shape.symmetry import Leaves, alike, mirrors_formula, tilted, unit
-from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
+from magshell_fenicsx.shape.meridian_chart import (
+    MeridianChart,
+    scalar_is_axisymmetric,
+    vector_is_axisymmetric,
+)
+from magshell_fenicsx.shape.symmetry_constraint import (
+    SymmetryConstraint,
+    equal_to_rounding,
+    mirrors_formula,
+    tilted,
+    unit,
+)
 
 if TYPE_CHECKING:
     from ufl.core.expr import Expr
@@ -215,8 +225,8 @@ class DeadSection(PathStep):
     def step(self, change: float | None, now: Now) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
-        R, span = context.shell.reference, outline.span
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+        R, span = context.shell.reference, outline.meridian
         fixed = [load for load in self.loads if not load.varies]
         forces = [
             np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v
@@ -225,11 +235,11 @@ class DeadSection(PathStep):
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
         x = outline.sample() if potentials or len(fixed) < len(self.loads) else np.zeros((0, 3))
-        whole = {None, "all", *(piece.name for piece in (span.pieces if span else ()))}
+        whole = {None, "all", *(piece.name for piece in (span.shell_meridians if span else ()))}
         patches = any(load.over not in whole for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
-            on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)
+            on_plane = all(abs(float(mirror.signed_distance(place))) < ROUNDING for place in places)
             in_potentials = on_plane and all(
                 mirrors_formula(text, mirror, x, R) for text in potentials
             )
@@ -243,13 +253,13 @@ class DeadSection(PathStep):
         around = (
             all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
         )
-        if span and not (around and all(scalar_turns(text, span, R) for text in potentials)):
+        if span and not (around and all(scalar_is_axisymmetric(text, span, R) for text in potentials)):
             why = why or "a load differs around e3"
         energies = [
             potential(f"potential_{i}", text, np.eye(3), context.scales)
             for i, text in enumerate(potentials)
         ]
-        return [Leaves(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
+        return [SymmetryConstraint(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
 
     def named_points(self) -> list[str]:
         return [load.at for load in self.loads if load.at]
@@ -257,7 +267,7 @@ class DeadSection(PathStep):
     @classmethod
     def around(cls, loads: Sequence[Self], place: Array, fit: Fit) -> list[Feature]:
         x, y = map(float, place)
-        return [Disc((x, y), 0.0, fit.h, loads[0].growth(fit))]
+        return [DiscFeature((x, y), 0.0, fit.h, loads[0].growth(fit))]
 
     def largest(self, fit: Fit) -> float | None:
         size = 2 * sqrt(fit.h)
@@ -292,7 +302,7 @@ class DeadSection(PathStep):
         )  # the solver takes long to import
 
         mirror = modelled.mirror
-        loads = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
+        loads = (load for load in self.loads if not mirror or load.edge not in mirror.removed_edges)
         made = (
             dead_load(load, f"{step.name}_potential_{i}", context, modelled)
             for i, load in enumerate(loads)
@@ -300,11 +310,11 @@ class DeadSection(PathStep):
         return {"dead": {step.name: tuple(made)}}
 
 
-def load_turns(load: DeadLoadSection, span: Span, R: float) -> bool:
+def load_turns(load: DeadLoadSection, span: MeridianChart, R: float) -> bool:
     """Whether a load by formula is the same all around e3."""
     if load.vector is None:
-        return scalar_turns(str(load.pressure), span, R)
-    return vector_turns([str(v) for v in load.vector], span, R)
+        return scalar_is_axisymmetric(str(load.pressure), span, R)
+    return vector_is_axisymmetric([str(v) for v in load.vector], span, R)
 
 
 def is_image(
@@ -313,7 +323,7 @@ def is_image(
     """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
     if load.varies or other.varies:
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
-    edge = load.edge and mirror.other(load.edge)
+    edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
         other.at,
@@ -336,14 +346,14 @@ def is_image(
 def _mirrored_formula(
     load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array
 ) -> bool:
-    edge = load.edge and mirror.other(load.edge)
+    edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False
     values, images = (
-        np.stack([function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
+        np.stack([formula_function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
         for each, places in ((load, x), (other, image))
     )
-    return alike(values if load.vector is None else values @ mirror.reflection, images)
+    return equal_to_rounding(values if load.vector is None else values @ mirror.reflection, images)
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.input.expressions import ByFormula, Inwards, function
+from magshell_fenicsx.input.expressions import FormulaVectors, InwardPressure, formula_function
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
@@ -238,9 +238,9 @@ def _over(load: DeadLoadSection) -> str | None:
 def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
     """The load of a formula in the model's frame; a pressure is against the normal."""
     if load.vector is not None:
-        return ByFormula([function(v) for v in load.vector], Q, length, factor, vectors=True)
+        return FormulaVectors([formula_function(v) for v in load.vector], Q, length, factor, vectors=True)
     assert load.pressure is not None
-    return Inwards(ByFormula([function(load.pressure)], Q, length, factor))
+    return InwardPressure(FormulaVectors([formula_function(load.pressure)], Q, length, factor))
 
 
 def account(context: Context, loads: Loads) -> Account:

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Direction, over
+from magshell_fenicsx.input.section import Direction, over_size
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
-from magshell_fenicsx.shape.symmetry import Leaves, tilted
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, tilted
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -62,12 +62,12 @@ class IndentationSection(PathStep):
     """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is load with a target
     `force`"""
     until: Until = "target"
-    depth: Annotated[float, over(THICKNESS)] | None = Field(default=None, ge=-1e4, le=1e4)
+    depth: Annotated[float, over_size(THICKNESS)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target w under the load; with control: displacement or arc [h]"""
-    force: Annotated[float, over(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over_size(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target F; with control: load or arc [2πD/R]"""
     points: Count = 20
-    patch: Annotated[float, over(THICKNESS)] = Field(default=0.0, ge=0, le=1000)
+    patch: Annotated[float, over_size(THICKNESS)] = Field(default=0.0, ge=0, le=1000)
     """Radius of the patch that the force is spread over, from 0.3; 0 is a point [h]"""
 
     @property
@@ -83,10 +83,10 @@ class IndentationSection(PathStep):
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
             )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         place = self.place_on(step, context, outline)
         reason = "the force is not at the pole" if tilted(place) else None
-        return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
+        return [SymmetryConstraint(reason, [place], lambda mirror: bool(abs(mirror.signed_distance(place)) < ROUNDING))]
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array:
         at, geometry, key = self.at, context.shell.geometry, step.key
@@ -139,8 +139,8 @@ class IndentationSection(PathStep):
         growth = loads[0].growth(fit)
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         return [
-            Disc((x, y), dent, sqrt(h) / fit.refinement, growth),
-            Disc((x, y), patch * h, max(patch * h / 2, h), growth),
+            DiscFeature((x, y), dent, sqrt(h) / fit.refinement, growth),
+            DiscFeature((x, y), patch * h, max(patch * h / 2, h), growth),
         ]
 
     def growth(self, fit: Fit) -> float:

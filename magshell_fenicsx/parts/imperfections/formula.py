@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
-from magshell_fenicsx.input.messages import shown
+from magshell_fenicsx.input.expressions import Formula, formula, formula_with_derivatives
+from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection
-from magshell_fenicsx.shape.ground import Ground
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
 DEEPEST = 0.5  # over R
@@ -31,7 +31,7 @@ class FormulaSection(ImperfectionSection):
     def account(self) -> str:
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`; the element size is 2.5/k of the shortest wave sin(k x) that
         it resembles.
 
@@ -46,12 +46,12 @@ class FormulaSection(ImperfectionSection):
         if len(bad):
             place = ", ".join(f"{c:.3g}" for c in bad[0])
             raise CaseError(
-                f"{key}.w0: {shown(self.w0)}: has no finite value, or one above half a radius, at (x, y, z)/R = "
+                f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a radius, at (x, y, z)/R = "
                 f"({place})"
             )
         largest, derived = (
             np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
-            with_derivatives(self.w0),
+            formula_with_derivatives(self.w0),
         )
 
         def sizes(places: Array) -> Array:

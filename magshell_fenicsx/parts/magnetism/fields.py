@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
-from magshell_fenicsx.input.messages import shown
+from magshell_fenicsx.input.expressions import Formula, formula, formula_with_derivatives
+from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
-from magshell_fenicsx.quantities.quantity import Given
-from magshell_fenicsx.shape.revolved import SurfaceSection
-from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.quantities.quantity import CaseSizes
+from magshell_fenicsx.shape.revolution_sections import SurfaceSection
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -319,7 +319,7 @@ class MagneticSection(Section, Ability):
                 "a thickness that does not change",
                 hint="or give energy: full",
             )
-        if self.remanent and isinstance(self.remanent.components, GivenField):
+        if self.remanent and isinstance(self.remanent.components, UserField):
             context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
         layers = self.remanent.layers if self.remanent else None
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
@@ -344,13 +344,13 @@ class MagneticSection(Section, Ability):
         }
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         from magshell_fenicsx.parts.magnetism.magnetisation import (
             leaves,
         )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
-        acts = [] if self.interaction == "none" else [Leaves("parts act on each other")]
+        acts = [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         seen = strength(context) or is_read(context) or acts
         return acts + (leaves(context, outline) if seen else [])
 
@@ -423,7 +423,7 @@ class MagneticSection(Section, Ability):
             if len(bad):
                 x, y, z = bad[0]
                 raise CaseError(
-                    f"magnetic.{key}.components: {shown(text)}: has no finite value (or one above 1e6) "
+                    f"magnetic.{key}.components: {shown_value(text)}: has no finite value (or one above 1e6) "
                     f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
 
@@ -432,7 +432,7 @@ class MagneticSection(Section, Ability):
         components = self.applied.components if strength(context) else None
         if not components:
             return None
-        G = np.stack([with_derivatives(text)(places).gradient for text in components])
+        G = np.stack([formula_with_derivatives(text)(places).gradient for text in components])
         divergence, curl = (
             np.abs(np.trace(G)),
             np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2),
@@ -467,7 +467,7 @@ class MagneticSection(Section, Ability):
             f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"
         ]
 
-    def units(self, context: Context, units: Given) -> Given:
+    def units(self, context: Context, units: CaseSizes) -> CaseSizes:
         """The flux density, or the strength of the sources, of lambda_m = 1."""
         if (
             isnan(units.E)

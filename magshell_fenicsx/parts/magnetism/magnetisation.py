@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import ByFormula, formula, function
+from magshell_fenicsx.input.expressions import FormulaVectors, formula, formula_function
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.patterns import (
     Components,
@@ -36,22 +36,22 @@ from magshell_fenicsx.parts.magnetism.soft import Soft
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
-from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import (
-    PARALLEL,
-    Leaves,
-    alike,
-    mirrors_formula,
-    nothing,
-    tilted,
+from magshell_fenicsx.shape.meridian_chart import (
+    field_is_axisymmetric,
+    scalar_is_axisymmetric,
+    vector_function,
+    vector_is_axisymmetric,
+    with_nearby_places,
 )
-from magshell_fenicsx.shape.turning import (
-    beside,
-    field_turns,
-    scalar_turns,
-    vector_turns,
-    vectors_of,
+from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import (
+    PARALLEL,
+    SymmetryConstraint,
+    equal_to_rounding,
+    mirrors_formula,
+    no_plane,
+    tilted,
 )
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def magnetisation(
         tuple(basis),
         driven,
         turns(context, turn),
-        section.components if isinstance(section.components, GivenField) else None,
+        section.components if isinstance(section.components, UserField) else None,
         soft(context, turn, within),
         own if np.isfinite(own) else 1.0,
         context.shell.reference
@@ -144,7 +144,7 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | 
     patches = dict[str, Array]()
     pattern: float | Pattern = float(chi) if isinstance(chi, float | int) else 0.0
     if isinstance(chi, str):
-        pattern = ByFormula([function(chi)], rotation(turn), 1.0)
+        pattern = FormulaVectors([formula_function(chi)], rotation(turn), 1.0)
     elif isinstance(chi, dict) and isinstance(context.shell, MeshSurface):
         patches = {name: np.array([each]) for name, each in chi.items()}
     elif isinstance(chi, dict):
@@ -200,7 +200,7 @@ def _remanence(
     return section.vector(turn)
 
 
-def leaves(context: Context, outline: Outline) -> list[Leaves]:
+def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = context.of(MagneticSection)
     assert magnetic
@@ -213,10 +213,10 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     turning = [] if whole else [step.to.vector() for step in _rotations(context)]
     remanent = magnetic.remanent or RemanentSection.model_construct()
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
-    if isinstance(remanent.components, GivenField):
-        return [Leaves("the remanence is a function on a mesh", mirrors=nothing)]
+    if isinstance(remanent.components, UserField):
+        return [SymmetryConstraint("the remanence is a function on a mesh", mirrors=nothing)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
-    fields += [vectors_of(texts) for texts in (remanent.components, formulas) if texts]
+    fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
     askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
     if remanent.file:
         by_place = by_points(remanent)
@@ -233,25 +233,25 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         fields.append(partial(_at_places, pattern))
         pieces = tuple(
             piece
-            for piece in (outline.span.pieces if outline.span else ())
+            for piece in (outline.meridian.shell_meridians if outline.meridian else ())
             if name.startswith(piece.name)
         )
-        span = outline.span and replace(outline.span, pieces=pieces)
-        if not (span and field_turns(fields[-1], span, smooth=False)):
+        span = outline.meridian and replace(outline.meridian, shell_meridians=pieces)
+        if not (span and field_is_axisymmetric(fields[-1], span, smooth=False)):
             askew.append(f"the remanence of {name} differs around e3")
     if remanent.components and not (
-        outline.span and vector_turns(remanent.components, outline.span)
+        outline.meridian and vector_is_axisymmetric(remanent.components, outline.meridian)
     ):
         askew.append("the formula of the remanence differs around e3")
-    if formulas and not (outline.span and vector_turns(formulas, outline.span, in_space=True)):
+    if formulas and not (outline.meridian and vector_is_axisymmetric(formulas, outline.meridian, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
     if isinstance(magnetic.susceptibility, str) and not (
-        outline.span and scalar_turns(magnetic.susceptibility, outline.span)
+        outline.meridian and scalar_is_axisymmetric(magnetic.susceptibility, outline.meridian)
     ):
         askew.append("the susceptibility differs around e3")
     sources = values(context) if magnetic.applied.sources or whole else []
     if sources and not (
-        outline.span and all(field_turns(field, outline.span) for field in sources)
+        outline.meridian and all(field_is_axisymmetric(field, outline.meridian) for field in sources)
     ):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
@@ -259,13 +259,13 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
 
     def mirrors(mirror: Mirror) -> bool:
         S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
-        x = beside(x) if formulas else x
+        x = with_nearby_places(x) if formulas else x
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
             few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
-                alike(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
+                equal_to_rounding(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
                 for field, places in (
                     *((field, x) for field in fields),
                     *((field, few) for field in sources),
@@ -285,7 +285,7 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
         )
 
     return [
-        Leaves(
+        SymmetryConstraint(
             next(iter(askew), None),
             [*vectors, *_of_sources(magnetic.applied.sources or [], context.shell.reference)],
             mirrors,
@@ -323,7 +323,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     if magnetic.remanent is None:
         return read
     (part,) = leaves(context, modelled.outline)
-    shown = part.askew is None or not modelled.axisymmetric
+    shown = part.not_axisymmetric is None or not modelled.axisymmetric
     if not shown or (modelled.plane and not part.mirrors(modelled.plane)):
         return read
     return {"remanence": magnetisation(magnetic, context, turn, within), **read}

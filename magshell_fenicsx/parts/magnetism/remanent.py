@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.expressions import Formula
-from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrOfProgram
-from magshell_fenicsx.mesh.assembly import Place
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrInMemory
+from magshell_fenicsx.mesh.multi_shell import ShellPose
+from magshell_fenicsx.mesh.patch import UserField
 
 
 class Layer(Direction):
@@ -36,8 +36,8 @@ class RemanentSection(FileKeys, Direction):
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
     components: Annotated[
-        Annotated[list[Formula], Field(min_length=3, max_length=3)] | GivenField | None,
-        OrOfProgram(GivenField),
+        Annotated[list[Formula], Field(min_length=3, max_length=3)] | UserField | None,
+        OrInMemory(UserField),
     ] = None
     """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
@@ -50,7 +50,7 @@ class RemanentSection(FileKeys, Direction):
     filter: float | None = Field(default=None, gt=0, le=10)
     """Of kind: points: distance over which the points are averaged [R]"""
 
-    _of_shell: tuple[Place, float] | None = PrivateAttr(default=None)
+    _of_shell: tuple[ShellPose, float] | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
@@ -63,7 +63,7 @@ class RemanentSection(FileKeys, Direction):
                 )
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
-        if isinstance(self.components, GivenField) and self.components.size != 3:
+        if isinstance(self.components, UserField) and self.components.size != 3:
             raise ValueError(
                 f"components: a function of {self.components.size} numbers; a vector has three"
             )
@@ -71,14 +71,14 @@ class RemanentSection(FileKeys, Direction):
             raise ValueError("the fractions of the layers must add up to 1")
         return self
 
-    def placed(self, place: Place, factor: float) -> "RemanentSection":
+    def placed(self, place: ShellPose, factor: float) -> "RemanentSection":
         """That of one shell of several, in the frame of which it is, times a factor."""
         copied = self.model_copy()
         copied._of_shell = place, factor
         return copied
 
     @property
-    def of_shell(self) -> tuple[Place, float] | None:
+    def of_shell(self) -> tuple[ShellPose, float] | None:
         """The place of its shell and its factor; None where the frame is that of the case."""
         return self._of_shell
 

@@ -15,8 +15,8 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import Count, LoadStep
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, TURN, WAY, WORK, Quantity
-from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
+from magshell_fenicsx.quantities.quantity import DISTANCE, FORCE, TORQUE, TURN, WORK, Quantity
+from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
@@ -65,7 +65,7 @@ class SourceStep(LoadStep):
             raise ValueError("give one of move, to, turn and strength")
         if self.strength == 1 or (self.move and not any(self.move)):
             raise ValueError(f"{given[0]}: changes nothing")
-        if self.name in ({*TAKEN, *QUANTITIES} - {"source"}):
+        if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"source"}):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the source"
             )
@@ -151,7 +151,7 @@ class SourcesSeen(Seen):
             "Factor of a source's motion or strength; the step may give it another name. With units the way of a "
             "motion has a column too, in mm or degrees.",
             "load",
-            units=(WAY, TURN),
+            units=(DISTANCE, TURN),
         ),
         Quantity(
             "source_force",

@@ -5,18 +5,18 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import ByFormula, function
+from magshell_fenicsx.input.expressions import FormulaVectors, formula_function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface, ShellSection
-from magshell_fenicsx.shape.symmetry import Leaves, unit
-from magshell_fenicsx.shape.turning import scalar_turns
+from magshell_fenicsx.shape.shell_sections import MeshSurface, PlateSurface, ShellSection
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # of the largest value: differences that are rounding
@@ -37,14 +37,14 @@ def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natu
     ) -> Varying | None:
         if value is None:
             return None
-        if isinstance(value, GivenField):
+        if isinstance(value, UserField):
             return value.mapped(
                 lambda numbers: factor * _completed(numbers, stretch=whole is _stretches)
             )
         if not isinstance(value, dict):
             parts = whole(value)
             if any(isinstance(v, str) for v in parts):
-                return ByFormula([function(v) for v in parts], Q, R, factor)
+                return FormulaVectors([formula_function(v) for v in parts], Q, R, factor)
             return factor * np.array(parts, dtype=float)
         vectors = {
             name: factor * np.array(whole(each), dtype=float) for name, each in value.items()
@@ -70,8 +70,8 @@ def frame(context: Context, turn: float) -> Pattern:
     direction = along(context)
     if direction == MERIDIAN:
         return meridians
-    return ByFormula(
-        [function(v) for v in direction], rotation(turn), context.shell.reference, vectors=True
+    return FormulaVectors(
+        [formula_function(v) for v in direction], rotation(turn), context.shell.reference, vectors=True
     )
 
 
@@ -98,13 +98,13 @@ def askew(context: Context, outline: Outline) -> str | None:
     assert section
     direction, R = along(context), context.shell.reference
     k = components(section.curvature)
-    of_patches = section.curvature.values() if isinstance(section.curvature, dict) else []
-    if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *of_patches])):
+    patch_constraint = section.curvature.values() if isinstance(section.curvature, dict) else []
+    if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *patch_constraint])):
         return "the natural curvature twists: k12 is not zero"
     upright = [v == 0 for v in direction] == [True, True, False]
     if uneven(context) and direction != MERIDIAN and not upright:
         return "the natural shape is not along the meridians"
-    if outline.span and not all(scalar_turns(text, outline.span, R) for text in section.texts):
+    if outline.meridian and not all(scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts):
         return "the natural shape differs around e3"
     return None
 
@@ -118,7 +118,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     x, R, direction = outline.sample(), context.shell.reference, along(context)
 
     def alike(text: float | str, sign: float = 1.0) -> bool:
-        own, of_image = (function(text)(*(R * places).T) for places in (x, mirror.image(x)))
+        own, of_image = (formula_function(text)(*(R * places).T) for places in (x, mirror.image(x)))
         size = np.abs(own).max(initial=0.0)
         return bool(np.isfinite(own).all() and (np.abs(own - sign * of_image) <= SAME * size).all())
 
@@ -131,7 +131,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
     d, image = (
-        np.stack([function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x))
+        np.stack([formula_function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x))
     )
     return any(
         bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all())
@@ -168,13 +168,13 @@ def _completed(numbers: Array, *, stretch: bool) -> Array:
     )
 
 
-def leaves(context: Context, outline: Outline) -> list[Leaves]:
+def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """The symmetry that the natural shape leaves."""
     chosen = along(context) if uneven(context) else MERIDIAN
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
     return [
-        Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))
+        SymmetryConstraint(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))
     ]
 
 

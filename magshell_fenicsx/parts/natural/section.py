@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, Section, in_units
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.input.section import _NUMBER, OrInMemory, Section, in_units
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.course import Target
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled, Offer
 from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import PatchMesh
@@ -66,7 +66,7 @@ def _components(
         return [one(v) for v in value] if isinstance(value, list) else one(value)
 
     def read(value: Any) -> Any:
-        if isinstance(value, GivenField):
+        if isinstance(value, UserField):
             if value.size not in (1, numbers):
                 raise ValueError(f"a function of {value.size} numbers; allowed are 1 and {numbers}")
             return value
@@ -90,8 +90,8 @@ CURVATURE = 1e6  # of a natural shape by formula, over 1/R
 Number = float | str
 Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
 Values = Annotated[
-    Number | list[Number] | dict[str, Number | list[Number]] | GivenField | None,
-    OrOfProgram(GivenField),
+    Number | list[Number] | dict[str, Number | list[Number]] | UserField | None,
+    OrInMemory(UserField),
 ]
 
 
@@ -125,9 +125,9 @@ class NaturalSection(Section, Ability):
         return self
 
     @property
-    def given(self) -> list[GivenField]:
+    def given(self) -> list[UserField]:
         """Those that are functions of a program."""
-        return [value for value in (self.curvature, self.stretch) if isinstance(value, GivenField)]
+        return [value for value in (self.curvature, self.stretch) if isinstance(value, UserField)]
 
     @property
     def texts(self) -> list[str]:
@@ -152,7 +152,7 @@ class NaturalSection(Section, Ability):
         values = {f"natural.{key}": getattr(self, key) for key in ("curvature", "stretch")}
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         from magshell_fenicsx.parts.natural.planned import leaves  # the solver takes long to import
 
         return leaves(context, outline)

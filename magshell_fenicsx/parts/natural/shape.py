@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.memo import at_quadrature
-from magshell_fenicsx.input.expressions import Together
+from magshell_fenicsx.input.expressions import FormulaGroup
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -125,7 +125,7 @@ class Natural:
         return np.stack([np.sum(forces * one, axis=-1) for one in ones], axis=-1)
 
     @property
-    def formulas(self) -> Together | None:
+    def formulas(self) -> FormulaGroup | None:
         """Those of stretch and curvature."""
         given = (getattr(each, "formulas", None) for each in (self.stretch, self.curvature))
         several = [each for each in given if each]

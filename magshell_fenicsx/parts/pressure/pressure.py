@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.input.section import over
+from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.course import Course, Fit, GasSection, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Account, Context, Modelled
@@ -15,9 +15,9 @@ from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
-from magshell_fenicsx.shape.revolved import CapSurface
-from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
-from magshell_fenicsx.shape.symmetry import Leaves, of_patches
+from magshell_fenicsx.shape.revolution_sections import CapSurface
+from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
 BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
 
@@ -44,9 +44,9 @@ class PressureSection(PathStep):
     """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
     `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
-    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e6, le=1e6)
+    pressure: Annotated[float, over_size(PRESSURE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target p; with control: load or arc [p_c]"""
-    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
+    volume_change: Annotated[float, over_size(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target ΔV; with control: volume or arc [R³]"""
     on: dict[str, Literal["outside", "inside"]] | None = Field(default=None, min_length=1)
     """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by default all from
@@ -67,10 +67,10 @@ class PressureSection(PathStep):
                 f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells"
             )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         return [
             *super().leaves(step, context, outline),
-            of_patches(f"{step.key}.on", self.on or (), context.shell),
+            patch_constraint(f"{step.key}.on", self.on or (), context.shell),
         ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
-from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
+from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class EdgeSection(PathStep):
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:
-        if self.name in ({*TAKEN, *QUANTITIES} - {"motion"}):
+        if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"motion"}):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the motion"
             )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.quantities.quantity import MOMENT, REACTION, TURN, WAY, Quantity
+from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TURN, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
@@ -54,7 +54,7 @@ class Moved(Seen):
             "Factor of the motion of supports; the step may give it another name. With units its way has a column too: "
             "all translations together in mm, of rotations alone degrees.",
             "load",
-            units=(WAY, TURN),
+            units=(DISTANCE, TURN),
         ),
         Quantity(
             "reaction",

@@ -168,7 +168,7 @@ class Adjoint:
     @property
     def size(self) -> float:
         """What one of J is in its unit."""
-        return self.scene.sizes.of[self.scale] if self.scale else 1.0
+        return self.scene.sizes.by_unit[self.scale] if self.scale else 1.0
 
     @property
     def shown(self) -> float:

@@ -133,7 +133,7 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     problem = adjoint.scene.problem
     value, size = number_of(problem.context, key), size_of(problem.context, key)
     return _slope(
-        lambda p: sizes_of(problem.with_values({key: p}).context).of[adjoint.scale], value, size
+        lambda p: sizes_of(problem.with_values({key: p}).context).by_unit[adjoint.scale], value, size
     )
 
 

@@ -66,7 +66,7 @@ def refuse_unitless(scene: Scene, of: str) -> None:
     """
     sizes = scene.sizes
     if of in SCALES and (
-        SCALES[of] not in sizes.of or (of.endswith("_mT") and sizes.field != "mT")
+        SCALES[of] not in sizes.by_unit or (of.endswith("_mT") and sizes.field != "mT")
     ):
         bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[of])
         raise CaseError(f"{of}: the case has no such unit; {bare} has none")

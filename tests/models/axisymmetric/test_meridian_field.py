@@ -9,7 +9,7 @@ from meridian_scenes import E3, hemisphere
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
@@ -23,7 +23,7 @@ def dense(K: PETSc.Mat) -> np.ndarray:
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_on_the_meridian_and_its_waves(law: RemanenceLaw) -> None:
     """A field diag(a, a, b) . r as formulas and built in."""
-    formulas = [with_derivatives(text) for text in ("x/2", "y/2", "1 - z")]
+    formulas = [formula_with_derivatives(text) for text in ("x/2", "y/2", "1 - z")]
     gradient = np.diag([0.5, 0.5, -1.0])
     built_in = Magnetisation(tangential, E3, gradient=gradient, law=law)
     known = replace(built_in, gradient=None, in_space=FormulasInSpace(formulas, np.eye(3)))

@@ -12,7 +12,7 @@ from conftest import disc, hemisphere, random_displacement
 from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
 
-from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import Material
@@ -34,7 +34,7 @@ DIPOLE = [
 
 
 def formulas(*texts: str, turn: float = 0.0, d: float = 2.0) -> FormulasInSpace:
-    return FormulasInSpace([with_derivatives(text.format(d=d)) for text in texts], rotation(turn))
+    return FormulasInSpace([formula_with_derivatives(text.format(d=d)) for text in texts], rotation(turn))
 
 
 def linear() -> FormulasInSpace:

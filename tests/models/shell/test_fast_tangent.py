@@ -187,7 +187,8 @@ for fast in (model.system, model.excluded_modes.system):
     K.mult(given, found)
     expected = fast.zero_at_supports(along(fast, u, mu, v))
     largest = [
-        scene.comm.allreduce(np.abs(a).max(), MPI.MAX) for a in (fast.zero_at_supports(found.array) - expected, expected)
+        scene.comm.allreduce(np.abs(a).max(), MPI.MAX)
+        for a in (fast.zero_at_supports(found.array) - expected, expected)
     ]
     size = K.norm()
     if scene.comm.rank == 0:

@@ -13,10 +13,10 @@ import pytest
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.expressions import Together, formula
+from magshell_fenicsx.input.expressions import FormulaGroup, formula
 from magshell_fenicsx.models.shell.fitted import fitted
 from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.problem.formulas import looked_at
+from magshell_fenicsx.problem.formulas import adaptive_cells
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.follow import follow
@@ -186,7 +186,7 @@ def test_the_cost_of_finding_grows_slowly_and_smooth_formulas_have_none():
     """Parts that are looked at, as the disc becomes a thousand times smaller."""
     there = outline(dead("1").shell)
     parts = {
-        text: len(looked_at(Together([formula(text)]), there).area)
+        text: len(adaptive_cells(FormulaGroup([formula(text)]), there).area)
         for text in ("2", "1 + x*y", disc(1e-2), disc(1e-5))
     }
     assert parts["1 + x*y"] == parts["2"]

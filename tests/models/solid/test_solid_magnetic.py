@@ -12,7 +12,7 @@ from bodies import hemisphere, plate
 from test_solid_derivatives import FIELD, MU, displacement
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
-from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
@@ -38,7 +38,7 @@ DEFORMATIONS = {
 
 
 def formulas(texts: list[str]) -> FormulasInSpace:
-    return FormulasInSpace([with_derivatives(text) for text in texts], np.eye(3))
+    return FormulasInSpace([formula_with_derivatives(text) for text in texts], np.eye(3))
 
 
 def block(law: RemanenceLaw) -> SolidModel:

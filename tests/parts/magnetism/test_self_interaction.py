@@ -235,7 +235,8 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
         np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel())),
     )
     for upper in (True, False):
-        assert (np.abs(times(SinglePrecisionBlocks.from_blocks(stored, upper=upper), v.ravel()) - exact) <= rounding).all()
+        single = SinglePrecisionBlocks.from_blocks(stored, upper=upper)
+        assert (np.abs(times(single, v.ravel()) - exact) <= rounding).all()
     others = flat.times_far(v.reshape(-1, 1))[:, 0]
     products = [exact + others, times(turned, v.ravel()) + rest @ v.ravel() + others]
     as_it_was, with_nodes = (np.linalg.norm(each - slope) for each in products)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from magshell_fenicsx import Case, CaseError, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.magnetism.applied import crossing
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
@@ -101,7 +101,7 @@ def test_sphere_is_a_dipole() -> None:
         f"(z - ({z0}))*y/{s}**2.5",
         f"(z - ({z0}))**2/{s}**2.5 - {s}**-1.5/3",
     ]
-    exact = FormulasInSpace([with_derivatives(text) for text in texts], np.eye(3))
+    exact = FormulasInSpace([formula_with_derivatives(text) for text in texts], np.eye(3))
     magnet = {
         "kind": "sphere",
         "diameter": "20 mm",

@@ -9,7 +9,7 @@ from math import acos, radians
 import numpy as np
 
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion, apply_motions
-from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
@@ -110,7 +110,7 @@ def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, 
     applied, Q = _applied(context), rotation(turn)
     if applied is None:
         return None, ()
-    formulas = [with_derivatives(text) for text in applied.components or []]
+    formulas = [formula_with_derivatives(text) for text in applied.components or []]
     by_formula = FormulasInSpace(formulas, Q) if formulas else None
     rotations = turns(context, turn)
     if not applied.sources and not rotations:

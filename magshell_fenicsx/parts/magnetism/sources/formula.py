@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from magshell_fenicsx.input.expressions import Formula, FormulasInSpace, with_derivatives
+from magshell_fenicsx.input.expressions import Formula, FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.input.section import FluxDensity
 from magshell_fenicsx.parts.magnetism.sources.source import Array, FieldOfSource, SourceSection
 
@@ -23,7 +23,7 @@ class FormulaSource(SourceSection):
         return f"formulas ({', '.join(self.components)})"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        formulas = FormulasInSpace([with_derivatives(text) for text in self.components], np.eye(3))
+        formulas = FormulasInSpace([formula_with_derivatives(text) for text in self.components], np.eye(3))
 
         def values(x: Array) -> tuple[Array, Array, Array]:
             B, G, H = formulas(np.asarray(x / R))

@@ -1,0 +1,168 @@
+"""Distances between vertices of a mesh, and triangles that are too flat for their neighbours.
+
+The interior penalty of an edge is over the mean height of its two triangles. Where one is lower
+than about a hundredth of the other, the default penalty is too small, whatever the degree. So
+vertices that are nearer to each other than a part of the elements there share a grid line, or are
+refused.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, directed_sides
+
+Array = NDArray[np.float64]
+# over R: nearer places are one, and a place so near to an edge is on it
+SAME_PLACE_TOLERANCE = 1e-6
+# over the element size: nearer vertices make cells too flat; at half of it plates are unstable
+MIN_VERTEX_DISTANCE = 0.02
+MAX_GROUP_WIDTH = 0.2  # over the element size: places farther apart have grid lines of their own
+MIN_DIGITS, MAX_DIGITS = 4, 17  # significant digits of a number in a message
+TEXT_PRECISION = 0.05  # relative error of the difference of two places in a message
+# `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
+MAX_FLATNESS = 25.0
+SHORT_SIDE = 0.05  # a side over another one, below which messages tell its ends
+# `flatness` that no penalty stands: rounding then gives rigid motions a stiffness
+MAX_FLATNESS_OF_ANY_PENALTY = 400.0
+
+
+def grouped_by_distance(
+    coordinates: Array, size: Callable[[float], float], rounding: float
+) -> list[Array]:
+    """Return groups of sorted coordinates (n,), each of which has one grid line.
+
+    Parameters
+    ----------
+    size
+        Coordinate -> element size there.
+    rounding
+        Distance up to which coordinates are always one.
+    """
+    groups = list[Array]()
+    for c in np.sort(coordinates):
+        if groups:
+            previous = groups[-1][-1]
+            smaller_size = min(size(float(c)), size(float(previous)))
+            if c - previous <= max(rounding, MIN_VERTEX_DISTANCE * smaller_size):
+                groups[-1] = np.append(groups[-1], c)
+                continue
+        groups.append(np.array([c]))
+    narrow_groups = list[Array]()
+    for group in groups:
+        max_width = max(rounding, MAX_GROUP_WIDTH * size(float(group.mean())))
+        narrow_groups += _narrow_parts(group, max_width)
+    return narrow_groups
+
+
+def line_coordinates(
+    coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]
+) -> list[float]:
+    """Return one coordinate for each group of near ones between two ends, and near neither."""
+
+    def is_inside(x: float) -> bool:
+        distance_to_end = min(x - ends[0], ends[1] - x)
+        return distance_to_end > max(SAME_PLACE_TOLERANCE, MIN_VERTEX_DISTANCE * size(x))
+
+    inner = np.array([x for x in coordinates if is_inside(float(x))])
+    groups = grouped_by_distance(inner, size, SAME_PLACE_TOLERANCE)
+    return [float(group[0] + group[-1]) / 2 for group in groups]
+
+
+def _narrow_parts(group: Array, max_width: float) -> list[Array]:
+    """Return a group of sorted coordinates (n,), or halves of halves of it that are narrower."""
+    if np.ptp(group) <= max_width:
+        return [group]
+    lower = group < (group[0] + group[-1]) / 2
+    return [*_narrow_parts(group[lower], max_width), *_narrow_parts(group[~lower], max_width)]
+
+
+def distinguishable_texts(a: Array, b: Array) -> tuple[str, str]:
+    """Return the coordinates (n,) of two places, with as many digits as show where they differ."""
+    for digits in range(MIN_DIGITS, MAX_DIGITS + 1):
+        texts = [[f"{c + 0.0:.{digits}g}" for c in place] for place in (a, b)]
+        difference = np.array(texts[1], dtype=np.float64) - np.array(texts[0], dtype=np.float64)
+        error = np.abs(difference - (b - a)).max()
+        if error <= TEXT_PRECISION * np.abs(b - a).max():
+            break
+    return ", ".join(texts[0]), ", ".join(texts[1])
+
+
+def flatness(patch: PatchMesh) -> Array:
+    """Return for each triangle (m,) how high its neighbours are over its own heights.
+
+    The sum over its sides of (h + h') / (4 h), with the heights h and h' of the triangle and of its
+    neighbour over the side. Equal triangles have 1.5.
+    """
+    corners = patch.embedding(patch.nodes)[patch.cells[:, :3]]
+    sides = corners[:, [1, 2, 0]] - corners
+    doubled_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        heights = (doubled_area[:, None] / np.linalg.norm(sides, axis=2)).T.ravel()
+        _, edge = np.unique(
+            np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True
+        )
+        edge = edge.ravel()
+        sum_of_heights = np.bincount(edge, weights=heights)[edge]
+        has_neighbour = np.bincount(edge)[edge] > 1
+        ratios = np.where(has_neighbour, sum_of_heights / (4 * heights), 0.0)
+    return np.asarray(np.nan_to_num(ratios, nan=np.inf).reshape(3, -1).sum(axis=0))
+
+
+def flat_triangle(
+    patch: PatchMesh, penalty: float, default: float, length: float, unit: str
+) -> str:
+    """Return where a triangle is too flat for the penalty, and what helps; empty if none is.
+
+    Parameters
+    ----------
+    penalty, default
+        The factor of the interior penalty, and that of its degree by default.
+    length
+        R in the coordinates of the message.
+    unit
+        What the coordinates are in, such as "over R".
+    """
+    ratios = flatness(patch)
+    flattest = int(ratios.argmax())
+    if ratios[flattest] * default <= MAX_FLATNESS * penalty:
+        return ""
+    corners = patch.embedding(patch.nodes[patch.cells[flattest, :3]]) * length
+    x, y, z = corners.mean(axis=0)
+    sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
+    doubled_area = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+    height = doubled_area / sides.max()
+    near_vertices = ""
+    if sides.min() < SHORT_SIDE * sides.max():
+        side = int(sides.argmin())
+        start, end = distinguishable_texts(corners[side], corners[(side + 1) % 3])
+        near_vertices = f", with vertices at ({start}) and ({end})"
+    hint = _penalty_hint(float(ratios[flattest]), default)
+    return (
+        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {unit}, is {height:.3g} high "
+        f"and {sides.max():.3g} long{near_vertices}, too flat beside its "
+        f"neighbours: make triangles of like heights there{hint}"
+    )
+
+
+def _penalty_hint(triangle_flatness: float, default: float) -> str:
+    """Return a hint at the penalty that a `flatness` needs; empty where none helps."""
+    if not triangle_flatness < MAX_FLATNESS_OF_ANY_PENALTY:
+        return ""
+    needed = np.ceil(default * triangle_flatness / MAX_FLATNESS / 100) * 100
+    return f", or take mesh.penalty: {needed:g}"
+
+
+def refuse_flat(patch: PatchMesh, default: float, length: float, unit: str, key: str) -> None:
+    """Refuse a triangulation with a triangle so flat that no penalty helps.
+
+    The parameters are those of `flat_triangle`; `key` begins the message.
+
+    Raises
+    ------
+    MeshError
+        With the place of the flattest triangle.
+    """
+    if not flatness(patch).max() < MAX_FLATNESS_OF_ANY_PENALTY:
+        raise MeshError(f"{key}: {flat_triangle(patch, default, default, length, unit)}")

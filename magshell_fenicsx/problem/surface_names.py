@@ -1,0 +1,145 @@
+"""Names that a problem uses: of its energies, and of edges, points and patches of the surface.
+
+Each energy has a name of its own; edges, points and patches must be on the surface.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set
+from magshell_fenicsx.models.shell.kinematics import SECOND
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.pressure.openings import moving, without_potential
+from magshell_fenicsx.parts.registered import SEEN, parts_of
+from magshell_fenicsx.parts.supports.supports import refuse_unknown
+from magshell_fenicsx.quantities.registry import RESERVED_NAMES
+
+# bounds of a part's amplitude, in E h/R^2: rounding, and what no mesh of a shell resolves
+MIN_AMPLITUDE, MAX_AMPLITUDE = 1e-12, 1e9
+
+
+def surface_terms(context: Context, user_terms: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
+    """Return the terms of parts and of steps, then the user's.
+
+    Raises
+    ------
+    CaseError
+        If a part's amplitude is out of bounds, a name is taken, or a solid cannot have a term.
+    """
+    terms = []
+    for key, part in parts_of(context).items():
+        for term in part.terms(context.scales):
+            if term.density and not MIN_AMPLITUDE <= abs(term.value) <= MAX_AMPLITUDE:
+                raise CaseError(
+                    f"{key}: {term.name} is {term.value:.4g} E h/R²; "
+                    f"allowed are {MIN_AMPLITUDE:g} to {MAX_AMPLITUDE:g}"
+                )
+            terms.append(term)
+    for step in {step.name: step for step in context.steps}.values():
+        terms += step.load.terms(step, context)
+    terms += user_terms
+    _refuse_taken_names(terms)
+    if context.solid:
+        _refuse_unfit_for_solid(terms)
+    return tuple(terms)
+
+
+def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
+    """Refuse a name of an energy, of what it reports or of its parameters that is taken."""
+    names = list[str]()
+    for term in terms:
+        names += [term.name, *term.observed] if term.density else [*term.observed]
+    names += {p.name for term in terms for p in term.free}
+    for name in names:
+        if name in RESERVED_NAMES or names.count(name) > 1:
+            raise CaseError(f"terms: {name}: something else has this name already")
+
+
+def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:
+    """Refuse energies of edges, and those that depend on second derivatives."""
+    for term in terms:
+        if term.on is not None:
+            raise CaseError(
+                f"model: solid: {term.name} is an energy of an edge, which only a shell has"
+            )
+        second_derivatives = [f"r0.{name}" for name in term.placed_parts if name in SECOND]
+        if second_derivatives:
+            raise CaseError(
+                f"model: solid: {term.name} depends on {', '.join(second_derivatives)}, "
+                "which only a shell has"
+            )
+
+
+def refuse_unfit(
+    patch: PatchMesh, conditions: Mapping[str, Condition], loads: Loads, thickness: Thickness | None
+) -> None:
+    """Refuse a triangulation without an edge, a point or a patch that the problem names.
+
+    Raises
+    ------
+    MeshError
+        With the name.
+    """
+    refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
+    _refuse_ambiguous(patch.edges, patch.points, conditions)
+    for registered in SEEN:
+        registered.refuse_unfit(loads, patch)
+    for name in (thickness and thickness.patches) or {}:
+        patch_of(patch.patches, name, "shell.thickness_factor")
+
+
+def refuse_unfit_ends(
+    ends: Collection[str],
+    points: Collection[str],
+    conditions: Mapping[str, Condition],
+    loads: Loads,
+) -> None:
+    """Refuse a meridian without an end or a point that the problem names.
+
+    Raises
+    ------
+    MeshError
+        With the name.
+    """
+    refuse_unknown(ends, points, [], conditions, loads)
+    _refuse_ambiguous(ends, points, conditions)
+
+
+def _refuse_ambiguous(
+    edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]
+) -> None:
+    """Refuse the support of a name that an edge and a point have."""
+    for name, condition in conditions.items():
+        if isinstance(condition, Held) and name in edges and name in points:
+            raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
+
+
+def open_edges(
+    patch: PatchMesh, conditions: Mapping[str, Condition], patch_names: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Return the edges at which a live pressure has no potential.
+
+    Parameters
+    ----------
+    patch_names
+        Patches that the pressure acts on; all of the surface without.
+    """
+    pairs_of_edges = {name: as_set(pairs) for name, pairs in patch.edges.items()}
+    if patch_names:
+        under_pressure = np.logical_or.reduce([patch.patches[name] for name in patch_names])
+        vertices = set(map(int, patch.corners[under_pressure].ravel()))
+        pairs_of_edges = {
+            name: {pair for pair in pairs if vertices.issuperset(pair)}
+            for name, pairs in pairs_of_edges.items()
+        }
+    return without_potential(
+        moving(pairs_of_edges, conditions),
+        conditions,
+        lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])]),
+    )
