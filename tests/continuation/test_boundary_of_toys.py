@@ -197,7 +197,7 @@ class WithoutPairs(WithoutModes):
 
     def quadratic_form(self, p: float, state: State, m: int, v: np.ndarray) -> float:
         return float(
-            sum(super(WithoutPairs, self).along(p, state, i, v[i - 1 : i]) for i in (1, 2))
+            sum(super(WithoutPairs, self).quadratic_form(p, state, i, v[i - 1 : i]) for i in (1, 2))
         )
 
     def counts(self, p: float, state: State) -> list[int]:

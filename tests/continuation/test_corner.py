@@ -72,7 +72,7 @@ def walked(load: float, first: float) -> list[tuple[Label, Point]]:
         stop(), NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses={"stop": 1.0})
     )
     path = Path(
-        newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), setting_in=way_to_touch
+        newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), step_event=way_to_touch
     )
     return list(
         ContinuationRun(
@@ -90,9 +90,10 @@ def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
     folds = [point for label, point in passed if label == "fold"]
     assert [point.negative_pivots for point in folds] == [0, 1]
     assert folds[0].state.mu["load"] == pytest.approx(f(1 - 1 / np.sqrt(3)), rel=1e-8)
+    # the penalty sets in over SOFT
     assert folds[1].state.mu["load"] == pytest.approx(
         f(X), rel=1e-4
-    )  # the penalty sets in over SOFT
+    )
     assert len(passed) < 60, "it does not creep"
     q, x = passed[-1][1].state.u
     assert passed[-1][0] == "target"

@@ -21,21 +21,24 @@ FULL, CHORD = True, False
         ([(1e-10, FULL)], 0.0, "converged"),  # the next step is the error, whatever came before
         ([(1.0, FULL), (1e-2, CHORD), (5e-10, CHORD)], 0.0, "converged"),
         ([(1e-5, FULL), (9e-6, FULL)], 1e-12, "go on"),  # a stall far above rounding is no solution
+        # one at its level is, but not to the tolerance
         (
             [(1e-5, FULL), (9e-6, FULL)],
             2e-6,
             "rounding",
-        ),  # one at its level is, but not to the tolerance
+        ),
+        # a new matrix has yet to show what it can do
         (
             [(1e-5, CHORD), (9e-6, FULL)],
             2e-6,
             "go on",
-        ),  # a new matrix has yet to show what it can do
+        ),
+        # the old matrix had hidden the error
         (
             [(1e-7, FULL), (1e-9, CHORD), (2e-8, FULL)],
             0.0,
             "go on",
-        ),  # the old matrix had hidden the error
+        ),
         ([(1e-3, FULL), (1e-4, FULL), (1e-4, CHORD), (1e-2, FULL)], 0.0, "diverged"),
         ([(1.0, FULL), (0.9, FULL), (0.8, FULL), (0.7, FULL), (0.6, FULL)], 0.0, "diverged"),
         ([(2e4, FULL)], 0.0, "diverged"),

@@ -71,10 +71,11 @@ def test_fold_is_located(step: float) -> None:
     assert found.kind == "fold"
     assert found.point.state.mu["load"] == pytest.approx(2 / (3 * np.sqrt(3)), rel=1e-8)
     assert found.point.s == pytest.approx(1 - 1 / np.sqrt(3), abs=5e-5)
+    # a neutral mode is not unstable
     assert (found.point.negative_pivots, found.point.negative_pivots_held) == (
         0,
         0,
-    )  # a neutral mode is not unstable
+    )
 
 
 @pytest.mark.parametrize("control", ["load", "conjugate"])
