@@ -66,7 +66,7 @@ class Memory:
 
 
 class Viscosity:
-    """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles
+    """The viscous forces of a shell in motion; a `continuation.motion.ViscousForces`. Compiles
     kernels.
 
     Parameters

@@ -185,7 +185,7 @@ class _Ends:
 
 class Pressings:
     """All contacts of a system in steps in time, with bodies and between shells; a
-    `continuation.motion.Averaged`.
+    `continuation.motion.AveragedContact`.
 
     Attributes
     ----------

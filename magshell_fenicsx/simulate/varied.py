@@ -93,7 +93,7 @@ def refuse_excluded(mode: str) -> None:
 
 
 class Varied:
-    """A `continuation.augmented.Family` of scenes.
+    """A `continuation.augmented.SystemFamily` of scenes.
 
     Parameters
     ----------
