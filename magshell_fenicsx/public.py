@@ -62,8 +62,8 @@ def problem_of(
 
 def processes(given: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
     """Those that were asked for; else those of the mesh of a problem, or all."""
-    problem = given.given if isinstance(given, Problem) else None
-    return comm or (problem.home.comm if problem and problem.home else MPI.COMM_WORLD)
+    problem = given.mesh_file if isinstance(given, Problem) else None
+    return comm or (problem.user_mesh.comm if problem and problem.user_mesh else MPI.COMM_WORLD)
 
 
 class Scene(SceneOfProblem):

@@ -15,8 +15,8 @@ import pytest
 from mpi4py import MPI
 
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import Deviated, Embedding
-from magshell_fenicsx.mesh.shapes import DiscShape, flat, sphere
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Embedding
+from magshell_fenicsx.mesh.shapes import DiscShape, plane_embedding, sphere_embedding
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
@@ -135,14 +135,14 @@ def hemisphere(
 
 def spherical(dimple: Dimple | None) -> Embedding:
     """The sphere with a dimple at its pole."""
-    return Deviated(sphere, sphere, (dimple,)) if dimple else sphere
+    return DeviatedEmbedding(sphere_embedding, sphere_embedding, (dimple,)) if dimple else sphere_embedding
 
 
 def disc(size: float, *, half: bool = False) -> Midsurface:
     """A flat disc of radius 1."""
     points = {"pole": np.zeros(2)}
     return distribute(
-        triangulate(DiscShape(1.0, half), lambda x: size, points, flat), MPI.COMM_SELF
+        triangulate(DiscShape(1.0, half), lambda x: size, points, plane_embedding), MPI.COMM_SELF
     )
 
 

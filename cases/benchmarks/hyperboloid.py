@@ -17,7 +17,7 @@ from dolfinx import fem
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.grading import Grading, Line
+from magshell_fenicsx.mesh.grading import Grading, LineFeature
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
@@ -108,8 +108,8 @@ def energy(edge: Edge, R_over_h: float, size: float, *settings: str, graded: boo
         grid = problem.shape
         assert isinstance(grid, Grid)
         place = (grid.low, grid.high)[grid.sides.index("top") % 2][1]
-        layer = Line(1, place, LAYER * size * sqrt(h), GROWTH * size)
-        problem = replace(problem, shape=replace(grid, size=Grading([layer], size).across))
+        layer = LineFeature(1, place, LAYER * size * sqrt(h), GROWTH * size)
+        problem = replace(problem, shape=replace(grid, size=Grading([layer], size).line_spacing))
     scene = Scene(problem)
     *_, last = follow(scene)
     found = scene.observe(last.point.state)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.assembly import MEET, Place
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.mesh.patch import Deviated, MeshError
+from magshell_fenicsx.mesh.multi_shell import MEETING_TOLERANCE, ShellPose
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, MeshError
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
-from magshell_fenicsx.shape.outline import Outline, ground_of
-from magshell_fenicsx.shape.turning import Piece, Span
+from magshell_fenicsx.shape.meridian_chart import MeridianChart, ShellMeridian
+from magshell_fenicsx.shape.outline import Outline, reference_shell_of
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.shells import Part, Several
@@ -40,8 +40,8 @@ class Turned:
     name: str
     start: float
     problem: Problem
-    span: Span
-    place: Place
+    span: MeridianChart
+    place: ShellPose
     outline: Outline
 
     @property
@@ -87,19 +87,19 @@ class Turned:
     def deviation(self, s: Array) -> Array:
         """w0 (n, 1) of the drawn shell there, over R."""
         own, drawn = self.own(s), self.span.embedding
-        w0 = drawn.w0(np.column_stack([own, 0 * own])) if isinstance(drawn, Deviated) else 0 * own
+        w0 = drawn.w0(np.column_stack([own, 0 * own])) if isinstance(drawn, DeviatedEmbedding) else 0 * own
         return np.asarray(self.place.scale * w0[:, None])
 
     def foot(self, x: Array) -> tuple[float, float]:
         """Parameter and azimuth (rad) of the nearest place to one in space."""
-        own, _ = self.span.place(self.outline.inverse(self.place.own(np.asarray(x)[:3])))
+        own, _ = self.span.locate(self.outline.inverse(self.place.to_shell_frame(np.asarray(x)[:3])))
         return float(self.parameter(np.array(own))), float(np.arctan2(x[1], x[0]))
 
     def vertices(self, pressed: Sequence[tuple[float, float]]) -> Array:
-        """See `Piece`."""
+        """See `ShellMeridian`."""
         own = tuple((size / self.place.scale, reach / self.place.scale) for size, reach in pressed)
         s = self.parameter(
-            meridian_vertices(replace(self.problem, pressed=(*self.problem.pressed, *own)))
+            meridian_vertices(replace(self.problem, body_contacts=(*self.problem.body_contacts, *own)))
         )
         return np.asarray(s if self.upright else s[::-1])
 
@@ -118,9 +118,9 @@ class Turned:
         ]
 
     @property
-    def piece(self) -> Piece:
+    def piece(self) -> ShellMeridian:
         """It as a part of all."""
-        return Piece(self.name, (self.start, self.end), self.foot, self.vertices)
+        return ShellMeridian(self.name, (self.start, self.end), self.foot, self.vertices)
 
     def _turned(self, x: Array) -> Array:
         return np.asarray(x if self.upright else x * [1.0, 1.0, -1.0])
@@ -158,7 +158,7 @@ class Joined:
         return values
 
 
-def meridians(several: "Several") -> Span | str:
+def meridians(several: "Several") -> MeridianChart | str:
     """Those of all shells, over the R of the first one; or why there are none.
 
     Raises
@@ -171,7 +171,7 @@ def meridians(several: "Several") -> Span | str:
         return "contact: shells that are joined to each other are modelled with their circumference"
     shells = list[Turned]()
     for part in several.parts:
-        place, outline = several.place(part), ground_of(part.case.shell).perfect
+        place, outline = several.place(part), reference_shell_of(part.case.shell).perfect
         key = part.refused("place")
         if max(np.hypot(*place.position[:2]), np.hypot(*place.Q[:2, 2])) > ROUNDING:
             return f"{key}: its axis is not e3 through the origin"
@@ -213,7 +213,7 @@ def _after(shells: Sequence[Turned], joints: Sequence[tuple[str, str]]) -> dict[
         )
         if (begin, end) != (0, 1):
             return f"{key}: the normals of {both} point to opposite sides"
-        if np.linalg.norm(x - y) > MEET * extent:
+        if np.linalg.norm(x - y) > MEETING_TOLERANCE * extent:
             return f"{key}: {both} do not meet"
         after[before_it.name] = after_it.name
     return after
@@ -223,7 +223,7 @@ def _marked(shell: Turned, feet: Sequence[Array]) -> Turned:
     """With cells that end where another shell stands, at places (3,)."""
     own = [float(shell.own(np.array(shell.foot(x)[0]))) for x in feet]
     new = [s for s in own if np.abs(shell.span.knots - s).min() > ROUNDING]
-    span = replace(shell.span, circles=(*shell.span.circles, *new))
+    span = replace(shell.span, curvature_jumps=(*shell.span.curvature_jumps, *new))
     return replace(shell, problem=replace(shell.problem, meridian=span), span=span)
 
 
@@ -252,7 +252,7 @@ def _alone(part: "Part") -> Problem | str:
         raise type(e)(part.refused(str(e))) from None
 
 
-def _joined(shells: Sequence[Turned], several: "Several") -> Span:
+def _joined(shells: Sequence[Turned], several: "Several") -> MeridianChart:
     joints, names = several.joints, [part.name for part in several.parts]
     by_name = {shell.name: shell for shell in shells}
     joined = {name for one, other in joints if other not in by_name for name in (one, other)}
@@ -277,14 +277,14 @@ def _joined(shells: Sequence[Turned], several: "Several") -> Span:
         for name, s in zip(shell.names, (shell.start, shell.end), strict=True)
     }
     places = dict(of for shell in shells for of in shell.places)
-    span = Span(
+    span = MeridianChart(
         shells[-1].end,
-        tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.circles),
+        tuple(float(shell.parameter(np.array(c))) for shell in shells for c in shell.span.curvature_jumps),
         tuple(None if name in joined else name for shell in shells for name in shell.names),
         drawn,
         drawn.normal,
         place,
-        pieces=tuple(shell.piece for shell in shells),
+        shell_meridians=tuple(shell.piece for shell in shells),
         joints=tuple(
             (at[one], at[other] if other in at else by_name[other].foot(places[one])[0])
             for one, other in joints

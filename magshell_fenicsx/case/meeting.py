@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.touching.section import WHOLE
 from magshell_fenicsx.shape.outline import Outline
@@ -36,7 +36,7 @@ class Meeting:
     def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
         """Elements that show the ring of a contact."""
         x, y = map(float, self.place)
-        return [Disc((x, y), AROUND * sqrt(fit.h), FINE * sqrt(fit.h) / fit.refinement, growth)]
+        return [DiscFeature((x, y), AROUND * sqrt(fit.h), FINE * sqrt(fit.h) / fit.refinement, growth)]
 
 
 def meetings(
@@ -123,7 +123,7 @@ class Charted:
 
     def at(self, chart: Array) -> Array:
         """The place of a chart, or of the nearest one that the shell has."""
-        return self.place(self.outline.embedding(self.outline.within(chart)[None])[0])
+        return self.place(self.outline.embedding(self.outline.clip_to_chart(chart)[None])[0])
 
     def depth(self, x: Array) -> float:
         """How far a place is below the face, less what it is everywhere."""

@@ -12,9 +12,9 @@ from pydantic import BaseModel, ValidationError
 
 from magshell_fenicsx.case.shells import OneOfShells, Part, Several, Shells
 from magshell_fenicsx.input.section import Section, numbers_with_units
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
-from magshell_fenicsx.shape.sections import ShellSection
+from magshell_fenicsx.shape.shell_sections import ShellSection
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
@@ -196,7 +196,7 @@ def _merged(parts: Sequence[Part]) -> Keys:
                     f"shell: lengths of {one} have units and those of {none} none: give all of them one, or none"
                 )
             )
-        if isinstance(other.thickness_factor, GivenField):
+        if isinstance(other.thickness_factor, UserField):
             raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
         if (
             isinstance(other, ShellSection)

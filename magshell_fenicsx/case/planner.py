@@ -200,7 +200,7 @@ def make_problem(
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.removed_edges}
-        conditions |= dict.fromkeys(beyond.sides, "symmetry")
+        conditions |= dict.fromkeys(beyond.planes, "symmetry")
     within = {name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()}
     deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in imperfections.items()}
     modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)

@@ -87,8 +87,8 @@ class DiscFeature:
         s, g, a = self.size, self.growth, min(self.radius, reach)
         outer = g * (reach - a) / s
         ratio = outer / (1 + outer)
-        outside = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - ratio) / g**2)
-        return PER_AREA * (pi * a**2 / s**2 + outside)
+        outside_disc = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - ratio) / g**2)
+        return PER_AREA * (pi * a**2 / s**2 + outside_disc)
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ class SquaresFeature:
     def size_bound(self, x: Array, distance: Array) -> Array:
         offsets = np.abs(x[:, None] - self.centres) - self.halves[:, None]
         depth = np.minimum(offsets.max(axis=-1), 0.0)
-        outside = np.hypot(*np.moveaxis(np.maximum(offsets, 0.0), -1, 0))
-        from_squares = outside + depth + distance[:, None]
+        distance_outside = np.hypot(*np.moveaxis(np.maximum(offsets, 0.0), -1, 0))
+        from_squares = distance_outside + depth + distance[:, None]
         return np.asarray((self.sizes + self.growth * np.maximum(from_squares, 0.0)).min(axis=1))
 
     def cells(self, reach: float) -> float:

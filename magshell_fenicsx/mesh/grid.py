@@ -103,15 +103,15 @@ class Grid:
         counts = np.interp(required, x, cumulative_count)
         intervals = [max(int(np.ceil(b - a - COUNT_TOLERANCE)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(intervals) < MIN_GLUED_COUNT:
-            least = -(-MIN_GLUED_COUNT // len(intervals))
-            intervals = [max(n, least) for n in intervals]
+            min_count = -(-MIN_GLUED_COUNT // len(intervals))
+            intervals = [max(n, min_count) for n in intervals]
         lines = [required[:1]]
         for i, n in enumerate(intervals):
-            following = np.linspace(required[i], required[i + 1], n + 1)[1:]
+            new_lines = np.linspace(required[i], required[i + 1], n + 1)[1:]
             if callable(self.size):
                 inner_counts = np.linspace(counts[i], counts[i + 1], n + 1)[1:-1]
-                following[:-1] = np.interp(inner_counts, cumulative_count, x)
-            lines.append(following)
+                new_lines[:-1] = np.interp(inner_counts, cumulative_count, x)
+            lines.append(new_lines)
         return np.concatenate(lines)
 
     def _straight_lines(self, axis: int) -> Array:

@@ -206,8 +206,8 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     places = [*VERTICES]
     quads = []
     for i in range(3):
-        vertex, following, previous = (VERTICES[(i + k) % 3] for k in range(3))
-        middle, other_middle = (vertex + following) / 2, (vertex + previous) / 2
+        vertex, next_vertex, previous_vertex = (VERTICES[(i + k) % 3] for k in range(3))
+        middle, other_middle = (vertex + next_vertex) / 2, (vertex + previous_vertex) / 2
         quad = (
             (1 - s) * (1 - t) * vertex
             + s * (1 - t) * middle

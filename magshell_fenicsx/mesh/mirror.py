@@ -1,4 +1,9 @@
-"""Mirror planes, the meshes cut by them, and turned frames."""
+"""Symmetry planes and sectors, the triangulations cut at them, and frames turned about e3.
+
+A model with a symmetry plane is computed on one half; a model with the planes of waves
+cos(m theta) is computed on a sector of 180/m degrees. `Mirror` and `Sector` say which part is
+modelled and how its images make the whole surface. Lengths are over R (docs/theory.md, half shell).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,68 +20,69 @@ from magshell_fenicsx.mesh.patch import (
     on_border,
 )
 
+Array = NDArray[np.float64]
+SYMMETRY_EDGE = "symmetry"  # name of the edge in the symmetry plane
+SECOND_SYMMETRY_EDGE = "symmetry 2"  # name of the edge in the second plane of a sector
+PLANARITY_TOLERANCE = 1e-6  # deviation of an edge from a plane, over R
+ROUNDING = 1e-9  # relative difference that is rounding
 
-def rotation(azimuth: float) -> NDArray[np.float64]:
-    """Q (3, 3) of a frame turned by an azimuth (rad): Q v are the components of v in it, and w Q
-    turns rows w back.
+
+def rotation(azimuth: float) -> Array:
+    """Return Q (3, 3) of a frame turned about e3 by an azimuth (rad).
+
+    Q v are the components of v in the turned frame; w Q turns rows w back.
     """
     c, s = np.cos(azimuth), np.sin(azimuth)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-Array = NDArray[np.float64]
-CUT = "symmetry"  # name of the edge on the plane
-STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
-SECOND_CUT = "symmetry 2"  # of that on the second plane of a sector
-ROUNDING = 1e-9
-
-
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """The plane normal . x = offset; the half with normal . x > offset is modelled.
+    """The symmetry plane normal . x = offset; the half with normal . x > offset is modelled.
 
     Attributes
     ----------
     normal
         Unit vector (3,); components that only rounding makes are set to zero.
-    lost
-        Edges of the other half -> their mirror images.
+    offset
+        Distance of the plane from the origin, along the normal.
+    removed_edges
+        Edges of the half that is not modelled -> their mirror images.
     """
 
     normal: Array
     offset: float = 0.0
-    lost: Mapping[str, str] = field(default_factory=dict)
+    removed_edges: Mapping[str, str] = field(default_factory=dict)
 
     def __eq__(self, other: object) -> bool:
-        """Whether it is the same plane with the same edges: the parts of an array are compared one
-        by one.
-        """
+        """Whether it is the same plane with the same edges; arrays are compared as a whole."""
         if not isinstance(other, Mirror):
             return NotImplemented
-        same = (self.offset, self.lost) == (other.offset, other.lost)
-        return same and np.array_equal(self.normal, other.normal)
+        same_data = (self.offset, self.removed_edges) == (other.offset, other.removed_edges)
+        return same_data and np.array_equal(self.normal, other.normal)
 
     def __hash__(self) -> int:
         return hash((*self.normal, self.offset))
 
     @classmethod
-    def of(
-        cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None
+    def with_normal(
+        cls, normal: Array, offset: float = 0.0, removed_edges: Mapping[str, str] | None = None
     ) -> "Mirror":
-        """The plane with a normal of any length."""
+        """Return the plane normal . x = offset for a normal of any length."""
         unit = np.asarray(normal) / np.linalg.norm(normal)
         unit = np.where(np.abs(unit) < ROUNDING, 0.0, unit)
-        return cls(unit / np.linalg.norm(unit), offset / float(np.linalg.norm(normal)), lost or {})
+        distance = offset / float(np.linalg.norm(normal))
+        return cls(unit / np.linalg.norm(unit), distance, removed_edges or {})
 
     def is_plane_of(self, other: "Mirror") -> bool:
         """Whether both are the same half at the same plane, to rounding; edges may differ."""
-        normals = np.abs(self.normal - other.normal).max()
-        return bool(max(normals, abs(self.offset - other.offset)) < ROUNDING)
+        difference = np.abs(self.normal - other.normal).max()
+        return bool(max(difference, abs(self.offset - other.offset)) < ROUNDING)
 
     @classmethod
-    def upright(cls, azimuth: float) -> "Mirror":
-        """The plane through e3 at an azimuth (rad)."""
-        return cls.of(np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]))
+    def through_axis(cls, azimuth: float) -> "Mirror":
+        """Return the plane through e3 at an azimuth (rad)."""
+        return cls.with_normal(np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]))
 
     @property
     def through_e3(self) -> bool:
@@ -85,7 +91,7 @@ class Mirror:
 
     @property
     def azimuth(self) -> float:
-        """The azimuth of a plane through e3 (rad)."""
+        """Azimuth of a plane through e3 (rad)."""
         return float(np.arctan2(-self.normal[0], self.normal[1]))
 
     @property
@@ -94,43 +100,50 @@ class Mirror:
         return np.append(self.normal, self.offset) if self.offset else self.normal
 
     @property
-    def sides(self) -> Mapping[str, "Mirror"]:
-        """Name of each edge on a plane -> the plane."""
-        return {CUT: self}
+    def planes(self) -> Mapping[str, "Mirror"]:
+        """Name of each edge in a symmetry plane -> the plane."""
+        return {SYMMETRY_EDGE: self}
 
     @property
     def copies(self) -> int:
-        """How many copies of what is modelled make the whole."""
+        """Number of copies of the modelled part that make the whole."""
         return 2
 
     @property
     def images(self) -> list["Image"]:
-        """The copies that make the whole; the first is what is modelled itself."""
+        """The copies that make the whole; the first is the modelled part itself."""
         return [
             Image(np.eye(3), np.zeros(3), 1.0),
             Image(self.reflection, 2 * self.offset * self.normal, -1.0),
         ]
 
-    def everywhere(self, x: Array) -> Array:
-        """Places (n, 3) and all their images, (copies n, 3)."""
-        return np.concatenate([image.of(x) for image in self.images])
+    def with_images(self, x: Array) -> Array:
+        """Return places (n, 3) and all their images, (copies n, 3)."""
+        return np.concatenate([image.apply(x) for image in self.images])
 
-    def summed(self, v: Array, parity: float = 1.0) -> Array:
-        """The sum (3,) of the images of a vector; mirrored ones count `parity` times."""
+    def sum_over_images(self, v: Array, parity: float = 1.0) -> Array:
+        """Return the sum (3,) of the images of a vector; mirrored ones count `parity` times."""
+        factors = [parity if image.sign < 0 else 1.0 for image in self.images]
+        images = [image.Q @ v for image in self.images]
         return np.asarray(
-            sum(image.Q @ v * (parity if image.sign < 0 else 1.0) for image in self.images)
+            sum(image * factor for image, factor in zip(images, factors, strict=True))
         )
 
-    def turned(self, azimuth: float) -> "Mirror":
-        """This plane, given in a frame turned about e3 by an azimuth (rad), in the frame that is
-        not turned.
+    def rotated(self, azimuth: float) -> "Mirror":
+        """Return this plane in the frame of the case.
+
+        Parameters
+        ----------
+        azimuth
+            Angle about e3 (rad) by which the frame is turned in which this plane is given.
         """
         return replace(self, normal=self.normal @ rotation(azimuth))
 
     @property
     def reversed(self) -> "Mirror":
-        """The same plane with the other half."""
-        return Mirror(-self.normal, -self.offset, {kept: lost for lost, kept in self.lost.items()})
+        """This plane with the other half modelled."""
+        removed = {image: edge for edge, image in self.removed_edges.items()}
+        return Mirror(-self.normal, -self.offset, removed)
 
     @property
     def reflection(self) -> Array:
@@ -138,61 +151,76 @@ class Mirror:
         return np.asarray(np.eye(3) - 2 * np.outer(self.normal, self.normal))
 
     def image(self, x: Array) -> Array:
-        """Mirrored places (..., 3)."""
-        return np.asarray(np.asarray(x) - 2 * self.beyond(x)[..., None] * self.normal)
+        """Return the mirror images of places (..., 3)."""
+        return np.asarray(np.asarray(x) - 2 * self.signed_distance(x)[..., None] * self.normal)
 
-    def keeps_lines(self, along: Array | None) -> bool:
-        """Whether images of lines along a vector (3,), or if None of meridians about e3, are such
-        lines.
+    def keeps_lines(self, direction: Array | None) -> bool:
+        """Whether the images of a family of lines belong to the family.
+
+        Parameters
+        ----------
+        direction
+            (3,) of straight lines; None for the meridians about e3.
         """
-        if along is None:
-            through = abs(self.offset) < STRAIGHT or abs(float(self.normal[2])) > STRAIGHT
-            return through and self.keeps_lines(np.eye(3)[2])
-        unit = along / np.linalg.norm(along)
-        cosine, sine = (
-            abs(float(unit @ self.normal)),
-            float(np.linalg.norm(np.cross(unit, self.normal))),
-        )
-        return min(cosine, sine) < STRAIGHT
+        if direction is None:
+            maps_axis = (
+                abs(self.offset) < PLANARITY_TOLERANCE
+                or abs(float(self.normal[2])) > PLANARITY_TOLERANCE
+            )
+            return maps_axis and self.keeps_lines(np.eye(3)[2])
+        unit = direction / np.linalg.norm(direction)
+        cosine = abs(float(unit @ self.normal))
+        sine = float(np.linalg.norm(np.cross(unit, self.normal)))
+        return min(cosine, sine) < PLANARITY_TOLERANCE
 
-    def beyond(self, x: Array) -> Array:
-        """Distances (...) from the plane, positive in the half that is modelled."""
+    def signed_distance(self, x: Array) -> Array:
+        """Return the distance (...) of places (..., 3) from the plane, positive in the half."""
         return np.asarray(np.asarray(x) @ self.normal - self.offset)
 
-    def other(self, edge: str) -> str:
-        """The mirror image of an edge."""
-        return {**{kept: lost for lost, kept in self.lost.items()}, **self.lost}.get(edge, edge)
+    def image_of_edge(self, edge: str) -> str:
+        """Return the name of the mirror image of an edge."""
+        edge_of_image = {image: name for name, image in self.removed_edges.items()}
+        return {**edge_of_image, **self.removed_edges}.get(edge, edge)
 
     @property
-    def in_plane(self) -> tuple[Array, Array]:
+    def in_plane_vectors(self) -> tuple[Array, Array]:
         """Two unit vectors in the plane, normal to each other."""
-        first = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
-        along = np.cross(first, self.normal)
-        along /= np.linalg.norm(along)
-        return along, np.asarray(np.cross(self.normal, along))
+        axis = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
+        first = np.cross(axis, self.normal)
+        first /= np.linalg.norm(first)
+        return first, np.asarray(np.cross(self.normal, first))
 
 
 @dataclass(frozen=True)
 class Image:
-    """A copy of what is modelled, x -> Q x + shift; `sign` is the determinant of Q."""
+    """The map x -> Q x + shift of the modelled part to one of its copies.
+
+    Attributes
+    ----------
+    Q
+        Orthogonal matrix (3, 3).
+    shift
+        (3,) over R.
+    sign
+        Determinant of Q: -1 of a mirror image.
+    """
 
     Q: Array
     shift: Array
     sign: float
 
-    def of(self, x: Array) -> Array:
-        """The images (..., 3) of places."""
+    def apply(self, x: Array) -> Array:
+        """Return the images (..., 3) of places."""
         return np.asarray(x @ self.Q.T + self.shift)
 
-    def back(self, x: Array) -> Array:
-        """The places (..., 3) whose images these are."""
+    def apply_inverse(self, x: Array) -> Array:
+        """Return the places (..., 3) whose images these are."""
         return np.asarray((x - self.shift) @ self.Q)
 
 
 @dataclass(frozen=True, eq=False)
 class Sector(Mirror):
-    """Two planes through e3, this one and one that is turned by 180/m degrees; what lies between
-    them is modelled.
+    """Two symmetry planes through e3, 180/m degrees apart; the sector between them is modelled.
 
     Waves cos(m theta) around e3 have both as planes of symmetry. A half is the sector of m = 1.
 
@@ -211,23 +239,23 @@ class Sector(Mirror):
         return hash((super().__hash__(), self.waves))
 
     @classmethod
-    def at(cls, azimuth: float, waves: int) -> "Sector":
-        """The sector that begins at an azimuth (rad)."""
-        return cls(Mirror.upright(azimuth).normal, waves=waves)
+    def from_azimuth(cls, azimuth: float, waves: int) -> "Sector":
+        """Return the sector that begins at an azimuth (rad)."""
+        return cls(Mirror.through_axis(azimuth).normal, waves=waves)
 
     @property
     def angle(self) -> float:
-        """Between the planes (rad)."""
+        """Angle between the planes (rad)."""
         return np.pi / self.waves
 
     @property
-    def second(self) -> Mirror:
-        """The plane where it ends."""
-        return Mirror.upright(self.azimuth + self.angle).reversed
+    def second_plane(self) -> Mirror:
+        """The plane where the sector ends."""
+        return Mirror.through_axis(self.azimuth + self.angle).reversed
 
     @property
-    def sides(self) -> Mapping[str, Mirror]:
-        return {CUT: self, SECOND_CUT: self.second}
+    def planes(self) -> Mapping[str, Mirror]:
+        return {SYMMETRY_EDGE: self, SECOND_SYMMETRY_EDGE: self.second_plane}
 
     @property
     def copies(self) -> int:
@@ -235,66 +263,72 @@ class Sector(Mirror):
 
     @property
     def images(self) -> list[Image]:
-        turns = [rotation(-2 * self.angle * k) for k in range(self.waves)]
-        return [Image(Q @ one.Q, Q @ one.shift, one.sign) for Q in turns for one in super().images]
+        of_half = super().images
+        rotations = [rotation(-2 * self.angle * k) for k in range(self.waves)]
+        return [
+            Image(Q @ image.Q, Q @ image.shift, image.sign) for Q in rotations for image in of_half
+        ]
 
 
-Y0 = Mirror(
-    np.array([0.0, 1.0, 0.0])
-)  # for shapes whose chart is halved: the model's frame is turned so that this is their plane
+# the symmetry plane of shapes whose chart is halved: the model's frame is turned into it
+Y0_PLANE = Mirror(np.array([0.0, 1.0, 0.0]))
 
 
 def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
-    """The half of a triangulation, or its sector; its edges on the planes have the names of these.
+    """Return the half or the sector of a triangulation; its edges in the planes are named so.
 
     Raises
     ------
     MeshError
         If triangles lie across a plane, or in it.
     """
-    for name, plane in mirror.sides.items():
+    for name, plane in mirror.planes.items():
         patch = _halved(patch, plane, name)
     return patch
 
 
-def _halved(patch: PatchMesh, mirror: Mirror, name: str) -> PatchMesh:
+def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
+    """Return the triangles in the half of a plane; the edge in the plane gets a name."""
     places = patch.embedding(patch.nodes)
-    beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
-    corners = beyond[patch.cells[:, :3]]
-    kept = corners.mean(axis=1) > 0
-    within = np.where(kept[:, None], corners, -corners)  # how far on their own side of the plane
-    across = within.min() < -ROUNDING * extent or within.max(axis=1).min() <= ROUNDING * extent
-    if kept.all() or not kept.any() or across:
+    distances, extent = mirror.signed_distance(places), np.ptp(places, axis=0).max()
+    corners = distances[patch.cells[:, :3]]
+    in_half = corners.mean(axis=1) > 0
+    depths = np.where(in_half[:, None], corners, -corners)  # into each triangle's own half
+    crosses_plane = depths.min() < -ROUNDING * extent
+    lies_in_plane = depths.max(axis=1).min() <= ROUNDING * extent
+    if in_half.all() or not in_half.any() or crosses_plane or lies_in_plane:
         raise MeshError(
-            f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"
+            f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: "
+            "mesh it with a curve there"
         )
-    cells = patch.cells[kept]
+    cells = patch.cells[in_half]
     used, cells = np.unique(cells, return_inverse=True)
     cells = cells.reshape(-1, patch.cells.shape[1])
-    one = np.arange(len(patch.nodes)) if patch.one is None else patch.one
-    first = np.full(
-        len(patch.nodes), -1, dtype=np.int64
-    )  # for each vertex, its first node that is kept
-    first[one[used][::-1]] = np.arange(len(used))[::-1]
-    edges = {edge: first[one[pairs]] for edge, pairs in patch.edges.items()}
-    border = border_pairs(first[one[used[directed_sides(cells)]]])
+    glued = patch.representative
+    representative = np.arange(len(patch.nodes)) if glued is None else glued
+    # for each vertex, its first node that is in the half
+    first_node = np.full(len(patch.nodes), -1, dtype=np.int64)
+    first_node[representative[used][::-1]] = np.arange(len(used))[::-1]
+    edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
+    border = border_pairs(first_node[representative[used[directed_sides(cells)]]])
     edges = on_border(edges, border)
-    in_edges = {pair for lines in edges.values() for pair in as_set(lines)}
-    if on_plane := sorted(as_set(border) - in_edges):
-        edges[name] = np.array(on_plane, dtype=np.int64)
+    named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}
+    if pairs_in_plane := sorted(as_set(border) - named_pairs):
+        edges[edge_name] = np.array(pairs_in_plane, dtype=np.int64)
+    source = patch.source_triangles
     return replace(
         patch,
         nodes=patch.nodes[used],
         cells=cells,
         edges=edges,
-        one=None if patch.one is None else first[one[used]],
-        patches={each: inside[kept] for each, inside in patch.patches.items()},
-        given=None if patch.given is None else patch.given[kept],
-        feet={edge: on[kept] for edge, on in patch.feet.items()},
+        representative=None if glued is None else first_node[representative[used]],
+        patches={name: mask[in_half] for name, mask in patch.patches.items()},
+        source_triangles=None if source is None else source[in_half],
+        t_junctions={name: mask[in_half] for name, mask in patch.t_junctions.items()},
     )
 
 
 def plane_text(mirror: Mirror) -> str:
-    """Normal and offset, for messages."""
+    """Return normal and offset of a plane as text for messages."""
     normal = ", ".join(f"{c + 0.0:.4g}" for c in np.round(mirror.normal, 9))
     return f"({normal}) . x = {round(mirror.offset, 9) + 0.0:.4g} R"

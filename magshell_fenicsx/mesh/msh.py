@@ -53,7 +53,7 @@ LINE_TYPES = ("Line 2", "Line 3", "Line 4")
 
 
 def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
-    """Return triangles (m, 3 | 6 | 10) with one orientation in each connected piece.
+    """Return triangles (m, 3 | 6 | 10) with one orientation in each connected component.
 
     It is that of the larger area, see `_is_reversed`.
 
@@ -85,11 +85,13 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     # neighbours that agree run through their edge in opposite directions
     agree = edges[side, 0] != edges[opposite_side, 0]
     m = len(cells)
-    left, right = side % m, opposite_side % m
+    cell, neighbour = side % m, opposite_side % m
     # each triangle counts twice, once in each orientation: an orientable surface then has two
     # separate copies
-    rows = np.concatenate([left, left + m])
-    columns = np.concatenate([np.where(agree, right, right + m), np.where(agree, right + m, right)])
+    rows = np.concatenate([cell, cell + m])
+    columns = np.concatenate(
+        [np.where(agree, neighbour, neighbour + m), np.where(agree, neighbour + m, neighbour)]
+    )
     graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
     _, copy = scipy.sparse.csgraph.connected_components(graph, directed=False)
     if (copy[:m] == copy[m:]).any():
@@ -100,18 +102,18 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
         )
     _refuse_torn(nodes, cells, copy[:m], first_copy)
     keeps_orientation = np.empty(m, dtype=bool)
-    pieces = np.minimum(copy[:m], copy[m:])
-    for piece in np.unique(pieces):
-        in_piece = np.flatnonzero(pieces == piece)
-        as_first = copy[in_piece] == copy[in_piece[0]]
-        is_reversed = _is_reversed(nodes, cells[in_piece], areas[in_piece], as_first)
-        keeps_orientation[in_piece] = ~as_first if is_reversed else as_first
+    components = np.minimum(copy[:m], copy[m:])
+    for component in np.unique(components):
+        in_component = np.flatnonzero(components == component)
+        as_first = copy[in_component] == copy[in_component[0]]
+        is_reversed = _is_reversed(nodes, cells[in_component], areas[in_component], as_first)
+        keeps_orientation[in_component] = ~as_first if is_reversed else as_first
     reversed_cells = cells[:, REVERSED_NODES[cells.shape[1]]]
     return np.where(keeps_orientation[:, None], cells, reversed_cells)
 
 
 def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
-    """Return whether a piece has the orientation of the triangles that are not `as_first`.
+    """Return whether a component has the orientation of the triangles that are not `as_first`.
 
     The larger area decides. Halves of the same size, as refined meshes have them, do not depend on
     the numbers of triangles: their normals point upwards on the whole, else along e2 or e1, else
@@ -130,10 +132,10 @@ def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.
 
 
 def _refuse_torn(
-    nodes: Array, cells: Cells, piece: NDArray[np.int32], first_copy: int | None
+    nodes: Array, cells: Cells, component: NDArray[np.int32], first_copy: int | None
 ) -> None:
-    """Refuse a surface with pieces that have nodes at one place and are not connected."""
-    if (piece == piece[0]).all():
+    """Refuse a surface with components that have nodes at one place and are not connected."""
+    if (component == component[0]).all():
         return
     vertices = np.unique(cells[:, :3])
     if first_copy is not None:

@@ -1,4 +1,10 @@
-"""A triangulated surface before it is given to dolfinx, and the sides of its triangles."""
+"""A triangulated mid-surface before it is given to dolfinx, and the sides of its triangles.
+
+`Triangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the triangulation
+that the shell is computed on: nodes in a chart or in space, the embedding into space, named edges,
+points and patches. Lengths are over R, if nothing else is said. Arrays are NumPy's, and no function
+here is collective but `refuse_places`.
+"""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +18,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from magshell_fenicsx.mesh.given import Home
+    from magshell_fenicsx.mesh.user_mesh import UserMesh
 
 Embedding = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Array = NDArray[np.float64]
@@ -21,7 +27,7 @@ Pairs = NDArray[np.int64]  # (n, 2) vertices of edges
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A surface in space as a file or a program gives it; nobody changes it.
+    """A surface in space as a file or a program gives it; it is never changed.
 
     Attributes
     ----------
@@ -33,55 +39,52 @@ class Triangles:
         Name -> (e, 2) vertex pairs.
     patches
         Name -> (m,) whether each triangle belongs to it.
-    home
-        The mesh of a program that they are from; None of a file.
+    user_mesh
+        The mesh of a program that they are from; None for a file.
     """
 
     nodes: Array
     cells: NDArray[np.int64]
     edges: dict[str, Pairs] = field(default_factory=dict)
     patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    home: "Home | None" = field(default=None, repr=False)
+    user_mesh: "UserMesh | None" = field(default=None, repr=False)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
 
     @cached_property
     def digest(self) -> str:
-        """A hash of all that it has."""
-        named = [
-            each
-            for name, part in {**self.edges, **self.patches}.items()
-            for each in (np.array(name), part)
-        ]
-        return _digest(self.nodes, self.cells, *named)
+        """Hash of nodes, cells, edges and patches."""
+        names_and_values = list[NDArray[Any]]()
+        for name, values in {**self.edges, **self.patches}.items():
+            names_and_values += [np.array(name), values]
+        return _digest(self.nodes, self.cells, *names_and_values)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GivenField:
-    """Numbers that vary over `Triangles` as a program gives them, polynomials in each; nobody
-    changes it.
+class UserField:
+    """A field on `Triangles` as a program gives it, a polynomial in each; it is never changed.
 
     Attributes
     ----------
     name
-        For people.
+        Name for messages.
     degree
-        Of the polynomials.
+        Degree of the polynomials.
     nodal
         (m, nodes, size) values at the nodes of Basix's Lagrange element of the degree, in the order
         of each triangle.
     swapped
-        (nodes,) for each node that with the second and third vertex exchanged.
-    home
-        The mesh that it is on.
+        (nodes,) number that each node has when the second and third vertex are exchanged.
+    user_mesh
+        The mesh that the field is on.
     """
 
     name: str
     degree: int
     nodal: Array
     swapped: NDArray[np.int64]
-    home: "Home | None" = None
+    user_mesh: "UserMesh | None" = None
 
     def __repr__(self) -> str:
         return "a function on the mesh"
@@ -91,70 +94,77 @@ class GivenField:
 
     @cached_property
     def digest(self) -> str:
-        """A hash of its values."""
+        """Hash of the values."""
         return _digest(self.nodal)
 
     @property
     def size(self) -> int:
-        """How many numbers it is at each place."""
+        """Number of components at each place."""
         return int(self.nodal.shape[2])
 
     @property
     def largest(self) -> Array:
-        """The numbers (size,) where they are largest."""
-        each = self.nodal.reshape(-1, self.size)
-        return np.asarray(each[np.argmax(np.linalg.norm(each, axis=1))])
+        """The value (size,) of the largest norm."""
+        values = self.nodal.reshape(-1, self.size)
+        return np.asarray(values[np.argmax(np.linalg.norm(values, axis=1))])
 
-    def mapped(self, of: Callable[[Array], Array]) -> "GivenField":
-        """With other numbers (..., others) linear in these (..., size)."""
-        return replace(self, nodal=of(self.nodal))
+    def mapped(self, linear_map: Callable[[Array], Array]) -> "UserField":
+        """Return the field after a linear map of its values (..., size) to (..., other size)."""
+        return replace(self, nodal=linear_map(self.nodal))
 
-    def in_cells(self, given: NDArray[np.int64]) -> Array:
-        """Values (cells, nodes, size) in triangles as `PatchMesh.given` tells them."""
-        number, turned = given.T
+    def in_cells(self, source_triangles: NDArray[np.int64]) -> Array:
+        """Return the values (cells, nodes, size) in triangles.
+
+        Parameters
+        ----------
+        source_triangles
+            (cells, 2), see `PatchMesh.source_triangles`.
+        """
+        number, is_reversed = source_triangles.T
         values = self.nodal[number]
-        return np.where(turned[:, None, None] == 1, values[:, self.swapped], values)
+        return np.where(is_reversed[:, None, None] == 1, values[:, self.swapped], values)
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
     digest = hashlib.sha256()
-    for each in arrays:
-        digest.update(str((each.dtype, each.shape)).encode() + np.ascontiguousarray(each).tobytes())
+    for array in arrays:
+        digest.update(str((array.dtype, array.shape)).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class PatchMesh:
-    """Triangles of order 1, 2 or 3 with named edges and points.
+    """Triangles of order 1, 2 or 3 with named edges, points and patches.
 
     Attributes
     ----------
     nodes
-        (n, d) coordinates: of a chart (d = 2) or of space (d = 3).
+        (n, d) coordinates: of a chart (d = 2) or of space (d = 3; 6 with normals).
     cells
         (m, 3 | 6 | 10) node numbers in gmsh's order, vertices first.
     embedding
-        Maps (n, d) coordinates to (n, 3) points of the mid-surface.
+        Maps (n, d) coordinates to (n, 3) places of the mid-surface.
     edges
         Name -> (e, 2) vertex pairs of that boundary edge.
     points
         Name -> (d,) coordinates of a vertex of the mesh.
-    one
+    representative
         (n,) for each node the node that it is glued to, or itself: glued nodes have the same place
         in space and are one vertex. `edges` has these numbers. None where nothing is glued.
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
-    given
+    source_triangles
         (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1
-        where it has been turned over; None without.
+        where its orientation is reversed; None for other surfaces.
     joints
-        Of each two edges that are glued: whether each triangle has one, and whether it has the
-        other. None for an edge on another shell, of which nothing is glued.
-    feet
-        Of a mesh file in which an edge has three triangles: name of an edge that stands on another
-        sheet -> whether each triangle is one on which it does.
+        For each joint, two masks (m,): whether each triangle has a side on the first edge, and on
+        the second one. None for a T-junction, of which nothing is glued.
+    t_junctions
+        Of a mesh file in which an edge has three triangles: name of an edge that ends on another
+        sheet -> (m,) whether each triangle is one that it ends on.
     shells
-        Names of the patches that are shells, of which there are several.
+        Names of the patches that are shells, where there are several.
     """
 
     nodes: NDArray[np.float64]
@@ -162,68 +172,78 @@ class PatchMesh:
     embedding: Embedding
     edges: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     points: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    one: NDArray[np.int64] | None = None
+    representative: NDArray[np.int64] | None = None
     patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    given: NDArray[np.int64] | None = None
+    source_triangles: NDArray[np.int64] | None = None
     joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None, ...] = ()
-    feet: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    t_junctions: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     shells: tuple[str, ...] = ()
 
     @property
     def corners(self) -> NDArray[np.int64]:
         """(m, 3) vertices of the triangles, glued ones under one number."""
         corners = self.cells[:, :3]
-        return corners if self.one is None else self.one[corners]
+        return corners if self.representative is None else self.representative[corners]
 
 
 class MeshError(ValueError):
     """The triangulation cannot carry a shell; the message says where and why."""
 
 
-def refuse_places(bad: Array, what: str, comm: "MPI.Comm") -> None:
-    """See that no rank has found a bad place (n, 3) over R; collective.
+def refuse_places(bad_places: Array, what: str, comm: "MPI.Comm") -> None:
+    """Raise where a rank has found a place at which the mesh or a field is unfit; collective.
+
+    Parameters
+    ----------
+    bad_places
+        (n, 3) over R, those that this rank has found.
+    what
+        What is wrong there: how the message begins.
 
     Raises
     ------
     MeshError
-        On every rank, with the first of them.
+        On every rank, with the first of the places.
     """
-    if places := [place for of_rank in comm.allgather(bad[:1].tolist()) for place in of_rank]:
+    first_of_each_rank = comm.allgather(bad_places[:1].tolist())
+    if places := [place for places_of_rank in first_of_each_rank for place in places_of_rank]:
         x, y, z = places[0]
         raise MeshError(f"{what} at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
 
 
 def place_text(x: NDArray[np.float64]) -> str:
-    """The coordinates (3,) of a place, for messages."""
+    """Return the coordinates (3,) of a place as text for messages."""
     return f"({x[0]:.4g}, {x[1]:.4g}, {x[2]:.4g})"
 
 
 def directed_sides(cells: NDArray[np.int64]) -> Pairs:
-    """Sides (3 m, 2) in the direction of their triangles (m, 3 or more): all first sides, all
-    second, all third.
+    """Return the sides (3 m, 2) of triangles (m, 3 or more), each in its triangle's direction.
+
+    All first sides come first, then all second ones, then all third ones.
     """
     return np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
 
 
 def border_pairs(sides: Pairs) -> Pairs:
-    """The sides that belong to one triangle only, lower vertex first."""
+    """Return the sides that belong to one triangle only, lower vertex first."""
     pairs, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     return np.asarray(pairs[times == 1])
 
 
 def as_set(pairs: Pairs) -> set[tuple[int, int]]:
-    """Pairs of vertices without a direction: lower vertex first."""
+    """Return pairs of vertices as a set without direction: lower vertex first."""
     return {(int(a), int(b)) for a, b in np.sort(pairs, axis=1)}
 
 
-def on_border(named: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
-    """The part of each named edge that lies on the border; names without such a part are left out."""
-    ends = as_set(border)
-    kept = {
-        name: pairs[[(a, b) in ends for a, b in np.sort(pairs, axis=1)]]
-        for name, pairs in named.items()
-    }
-    return {name: pairs for name, pairs in kept.items() if len(pairs)}
+def on_border(edges: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
+    """Return the part of each named edge on the border; names without one are left out."""
+    border_set = as_set(border)
+    edges_on_border = dict[str, Pairs]()
+    for name, pairs in edges.items():
+        is_on_border = [(a, b) in border_set for a, b in np.sort(pairs, axis=1)]
+        if any(is_on_border):
+            edges_on_border[name] = pairs[is_on_border]
+    return edges_on_border
 
 
 def check_orientation(patch: PatchMesh) -> None:
@@ -235,13 +255,13 @@ def check_orientation(patch: PatchMesh) -> None:
         If two neighbours run through their common edge in the same direction, or
         if more than two triangles share an edge.
     """
-    same_way, times = np.unique(directed_sides(patch.corners), axis=0, return_counts=True)
+    sides, times = np.unique(directed_sides(patch.corners), axis=0, return_counts=True)
     if (times > 1).any():
-        a, b = same_way[times > 1][0]
-        where = patch.embedding(patch.nodes[[a, b]]).mean(axis=0)
+        a, b = sides[times > 1][0]
+        middle = patch.embedding(patch.nodes[[a, b]]).mean(axis=0)
         raise MeshError(
-            f"the normals of two neighbouring triangles point to opposite sides (or three triangles meet) "
-            f"at the edge around {place_text(where)}"
+            "the normals of two neighbouring triangles point to opposite sides "
+            f"(or three triangles meet) at the edge around {place_text(middle)}"
         )
 
 
@@ -249,13 +269,15 @@ Deviation = Callable[[Array], Array]  # places (n, 3) of the perfect surface -> 
 
 
 @dataclass(frozen=True)
-class Deviated:
-    """Chart -> r0 = x + w0(x) n(x), with the sum w0 of all deviations.
+class DeviatedEmbedding:
+    """Embedding of an imperfect surface: chart -> r0 = x + w0(x) n(x), w0 the sum of deviations.
 
     Attributes
     ----------
     perfect, normal
         Chart -> places x (n, 3) and outward unit normals (n, 3) of the perfect surface.
+    deviations
+        Places x -> w0 along the normal.
     """
 
     perfect: Embedding
@@ -266,11 +288,12 @@ class Deviated:
         return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
 
     def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
-        """The displacement (n, 3) that other deviations add."""
-        return replace(self, deviations=tuple(deviations)).w0(chart)[:, None] * self.normal(chart)
+        """Return the displacement (n, 3) that other deviations add."""
+        w0 = replace(self, deviations=tuple(deviations)).w0(chart)
+        return w0[:, None] * self.normal(chart)
 
     def w0(self, chart: Array) -> Array:
-        """w0 over R at places of the chart, (n,)."""
+        """Return the deviation w0 over R at places of the chart, (n,)."""
         places = self.perfect(chart)
         return np.asarray(
             sum((deviation(places) for deviation in self.deviations), np.zeros(len(places)))

@@ -1,7 +1,7 @@
-"""The plane shapes that gmsh triangulates, the chart of the mid-surface or half of it; sphere and
-plane over a chart.
+"""Plane shapes that gmsh triangulates: the chart of the mid-surface, or half of it.
 
-The sphere of radius 1 is charted by (x, y) = phi (cos theta, sin theta).
+And the embeddings of sphere and plane over a chart. The sphere of radius 1 is charted by
+(x, y) = phi (cos theta, sin theta). Lengths are over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,43 +13,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Faces = list[tuple[int, int]]
-Glued = tuple[int, float, float]  # an axis, and the coordinates across it
+Faces = list[tuple[int, int]]  # dimension and tag of gmsh's entities
+GluedSides = tuple[int, float, float]  # an axis, and the coordinates across it of both sides
+EDGE_TOLERANCE = 1e-9  # over the radius, or the length of a strip: a point so near is on an edge
 
 
-class Shape(Protocol):
-    """A shape for `triangulate`; `area` is the area of the modelled part, `reach` its extent."""
-
-    @property
-    def area(self) -> float: ...
+class PlaneShape(Protocol):
+    """A shape for `triangulate`."""
 
     @property
-    def reach(self) -> float: ...
+    def area(self) -> float:
+        """Area of the modelled part."""
+
+    @property
+    def reach(self) -> float:
+        """Extent of the shape."""
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the coordinates of the modelled part: of a disc of radius and
-        angle.
+        """Lower and upper bounds of the coordinates of the modelled part.
+
+        Of a disc they are bounds of radius and angle.
         """
 
     @property
-    def half(self) -> bool: ...
+    def half(self) -> bool:
+        """Whether a half or a sector is modelled."""
 
     @property
     def rims(self) -> tuple[Array, ...]:
         """Closed curves, points (n, 2) each, that elements follow."""
 
     @property
-    def glued(self) -> tuple[Glued, ...]:
+    def glued(self) -> tuple[GluedSides, ...]:
         """The pairs of opposite sides that are one line of the surface."""
 
     def faces(self, occ: Any) -> Faces:
-        """Make the shape's faces with gmsh's OpenCASCADE kernel; elements follow their common
-        edges.
+        """Make the shape's faces with gmsh's OpenCASCADE kernel.
+
+        Elements follow the edges of all faces.
         """
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
-        """Which of the points (n, 2) lie on each named boundary edge."""
+        """Return for each named boundary edge which of the points (n, 2) lie on it, (n,)."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ class DiscShape:
     edge: str = "rim"
     rims: tuple[Array, ...] = ()
     waves: int = 1
-    glued: ClassVar[tuple[Glued, ...]] = ()
+    glued: ClassVar[tuple[GluedSides, ...]] = ()
 
     @property
     def area(self) -> float:
@@ -92,48 +98,53 @@ class DiscShape:
         return np.zeros(2), np.array([self.radius, pi / self.waves if self.half else 2 * pi])
 
     def faces(self, occ: Any) -> Faces:
-        discs = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
-        discs += within(occ, self.rims, lambda: (2, occ.addDisk(0, 0, 0, self.radius, self.radius)))
+        def disc() -> tuple[int, int]:
+            return 2, occ.addDisk(0, 0, 0, self.radius, self.radius)
+
+        faces = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
+        faces += faces_within(occ, self.rims, disc)
         if not self.half:
-            return discs
+            return faces
         if self.waves > 1:
-            return list(occ.intersect(discs, [self._wedge(occ)])[0])
-        above = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
-        return list(occ.intersect(discs, [above])[0])
+            return list(occ.intersect(faces, [self._wedge(occ)])[0])
+        upper = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
+        return list(occ.intersect(faces, [upper])[0])
 
     def _wedge(self, occ: Any) -> tuple[int, int]:
-        """The triangle between the two sides of the sector, larger than the disc."""
+        """Make the triangle between the two sides of the sector, larger than the disc."""
         side = 2 * self.radius / np.cos(pi / (2 * self.waves))
-        ends = [side * self._along, np.array([side, 0.0])]
+        ends = [side * self._second_side, np.array([side, 0.0])]
         corners = [occ.addPoint(*x, 0) for x in (np.zeros(2), ends[1], ends[0])]
         lines = [occ.addLine(corners[i], corners[(i + 1) % 3]) for i in range(3)]
         return 2, occ.addPlaneSurface([occ.addCurveLoop(lines)])
 
     @property
-    def _along(self) -> Array:
-        """The direction of the second side."""
+    def _second_side(self) -> Array:
+        """Unit vector (2,) along the second side of the sector."""
         return np.array([np.cos(pi / self.waves), np.sin(pi / self.waves)])
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
-        edges = {self.edge: np.isclose(np.hypot(x[:, 0], x[:, 1]), self.radius, rtol=1e-9)}
+        radii = np.hypot(x[:, 0], x[:, 1])
+        edges = {self.edge: np.isclose(radii, self.radius, rtol=EDGE_TOLERANCE)}
         if self.half:
-            edges["symmetry"] = np.abs(x[:, 1]) < 1e-9 * self.radius
+            edges["symmetry"] = np.abs(x[:, 1]) < EDGE_TOLERANCE * self.radius
         if self.half and self.waves > 1:
-            across = x @ np.array([-self._along[1], self._along[0]])
-            edges["symmetry 2"] = np.abs(across) < 1e-9 * self.radius
+            normal = np.array([-self._second_side[1], self._second_side[0]])
+            edges["symmetry 2"] = np.abs(x @ normal) < EDGE_TOLERANCE * self.radius
         return edges
 
 
 @dataclass(frozen=True)
 class StripShape:
-    """0 <= x <= 1, |y| <= width/2; edges "root" (x = 0), "tip", "sides", and "symmetry" of the half
-    with y >= 0.
+    """The rectangle 0 <= x <= 1, |y| <= width/2.
+
+    Edges "root" (x = 0), "tip", "sides", and "symmetry" of the half with y >= 0.
     """
 
     width: float
     half: bool
     rims: tuple[Array, ...] = ()
-    glued: ClassVar[tuple[Glued, ...]] = ()
+    glued: ClassVar[tuple[GluedSides, ...]] = ()
 
     @property
     def area(self) -> float:
@@ -145,54 +156,61 @@ class StripShape:
 
     @property
     def box(self) -> tuple[Array, Array]:
-        return np.array([0.0, 0.0 if self.half else -self.width / 2]), np.array(
-            [1.0, self.width / 2]
-        )
+        low = np.array([0.0, 0.0 if self.half else -self.width / 2])
+        return low, np.array([1.0, self.width / 2])
 
     def faces(self, occ: Any) -> Faces:
-        below = 0 if self.half else -self.width / 2
+        bottom = 0 if self.half else -self.width / 2
 
         def strip() -> tuple[int, int]:
-            return 2, occ.addRectangle(0, below, 0, 1, self.width / 2 - below)
+            return 2, occ.addRectangle(0, bottom, 0, 1, self.width / 2 - bottom)
 
-        return [strip(), *within(occ, self.rims, strip)]
+        return [strip(), *faces_within(occ, self.rims, strip)]
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
         edges = {
-            "root": np.abs(x[:, 0]) < 1e-9,
-            "tip": np.abs(x[:, 0] - 1) < 1e-9,
-            "sides": np.abs(np.abs(x[:, 1]) - self.width / 2) < 1e-9,
+            "root": np.abs(x[:, 0]) < EDGE_TOLERANCE,
+            "tip": np.abs(x[:, 0] - 1) < EDGE_TOLERANCE,
+            "sides": np.abs(np.abs(x[:, 1]) - self.width / 2) < EDGE_TOLERANCE,
         }
         if self.half:
-            edges["symmetry"] = np.abs(x[:, 1]) < 1e-9
+            edges["symmetry"] = np.abs(x[:, 1]) < EDGE_TOLERANCE
         return edges
 
 
-def within(occ: Any, rims: Sequence[Array], whole: Callable[[], tuple[int, int]]) -> Faces:
-    """The faces within closed curves, points (n, 2) each, as far as they belong to a face that
-    `whole` makes.
+def faces_within(
+    occ: Any, curves: Sequence[Array], make_face: Callable[[], tuple[int, int]]
+) -> Faces:
+    """Make the faces within closed curves, as far as they lie in another face.
+
+    Parameters
+    ----------
+    curves
+        Points (n, 2) of each curve.
+    make_face
+        Makes the other face, each time anew.
     """
-    pieces: Faces = []
-    for points in rims:
+    faces: Faces = []
+    for points in curves:
         tags = [occ.addPoint(x, y, 0) for x, y in points]
         loop = occ.addCurveLoop([occ.addSpline([*tags, tags[0]])])
-        pieces += occ.intersect([(2, occ.addPlaneSurface([loop]))], [whole()])[0]
+        faces += occ.intersect([(2, occ.addPlaneSurface([loop]))], [make_face()])[0]
         occ.remove([(0, tag) for tag in tags])
-    return pieces
+    return faces
 
 
-def sphere(chart: Array) -> Array:
-    """Chart (n, 2) -> places (n, 3), which are the normals too."""
+def sphere_embedding(chart: Array) -> Array:
+    """Return places (n, 3) of the unit sphere, which are the normals too, at chart (n, 2)."""
     phi = np.hypot(chart[:, 0], chart[:, 1])
     horizontal = np.sinc(phi / np.pi)[:, None] * chart
     return np.column_stack([horizontal, np.cos(phi)])
 
 
-def flat(chart: Array) -> Array:
-    """Chart (x, y) -> the plane z = 0."""
+def plane_embedding(chart: Array) -> Array:
+    """Return places (n, 3) of the plane z = 0 at chart (x, y)."""
     return np.column_stack([chart, np.zeros(len(chart))])
 
 
-def upwards(chart: Array) -> Array:
-    """The normals (n, 3) of that plane."""
+def plane_normals(chart: Array) -> Array:
+    """Return the normals (n, 3) of the plane z = 0."""
     return np.broadcast_to([0.0, 0.0, 1.0], (len(chart), 3))

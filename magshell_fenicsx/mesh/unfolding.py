@@ -1,4 +1,9 @@
-"""The mesh of a sector around e3 and its mirror images, side by side."""
+"""The mesh of a half, made of the mesh of a sector around e3 and its images side by side.
+
+The symmetry-breaking modes of a sector are computed on the half, whose triangulation is the copies
+of the sector's. Copy k lies between the azimuths k and k + 1 times the sector's angle; every second
+copy is a mirror image. Lengths are over R.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,70 +12,78 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Sector, rotation
+from magshell_fenicsx.mesh.mirror import SECOND_SYMMETRY_EDGE, SYMMETRY_EDGE, Sector, rotation
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 
 Array = NDArray[np.float64]
-CLOSE = 1e-7  # over the chart's extent: nodes that are one
-TURNED_OVER = {
+SAME_NODE_TOLERANCE = 1e-7  # over the chart's extent: nodes that are one
+MIRRORED_NODES = {
     3: [0, 2, 1],
     6: [0, 2, 1, 5, 4, 3],
     10: [0, 2, 1, 8, 7, 6, 5, 4, 3, 9],
-}  # gmsh's nodes of a mirrored cell
+}  # nodes of a triangle -> gmsh's order of the nodes of its mirror image
 
 
-class Folding:
-    """Copies of a sector side by side: copy k lies between the azimuths k and k + 1 times its
-    angle.
+class ChartUnfolding:
+    """Copies of a sector side by side in a chart.
+
+    Attributes
+    ----------
+    count
+        Number of copies, the first of which is the sector itself.
+    round
+        Whether the chart is a disc around the axis; else its first coordinate goes around e3.
+    end
+        Where the sector ends: an angle (rad) of a disc, else a first coordinate.
 
     Parameters
     ----------
     angle
-        Of the sector (rad), which begins at azimuth 0.
+        Angle of the sector (rad), which begins at azimuth 0.
     count
-        Of the copies, the first of which is the sector itself.
+        Number of copies.
     patch
-        Its triangulation, in the chart of a disc around the axis, or of a rectangle whose first
-        axis goes around e3.
+        Triangulation of the sector, in the chart of a disc around the axis, or of a rectangle
+        whose first axis goes around e3.
     """
 
     def __init__(self, angle: float, count: int, patch: PatchMesh) -> None:
         self.count, self._angle = count, angle
-        places, turn = patch.embedding(patch.nodes), rotation(-angle)
-        turned = patch.embedding(patch.nodes @ turn[:2, :2].T)
-        self.round = bool(np.abs(turned - places @ turn.T).max() < CLOSE * np.abs(places).max())
+        places, Q = patch.embedding(patch.nodes), rotation(-angle)
+        of_rotated_chart = patch.embedding(patch.nodes @ Q[:2, :2].T)
+        error = np.abs(of_rotated_chart - places @ Q.T).max()
+        self.round = bool(error < SAME_NODE_TOLERANCE * np.abs(places).max())
         self.end = angle if self.round else float(patch.nodes[:, 0].max())
 
     def image(self, chart: Array, k: int) -> Array:
-        """Copy k of places of the chart."""
+        """Return places (n, 2) of the sector's chart in copy k."""
         if self.round:
             return np.asarray(chart @ self.turn(k)[:2, :2].T)
         x = (k + 1) * self.end - chart[:, 0] if k % 2 else k * self.end + chart[:, 0]
         return np.column_stack([x, chart[:, 1]])
 
     def turn(self, k: int) -> Array:
-        """The matrix (3, 3) that takes vectors of the sector to copy k."""
+        """Return the matrix (3, 3) that takes vectors of the sector to copy k."""
         if k % 2:
             return np.asarray(rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0]))
         return rotation(-k * self._angle)
 
     def copies(self, chart: Array) -> NDArray[np.int64]:
-        """In which copy each place (n, 2) of the half lies."""
-        along = (
-            np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]
-        )  # at pi rounding has a sign
-        return np.asarray(np.clip(np.floor(along / self.end), 0, self.count - 1), dtype=np.int64)
+        """Return the number (n,) of the copy in which each place (n, 2) of the half lies."""
+        # at pi rounding has a sign
+        angle = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]
+        return np.asarray(np.clip(np.floor(angle / self.end), 0, self.count - 1), dtype=np.int64)
 
-    def embedding(self, of: Embedding) -> Embedding:
-        """That of all copies, which have the chart in common."""
-        return of
+    def embedding(self, of_sector: Embedding) -> Embedding:
+        """Return the embedding of all copies: that of the sector, since they share the chart."""
+        return of_sector
 
     def key(self, nodes: Array) -> Array:
-        """What nodes have in common that are one: their places."""
+        """Return numbers (n, d) that are equal for nodes that are one: their places."""
         return nodes
 
-    def back(self, chart: Array) -> Array:
-        """The places of the sector whose copies these are."""
+    def to_sector(self, chart: Array) -> Array:
+        """Return the places (n, 2) of the sector whose copies these are."""
         places, copies = np.empty_like(chart), self.copies(chart)
         for k in range(self.count):
             of_copy = copies == k
@@ -83,139 +96,161 @@ class Folding:
         return places
 
 
-class FoldingInSpace:
-    """The same for a triangulation in space: that of a mesh file, or of several shells, whose nodes
-    are not shared.
+class SpaceUnfolding:
+    """Copies of a sector side by side in space: of a mesh file, or of several shells.
+
+    The methods are those of `ChartUnfolding`. Copies of several shells do not share nodes: a node
+    has the number of its copy, and `CopiesEmbedding` places it.
     """
 
     def __init__(self, sector: Sector, patch: PatchMesh) -> None:
         self.count, self._sector = sector.waves, sector
-        self._several = hasattr(patch.embedding, "charts")
+        self._several_shells = hasattr(patch.embedding, "has_charts")
 
     def image(self, nodes: Array, k: int) -> Array:
-        """Copy k of nodes; those of several shells get k as their last number but one."""
-        images, vectors = (
-            nodes.copy(),
-            1 if self._several else nodes.shape[1] // 3,
-        )  # places, and normals if any
-        for i in range(vectors):
+        """Return nodes (n, d) in copy k; those of several shells get k as their last but one."""
+        images = nodes.copy()
+        # nodes are places, of a mesh file perhaps with normals
+        vector_count = 1 if self._several_shells else nodes.shape[1] // 3
+        for i in range(vector_count):
             images[:, 3 * i : 3 * i + 3] = nodes[:, 3 * i : 3 * i + 3] @ self.turn(k).T
-        return np.insert(images, -1, k, axis=1) if self._several else images
+        return np.insert(images, -1, k, axis=1) if self._several_shells else images
 
     def turn(self, k: int) -> Array:
-        """See `Folding`."""
-        begin = rotation(self._sector.azimuth)
+        """Return the matrix (3, 3) that takes vectors of the sector to copy k."""
+        to_azimuth_zero = rotation(self._sector.azimuth)
         angle = self._sector.angle
-        Q = (
-            rotation(-(k + 1) * angle) @ np.diag([1.0, -1.0, 1.0])
-            if k % 2
-            else rotation(-k * angle)
-        )
-        return np.asarray(begin.T @ Q @ begin)
+        Q = rotation(-(k + k % 2) * angle)
+        if k % 2:
+            Q = np.asarray(Q @ np.diag([1.0, -1.0, 1.0]))
+        return np.asarray(to_azimuth_zero.T @ Q @ to_azimuth_zero)
 
     def copies(self, x: Array) -> NDArray[np.int64]:
-        """In which copy each place (n, 3) of the half lies."""
-        at = x @ rotation(self._sector.azimuth).T
-        along = np.abs(np.arctan2(at[:, 1], at[:, 0]))
+        """Return the number (n,) of the copy in which each place (n, 3) of the half lies."""
+        in_sector_frame = x @ rotation(self._sector.azimuth).T
+        angle = np.abs(np.arctan2(in_sector_frame[:, 1], in_sector_frame[:, 0]))
         return np.asarray(
-            np.clip(np.floor(along / self._sector.angle), 0, self.count - 1), dtype=np.int64
+            np.clip(np.floor(angle / self._sector.angle), 0, self.count - 1), dtype=np.int64
         )
 
-    def back(self, x: Array) -> Array:
-        """The places of the sector whose copies these are."""
+    def to_sector(self, x: Array) -> Array:
+        """Return the places (n, 3) of the sector whose copies these are."""
         turns = np.array([self.turn(k) for k in range(self.count)])[self.copies(x)]
         return np.asarray(np.einsum("ni,nij->nj", x, turns))
 
-    def embedding(self, of: Embedding) -> Embedding:
-        """That of all copies."""
-        return (
-            CopiesEmbedded(of, tuple(self.turn(k) for k in range(self.count)))
-            if self._several
-            else of
-        )
+    def embedding(self, of_sector: Embedding) -> Embedding:
+        """Return the embedding of all copies."""
+        if not self._several_shells:
+            return of_sector
+        return CopiesEmbedding(of_sector, tuple(self.turn(k) for k in range(self.count)))
 
     def key(self, nodes: Array) -> Array:
-        """What nodes of copies have in common that are one: the place, and the shell."""
-        return nodes[:, [0, 1, 2, -1]] if self._several else nodes
+        """Return numbers that are equal for nodes that are one: the place, and the shell."""
+        return nodes[:, [0, 1, 2, -1]] if self._several_shells else nodes
 
 
 @dataclass(frozen=True)
-class CopiesEmbedded:
-    """Nodes of copies of several shells -> places (n, 3), each by the nodes of the sector and its
-    matrix (3, 3).
+class CopiesEmbedding:
+    """Map of nodes of copies of several shells to places (n, 3).
+
+    Attributes
+    ----------
+    of_sector
+        Nodes of the sector -> places (n, 3).
+    turns
+        For each copy the matrix (3, 3) that takes vectors of the sector to it.
     """
 
-    of: Embedding
+    of_sector: Embedding
     turns: tuple[Array, ...]
 
     @property
-    def charts(self) -> bool:
-        """See `assembly.Embedded`."""
-        return bool(getattr(self.of, "charts", False))
+    def has_charts(self) -> bool:
+        """Whether all shells have charts, and none is from a mesh file."""
+        return bool(getattr(self.of_sector, "has_charts", False))
 
     def __call__(self, nodes: Array) -> Array:
         turns = np.array(self.turns)[np.rint(nodes[:, -2]).astype(int)]
-        return np.asarray(np.einsum("nij,nj->ni", turns, self.of(np.delete(nodes, -2, axis=1))))
+        places_in_sector = self.of_sector(np.delete(nodes, -2, axis=1))
+        return np.asarray(np.einsum("nij,nj->ni", turns, places_in_sector))
 
 
-def folding_of(sector: Sector, patch: PatchMesh) -> "Folding | FoldingInSpace":
-    """The copies of a sector that make a half."""
+def unfolding_of(sector: Sector, patch: PatchMesh) -> ChartUnfolding | SpaceUnfolding:
+    """Return the copies of a sector that make a half, for its triangulation."""
     if patch.nodes.shape[1] > 2:
-        return FoldingInSpace(sector, patch)
-    return Folding(sector.angle, sector.waves, patch)
+        return SpaceUnfolding(sector, patch)
+    return ChartUnfolding(sector.angle, sector.waves, patch)
 
 
-def unfolded(
-    patch: PatchMesh, folding: Folding | FoldingInSpace, ends: tuple[str, str]
+def unfold(
+    patch: PatchMesh, unfolding: ChartUnfolding | SpaceUnfolding, end_names: tuple[str, str]
 ) -> PatchMesh:
-    """The triangulation of all copies, from that of the sector; the edges where it begins and ends
-    have these names.
-    """
-    n, count = len(patch.nodes), folding.count
-    nodes = np.concatenate([folding.image(patch.nodes, k) for k in range(count)])
-    over = TURNED_OVER[patch.cells.shape[1]]
-    cells = np.concatenate(
-        [k * n + (patch.cells[:, over] if k % 2 else patch.cells) for k in range(count)]
-    )
-    keys = folding.key(nodes)
-    near = scipy.spatial.cKDTree(keys).query_ball_point(keys, CLOSE * np.ptp(keys, axis=0).max())
-    same = np.array([min(each) for each in near])
-    one = np.arange(n) if patch.one is None else patch.one
-    glued = same[np.concatenate([k * n + one for k in range(count)])]
-    apart = keys is not nodes  # then each copy keeps its nodes, and vertices are glued
-    used, numbers = np.unique(np.arange(len(nodes)) if apart else same, return_inverse=True)
-    new = np.full(len(nodes), -1, dtype=np.int64)
-    new[used] = np.arange(len(used))
+    """Return the triangulation of all copies of a sector.
 
-    def copied(name: str, ks: Sequence[int]) -> NDArray[np.int64]:
-        return np.concatenate([new[glued[k * n + patch.edges[name]]] for k in ks])
+    Parameters
+    ----------
+    patch
+        The triangulation of the sector.
+    end_names
+        Names of the edges where the first copy begins and the last one ends; equal names make one
+        edge of both.
+    """
+    n, count = len(patch.nodes), unfolding.count
+    nodes = np.concatenate([unfolding.image(patch.nodes, k) for k in range(count)])
+    mirrored = MIRRORED_NODES[patch.cells.shape[1]]
+    cells = np.concatenate(
+        [k * n + (patch.cells[:, mirrored] if k % 2 else patch.cells) for k in range(count)]
+    )
+    keys = unfolding.key(nodes)
+    distance = SAME_NODE_TOLERANCE * np.ptp(keys, axis=0).max()
+    near_nodes = scipy.spatial.cKDTree(keys).query_ball_point(keys, distance)
+    first_of_same = np.array([min(numbers) for numbers in near_nodes])
+    glued_to = np.arange(n) if patch.representative is None else patch.representative
+    representative = first_of_same[np.concatenate([k * n + glued_to for k in range(count)])]
+    # copies of several shells keep their nodes, and vertices are glued
+    keeps_nodes = keys is not nodes
+    used, numbers = np.unique(
+        np.arange(len(nodes)) if keeps_nodes else first_of_same, return_inverse=True
+    )
+    new_number = np.full(len(nodes), -1, dtype=np.int64)
+    new_number[used] = np.arange(len(used))
+
+    def edge_of_copies(name: str, copies: Sequence[int]) -> NDArray[np.int64]:
+        return np.concatenate(
+            [new_number[representative[k * n + patch.edges[name]]] for k in copies]
+        )
 
     last = count - 1
     edges = {
-        name: copied(name, range(count)) for name in patch.edges if name not in (CUT, SECOND_CUT)
+        name: edge_of_copies(name, range(count))
+        for name in patch.edges
+        if name not in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
     }
-    first, second = copied(CUT, [0]), copied(CUT if last % 2 else SECOND_CUT, [last])
-    edges |= (
-        {CUT: np.concatenate([first, second])}
-        if ends == (CUT, CUT)
-        else dict(zip(ends, (first, second), strict=True))
-    )
+    first_end = edge_of_copies(SYMMETRY_EDGE, [0])
+    last_end = edge_of_copies(SYMMETRY_EDGE if last % 2 else SECOND_SYMMETRY_EDGE, [last])
+    if end_names == (SYMMETRY_EDGE, SYMMETRY_EDGE):
+        edges[SYMMETRY_EDGE] = np.concatenate([first_end, last_end])
+    else:
+        edges |= dict(zip(end_names, (first_end, last_end), strict=True))
+    is_glued = keeps_nodes or patch.representative is not None
+    source = patch.source_triangles
     return replace(
         patch,
         nodes=nodes[used],
         cells=numbers[cells],
-        embedding=folding.embedding(patch.embedding),
+        embedding=unfolding.embedding(patch.embedding),
         edges=edges,
-        points={name: folding.image(x[None], 0)[0] for name, x in patch.points.items()},
-        one=new[glued[used]] if apart or patch.one is not None else None,
-        patches={name: np.tile(inside, count) for name, inside in patch.patches.items()},
-        given=None if patch.given is None else np.tile(patch.given, (count, 1)),
+        points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
+        representative=new_number[representative[used]] if is_glued else None,
+        patches={name: np.tile(mask, count) for name, mask in patch.patches.items()},
+        source_triangles=None if source is None else np.tile(source, (count, 1)),
         joints=tuple(
-            both and (np.tile(both[0], count), np.tile(both[1], count)) for both in patch.joints
+            masks and (np.tile(masks[0], count), np.tile(masks[1], count)) for masks in patch.joints
         ),
     )
 
 
-def doubled(patch: PatchMesh, angle: float) -> PatchMesh:
-    """A sector of an angle (rad) from the triangulation of its first half."""
-    return unfolded(patch, Folding(angle / 2, 2, patch), (CUT, SECOND_CUT))
+def double_sector(patch: PatchMesh, angle: float) -> PatchMesh:
+    """Return the triangulation of a sector of an angle (rad), made of that of its first half."""
+    unfolding = ChartUnfolding(angle / 2, 2, patch)
+    return unfold(patch, unfolding, (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE))

@@ -21,7 +21,7 @@ from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from dolfinx import fem
@@ -124,10 +124,10 @@ class Joined(KeyAbility[Sequence[JointSection]]):
                     )
                 taken.add(name)
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """Planes that cross each joint: its edges are their own mirror images."""
         names = [name for section in self.given for name in section.edges]
-        return [Leaves(mirrors=lambda mirror: all(mirror.other(n) == n for n in names))]
+        return [SymmetryConstraint(mirrors=lambda mirror: all(mirror.image_of_edge(n) == n for n in names))]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         scales = context.scales if any(section.stiffness for section in self.given) else None

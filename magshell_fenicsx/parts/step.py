@@ -29,7 +29,7 @@ from magshell_fenicsx.parts.course import (
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -237,7 +237,7 @@ class Step(Section):
         """What is often meant in another way, with the key; None if nothing is."""
         return None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """The symmetry that it leaves of a shell."""
         return []
 

@@ -484,10 +484,10 @@ def _unresolved_formula(
 def _stiffness_error(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
     """Return the error of the stiffness t^3 or the compliance 1/t^3 of the cells; collective.
 
-    It is over the exact value of all cells. Parts of a shell that carry side by side add their stiffness,
-    those in a row their compliance. That of a cell is what polynomial curvatures of its degree less
-    two show under a constant moment. The squares of moments may be equal everywhere or fall to zero
-    along an axis, as those of a cantilever: the largest difference counts.
+    It is over the exact value of all cells. Parts of a shell that carry side by side add their
+    stiffness, those in a row their compliance. That of a cell is what polynomial curvatures of its
+    degree less two show under a constant moment. The squares of moments may be equal everywhere or
+    fall to zero along an axis, as those of a cantilever: the largest difference counts.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""The problem: everything that will be computed, from which a scene is built."""
+"""The problem: everything that will be computed, from which a scene is built.
+
+A `Problem` is dimensionless: lengths are over R, and moduli over Young's modulus. It makes its own
+triangulation, or the vertices of its meridian.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -10,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.distinct import flat_triangle, refuse_flat
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
-from magshell_fenicsx.mesh.hexahedra import MIDDLE
+from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape
+from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.mesh.unfolding import doubled
+from magshell_fenicsx.mesh.unfolding import double_sector
+from magshell_fenicsx.mesh.vertex_spacing import flat_triangle, refuse_flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import Inside
@@ -31,47 +35,54 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.problem.names import refuse_unfit
-from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
-from magshell_fenicsx.problem.wanted import (
+from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
+from magshell_fenicsx.problem.requests import (
     FrequenciesSection,
     GradientsSection,
     OutputSection,
     StabilitySection,
 )
-from magshell_fenicsx.shape.turning import Span
+from magshell_fenicsx.problem.surface_names import refuse_unfit
+from magshell_fenicsx.shape.meridian_chart import MeridianChart
 
-ROUNDING = 1e-9
-PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
+COUNT_TOLERANCE = 1e-9  # of a number of elements, which is rounded up
+HEIGHT_DIGITS = 9  # decimals of heights in the thickness by which they are one
+CONTACT_CELL_SIZE = 0.08  # over sqrt(Rh): cells of a meridian that resolve the ring of a contact
+MAX_MERIDIAN_CELL_SIZE = 0.2  # over sqrt(Rh)
+CELLS_OF_CONTACT = 3  # of a meridian, over the size of a body's contact
 
 
 @dataclass(frozen=True)
-class Body:
-    """The material of a solid, and where its elements through the thickness begin and end, 0 inside
-    to 1 outside.
+class SolidBody:
+    """The material of a solid, and its elements through the thickness.
+
+    Attributes
+    ----------
+    layer_bounds
+        Where the elements begin and end, from 0 inside to 1 outside.
     """
 
     material: MooneyRivlin
-    layers: list[float]
+    layer_bounds: list[float]
 
 
-def body_of(context: Context) -> Body | None:
-    """The solid of a case; None of a shell."""
+def solid_body_of(context: Context) -> SolidBody | None:
+    """Return the solid of a case; None of a shell."""
     if not context.solid:
         return None
-    shell, ratio = context.shell, _section(context).bulk_to_shear
+    shell, ratio = context.shell, _solid_section(context).bulk_to_shear
     share = shell.rubber or 0.0
     assert isinstance(share, float)  # Ogden's law needs a mid-surface
-    return Body(MooneyRivlin.of(shell.poisson_ratio, ratio, share), layers(context))
+    return SolidBody(MooneyRivlin.of(shell.poisson_ratio, ratio, share), layer_bounds(context))
 
 
-def layers(context: Context) -> list[float]:
-    """Where the elements through the thickness begin and end, from 0 inside to 1 outside.
+def layer_bounds(context: Context) -> list[float]:
+    """Return where the elements through the thickness begin and end, from 0 inside to 1 outside.
 
     Magnetised layers end where elements do, and so does the inner half then: nodes lie in the
     middle.
     """
-    count, magnetic = _section(context).layers, context.of(MagneticSection)
+    count, magnetic = _solid_section(context).layers, context.of(MagneticSection)
     remanent = magnetic and magnetic.remanent
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
@@ -79,29 +90,28 @@ def layers(context: Context) -> list[float]:
     tops = [
         sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
     ]
-    ends = [0.0, *sorted({MIDDLE, *(round(top, 9) for top in tops)}), 1.0]
-    begins = [0.0]
-    for low, high in pairwise(ends):
-        parts = max(ceil((high - low) * count - ROUNDING), 1)
-        begins += [low + (high - low) * (n + 1) / parts for n in range(parts)]
-    return begins
+    inner = {MIDSURFACE_HEIGHT, *(round(top, HEIGHT_DIGITS) for top in tops)}
+    bounds = [0.0]
+    for low, high in pairwise([0.0, *sorted(inner), 1.0]):
+        parts = max(ceil((high - low) * count - COUNT_TOLERANCE), 1)
+        bounds += [low + (high - low) * (n + 1) / parts for n in range(parts)]
+    return bounds
 
 
-def _section(context: Context) -> SolidSection:
+def _solid_section(context: Context) -> SolidSection:
     return context.of(SolidSection) or SolidSection()
 
 
 @dataclass(frozen=True)
 class Document:
-    """What a run writes of that from which its problem was made, and by which it knows the run
-    again.
+    """The document that a problem was made of; a run writes it, and is known by it.
 
     Attributes
     ----------
     data
         A JSON object, for instance the resolved case.
     name
-        Of the file.
+        Name of the file.
     outside
         Hashes of what is solved besides `data`, such as files; None for one that cannot be read.
     placed
@@ -115,22 +125,22 @@ class Document:
 
 
 @dataclass(frozen=True)
-class Awaited:
-    """The modes of the perfect shell that a problem has as imperfections, before they are computed.
+class PendingModes:
+    """The modes of the perfect shell that are imperfections of a problem and not yet computed.
 
     Attributes
     ----------
     count
-        How many are needed.
+        Number of modes that are needed.
     perfect
         Makes the problem of the perfect shell.
-    given
+    with_modes
         Modes -> the problem that has them.
     """
 
     count: int
     perfect: "Callable[[], Problem]"
-    given: "Callable[[tuple[Mode, ...]], Problem]"
+    with_modes: "Callable[[tuple[Mode, ...]], Problem]"
 
 
 @dataclass(frozen=True)
@@ -140,32 +150,38 @@ class Problem:
     Attributes
     ----------
     context
-        What its parts know: the shell, the named places in the shell's length, the programme.
+        What parts know: the shell, the named places in the shell's length, the programme.
     mesh
-        The elements that are asked for.
+        The elements that are requested.
     body
-        What a solid is made of; None of a shell.
+        Material and elements of a solid; None of a shell.
+    material, loads, conditions
+        Of the shell, and name of an edge or a point -> its support.
     meridian
-        What is modelled instead of the surface; None if that is modelled.
+        The meridian that is modelled instead of the surface; None if the surface is modelled.
     mirror
-        Plane of the half, or both planes of the sector, that is modelled; None for all.
-    turns
-        Whether all parts are axisymmetric, whatever is modelled.
+        Symmetry plane of the half, or the sector, that is modelled; None for all.
     azimuth
-        The model's frame is turned about e3 by it (rad).
+        Angle about e3 (rad) by which the model's frame is turned.
     shape, size, points, embedding
-        What is triangulated, and how it is put into space. The point "pole" is the one whose
-        displacement is reported: the pole, the disc's centre, the strip's tip.
+        What is triangulated, the element size, the named points, and the map to space. The point
+        "pole" is the one whose displacement is reported: the pole, the disc's centre, the strip's
+        tip.
+    included, left_out
+        Phrases for what the model has and lacks.
     normal
         Chart -> outward unit normals of the perfect surface, of one that has a chart.
-    included, left_out
-        What the model has and lacks, for people.
+    turns
+        Whether all parts are axisymmetric, whatever is modelled.
     thickness
         What multiplies the thickness; None for 1.
     length
         R in the unit of results: metres of a case with units, else the unit of its lengths.
-    pressed
-        Size of each body, and how far from its first contact it presses; over R.
+    body_contacts
+        For each body the size of its contact, and how far from its first contact it presses; over
+        R.
+    supports, reactions
+        Names of supports, and whether their reactions are reported.
     warnings
         What is unphysical, or often meant in another way.
     within
@@ -173,31 +189,31 @@ class Problem:
     lambda_m
         |Br||Ba|/(mu_0 E); 0 without a field.
     unknowns
-        About how many there will be, if the meridian is not modelled.
+        Approximate number of unknowns, if the meridian is not modelled.
     patched
         Whether something has values by patches, so that the mesh has their edges.
     stability, frequencies, gradients
-        What is asked of the path besides itself.
+        Requests besides the path.
     output
-        How pictures look.
-    awaited
+        Style of pictures.
+    pending_modes
         The modes of the perfect shell, which must be computed first; None without.
     document
-        What a run writes of the case.
+        The document of the problem.
     remade
-        Values by keys -> the problem of the case with these; see `again`.
+        Values by keys -> the problem of the case with these; see `with_values`.
     """
 
     context: Context
     mesh: MeshSection
-    body: Body | None
+    body: SolidBody | None
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
-    meridian: Span | None
+    meridian: MeridianChart | None
     mirror: Mirror | None
     azimuth: float
-    shape: Shape | Grid | MeshFile | PatchMesh
+    shape: PlaneShape | Grid | MeshFile | PatchMesh
     embedding: Embedding
     points: dict[str, NDArray[np.float64]]
     size: Size
@@ -207,7 +223,7 @@ class Problem:
     turns: bool = False
     thickness: Thickness | None = None
     length: float = 1.0
-    pressed: tuple[tuple[float, float], ...] = ()
+    body_contacts: tuple[tuple[float, float], ...] = ()
     supports: tuple[str, ...] = ()
     reactions: bool = False
     warnings: tuple[str, ...] = ()
@@ -219,13 +235,13 @@ class Problem:
     frequencies: FrequenciesSection | None = None
     gradients: GradientsSection | None = None
     output: OutputSection = field(default_factory=OutputSection)
-    awaited: Awaited | None = None
+    pending_modes: PendingModes | None = None
     document: Document = field(default_factory=Document)
     remade: "Callable[[Mapping[str, Any]], Problem] | None" = None
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
-        """Its steps; before a single load the natural shape grows, then the field."""
+        """Steps of the programme; before a single load the natural shape grows, then the field."""
         return tuple(self.context.steps)
 
     @property
@@ -235,7 +251,7 @@ class Problem:
 
     @property
     def time_unit(self) -> float | None:
-        """See `Context.time_unit`."""
+        """Unit of time in seconds, see `Context.time_unit`."""
         return self.context.time_unit
 
     @property
@@ -249,22 +265,22 @@ class Problem:
         return self.meridian is not None
 
     @property
-    def half(self) -> bool:
+    def is_half(self) -> bool:
+        """Whether a half or a sector is modelled."""
         return self.mirror is not None
 
     @property
     def outward(self) -> Embedding | None:
-        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell; None if
-        they are not known.
+        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell.
+
+        None if they are not known.
         """
-        return (
-            self.meridian.normal
-            if self.meridian
-            else getattr(self.embedding, "normal", self.normal)
-        )
+        if self.meridian:
+            return self.meridian.normal
+        return getattr(self.embedding, "normal", self.normal)
 
     @property
-    def given(self) -> MeshFile | None:
+    def mesh_file(self) -> MeshFile | None:
         """The mesh of a file or a program; None of other surfaces."""
         return self.shape if isinstance(self.shape, MeshFile) else None
 
@@ -275,13 +291,14 @@ class Problem:
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing loads the shell and its frequencies alone are asked: it need not be held."""
+        """Whether only frequencies of an unloaded shell are requested: it need not be held."""
         return not self.programme and self.frequencies is not None
 
     @property
     def moves_freely(self) -> bool:
-        """Whether the shell moves in time alone, so that it need not be held: its rigid motions
-        cost inertia.
+        """Whether the shell only moves in time, so that it need not be held.
+
+        Inertia then resists its rigid motions.
         """
         motions = [step.load.motion for step in self.programme]
         needs_inertia_alone = all(
@@ -291,126 +308,134 @@ class Problem:
 
     @property
     def imperfections(self) -> Mapping[str, ImperfectionSection]:
-        """Key of each below `shell` -> its section."""
+        """Key of each imperfection below `shell` -> its section."""
         return self.context.sections.get("imperfections") or {}
 
-    def again(self, values: Mapping[str, Any]) -> "Problem":
-        """The same with other values, such as {"mesh.degree": 3}.
+    def with_values(self, values: Mapping[str, Any]) -> "Problem":
+        """Return the problem of the case with other values, such as {"mesh.degree": 3}.
 
         Raises
         ------
         CaseError
-            If it cannot be made again, or a value is not allowed.
+            If the problem has no case, or a value is not allowed.
         """
         if self.remade is None:
             raise CaseError(
-                f"{', '.join(values)}: needs the problem with another value, and this one is made without a case: "
-                "give it 'remade'"
+                f"{', '.join(values)}: needs the problem with another value, "
+                "and this one is made without a case: give it 'remade'"
             )
         return self.remade(values)
 
     def triangulated(self) -> PatchMesh:
-        """The triangulation; call it on one rank only.
+        """Return the triangulation; call it on one rank only.
 
         Raises
         ------
         MeshError
-            If there is none, it cannot carry a shell, or it has not what the problem names.
+            If it cannot carry a shell, or lacks what the problem names.
         """
-        patch = self._made()
+        patch = self._triangulation()
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         if not self.body:
-            refuse_flat(patch, *self._flat[1:], "shell.file" if self._of_file else "mesh")
+            key = "shell.file" if self._file_of_shell else "mesh"
+            refuse_flat(patch, *self._penalty_and_unit[1:], key)
         return patch
 
     def flat_triangle(self, patch: PatchMesh) -> str:
-        """Say where a triangle is too flat for the penalty, and what helps; empty if none is."""
-        return flat_triangle(patch, *self._flat)
+        """Return where a triangle is too flat for the penalty, and what helps; empty if none is."""
+        return flat_triangle(patch, *self._penalty_and_unit)
 
     @property
-    def _of_file(self) -> "MeshFile | None":
+    def _file_of_shell(self) -> MeshFile | None:
         """The mesh file of the one shell; None without."""
-        file = self.shape
-        return file if isinstance(file, MeshFile) and not file.given else None
+        file = self.mesh_file
+        return file if file and not file.in_memory else None
 
     @property
-    def _flat(self) -> tuple[float, float, float, str]:
-        """The penalty and that of the degree by default; how messages tell places."""
+    def _penalty_and_unit(self) -> tuple[float, float, float, str]:
+        """The penalty, that of the degree by default, R in the unit of messages, and the unit."""
         default = default_penalty(self.mesh.degree)
-        told = (
-            (1 / self._of_file.scale, "in the file's coordinates")
-            if self._of_file
-            else (1.0, "over R")
-        )
-        return self.mesh.penalty or default, default, *told
+        length, unit = 1.0, "over R"
+        if self._file_of_shell:
+            length, unit = 1 / self._file_of_shell.scale, "in the file's coordinates"
+        return self.mesh.penalty or default, default, length, unit
 
-    def _triangulated(self, shape: Shape) -> PatchMesh:
-        """The mesh of a shape by gmsh; that of a sector is symmetric, so that crests and troughs of
-        waves are alike.
+    def _triangulated_by_gmsh(self, shape: PlaneShape) -> PatchMesh:
+        """Return the mesh of a shape by gmsh.
+
+        That of a sector is symmetric, so that crests and troughs of waves have equal elements.
         """
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
-        middle = Mirror.upright(self.mirror.angle / 2)
-        at = {name: np.append(x, 0.0) for name, x in self.points.items()}
-        points = {
-            name: (x if middle.beyond(x) <= 0 else middle.image(x))[:2] for name, x in at.items()
-        }
-        half = triangulate(
-            replace(shape, waves=2 * self.mirror.waves), self.size, points, self.embedding
-        )
-        return replace(doubled(half, self.mirror.angle), points=dict(self.points))
+        middle_plane = Mirror.through_axis(self.mirror.angle / 2)
+        points = dict[str, NDArray[np.float64]]()
+        for name, chart in self.points.items():
+            x = np.append(chart, 0.0)
+            in_first_half = middle_plane.signed_distance(x) <= 0
+            points[name] = (x if in_first_half else middle_plane.image(x))[:2]
+        half_shape = replace(shape, waves=2 * self.mirror.waves)
+        half = triangulate(half_shape, self.size, points, self.embedding)
+        return replace(double_sector(half, self.mirror.angle), points=dict(self.points))
 
-    def _made(self) -> PatchMesh:
+    def _triangulation(self) -> PatchMesh:
+        """Return the triangulation of the half, the sector or the whole, not yet checked."""
         if isinstance(self.shape, MeshFile):
-            held = [
+            held_edges = [
                 name
                 for name, condition in self.conditions.items()
                 if condition in ("clamped", "hinged")
             ]
-            return replace(
-                read_msh(self.shape, self.points, self.mirror, held), embedding=self.embedding
-            )
+            patch = read_msh(self.shape, self.points, self.mirror, held_edges)
+            return replace(patch, embedding=self.embedding)
         if isinstance(self.shape, PatchMesh):
             return replace(self.shape, embedding=self.embedding)
         if isinstance(self.shape, Grid):
             patch = grid_mesh(self.shape, self.points, self.embedding)
         else:
-            patch = self._triangulated(self.shape)
-        whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
-        whole = whole and not isinstance(self.mirror, Sector)  # whose chart is narrower
-        return cut(patch, self.mirror) if self.mirror and whole else patch
+            patch = self._triangulated_by_gmsh(self.shape)
+        # other shapes are made as halves, and the chart of a sector is narrower
+        is_complete = isinstance(self.shape, Grid | RimmedGrid)
+        is_complete = is_complete and not isinstance(self.mirror, Sector)
+        return cut(patch, self.mirror) if self.mirror and is_complete else patch
 
 
 def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
-    """Vertices of the meridian's mesh, in the chart; those of several shells one after the other."""
-    span = problem.meridian
-    assert span
-    if span.vertices is not None:
-        return span.vertices
-    if span.pieces:
-        meets = {
-            piece.name: any(pair.has(piece.name) for pair in problem.loads.pairs)
-            for piece in span.pieces
-        }
-        pressed = {
-            piece.name: [(inf, piece.length)] if meets[piece.name] else [] for piece in span.pieces
-        }
-        each = [piece.vertices([*problem.pressed, *pressed[piece.name]]) for piece in span.pieces]
-        ends = [float(s[-1]) for s in each[:-1]]
-        return np.concatenate(
-            [s[s > end] for s, end in zip(each, [-inf, *ends], strict=True)]
-        )  # joined ones meet
-    pole = span.names[0] is None
-    h = problem.material.h / span.curvature
-    reach = max((one[1] for one in problem.pressed), default=0.0)
-    reach = span.length if problem.loads.pairs else reach  # folds meet anywhere
+    """Return the vertices (n,) of the meridian's mesh, in its chart.
+
+    Those of several shells stand one after the other.
+    """
+    meridian = problem.meridian
+    assert meridian
+    if meridian.vertices is not None:
+        return meridian.vertices
+    if meridian.shell_meridians:
+        return _vertices_of_shells(problem, meridian)
+    has_pole = meridian.names[0] is None
+    h = problem.material.h / meridian.curvature
+    reach = max((distance for _, distance in problem.body_contacts), default=0.0)
+    reach = meridian.length if problem.loads.pairs else reach  # shells may meet anywhere
+    contact_cells = None
+    if reach:
+        contact_cells = reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
     return graded_vertices(
-        span.length,
-        span.circles,
-        min([h, *(size / 3 for size, _ in problem.pressed)]),
+        meridian.length,
+        meridian.curvature_jumps,
+        min([h, *(size / CELLS_OF_CONTACT for size, _ in problem.body_contacts)]),
         refinement=problem.mesh.refinement,
-        axis=pole,
-        largest=min(0.2 * sqrt(h), span.largest),
-        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
+        axis=has_pole,
+        largest=min(MAX_MERIDIAN_CELL_SIZE * sqrt(h), meridian.largest),
+        pressed=contact_cells,
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
+
+
+def _vertices_of_shells(problem: Problem, meridian: MeridianChart) -> NDArray[np.float64]:
+    """Return the vertices (n,) of the meridians of several shells; joined ones share one."""
+    vertices, end = list[NDArray[np.float64]](), -inf
+    for shell in meridian.shell_meridians:
+        touches_shells = any(pair.has(shell.name) for pair in problem.loads.pairs)
+        anywhere = [(inf, shell.length)] if touches_shells else []
+        of_shell = shell.vertices([*problem.body_contacts, *anywhere])
+        vertices.append(of_shell[of_shell > end])
+        end = float(of_shell[-1])
+    return np.concatenate(vertices)

@@ -1,4 +1,8 @@
-"""The mirror planes of a shape itself: of a grid's chart, or of a mesh file's triangles."""
+"""Symmetry planes of a shape itself: of a grid's chart, or of a mesh file's triangles.
+
+Both functions return `Mirror`s whose half is the modelled one, with the edges that they map onto
+each other. Lengths are over R.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -7,13 +11,15 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, Mirror, cut
+from magshell_fenicsx.mesh.mirror import ROUNDING, SYMMETRY_EDGE, Mirror, cut
 from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Flip = Callable[[Array, Array], tuple[Array, Array]]
-ALIKE = 1e-3  # of two halves with different triangles: difference of their areas and centres
+# of two halves with different triangles: difference of their areas over the area, and of their
+# centres over the extent
+HALVES_TOLERANCE = 1e-3
 # where the chart's corner low + (s, t) extent goes, and the sides in the places of left, right,
 # bottom and top
 FLIPS: tuple[tuple[Flip, tuple[int, ...]], ...] = (
@@ -22,183 +28,200 @@ FLIPS: tuple[tuple[Flip, tuple[int, ...]], ...] = (
     (lambda s, t: (t, s), (2, 3, 0, 1)),
     (lambda s, t: (1 - t, 1 - s), (3, 2, 1, 0)),
 )
-MIDDLES = ((0.0, 0.5), (1.0, 0.5), (0.5, 0.0), (0.5, 1.0))
+SIDE_MIDDLES = ((0.0, 0.5), (1.0, 0.5), (0.5, 0.0), (0.5, 1.0))
+SAMPLES_PER_AXIS = 8  # of the chart; a power makes them unsymmetric along the second axis
+SAMPLE_POWER = 1.5
+LINE_SAMPLES = 9  # places along a grid line
+FIRST_NODES = 50  # nodes whose images are tried before those of all
 
 
 def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
-    """Planes that map a grid onto itself; the half that is kept has the larger chart coordinates."""
+    """Return the planes that map a grid onto itself.
+
+    The modelled half has the larger chart coordinates.
+    """
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
-    sample = np.stack(
-        np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 1, 8) ** 1.5), axis=-1
-    ).reshape(-1, 2)
-    square = abs(extent[0] - extent[1]) < ROUNDING * extent[0]
+    t = np.linspace(0, 1, SAMPLES_PER_AXIS)
+    sample = np.stack(np.meshgrid(t, t**SAMPLE_POWER), axis=-1).reshape(-1, 2)
+    is_square = abs(extent[0] - extent[1]) < ROUNDING * extent[0]
 
     def places(chart: Array) -> Array:
         return embedding(low + chart * extent)
 
     mirrors = []
-    for axis, (flip, sides) in enumerate(FLIPS if square and not any(grid.glued) else FLIPS[:2]):
+    flips = FLIPS if is_square and not any(grid.glued) else FLIPS[:2]
+    for axis, (flip, sides) in enumerate(flips):
         originals, images = places(sample), places(np.column_stack(flip(*sample.T)))
-        apart = originals - images
-        normal = apart[np.argmax(np.linalg.norm(apart, axis=1))]
+        differences = originals - images
+        normal = differences[np.argmax(np.linalg.norm(differences, axis=1))]
         if (axis == 0 and grid.glued[0]) or not normal.any():
             continue
-        mirror = Mirror.of(normal)
-        mirror = Mirror(
-            mirror.normal, _rounded(float(((originals + images) / 2 @ mirror.normal).mean()))
-        )
-        if np.abs(mirror.image(originals) - images).max() > ROUNDING * max(
-            1.0, np.abs(originals).max()
-        ):
+        unit = Mirror.with_normal(normal).normal
+        offset = float(((originals + images) / 2 @ unit).mean())
+        mirror = Mirror(unit, _rounded(offset))
+        error = np.abs(mirror.image(originals) - images).max()
+        if error > ROUNDING * max(1.0, np.abs(originals).max()):
             continue
-        beyond = mirror.beyond(places(np.array(MIDDLES)))
-        if beyond[1] + beyond[3] < -ROUNDING:
-            mirror, beyond = mirror.reversed, -beyond
-        lost = {
-            grid.sides[i]: grid.sides[j]
-            for i, j in enumerate(sides)
-            if i != j and beyond[i] < 0 and _edge(grid, i)
-        }
-        mirrors.append(Mirror(mirror.normal, mirror.offset, lost))
+        distances = mirror.signed_distance(places(np.array(SIDE_MIDDLES)))
+        if distances[1] + distances[3] < -ROUNDING:
+            mirror, distances = mirror.reversed, -distances
+        removed_edges = dict[str, str]()
+        for i, j in enumerate(sides):
+            if i != j and distances[i] < 0 and not grid.glued[i // 2]:
+                removed_edges[grid.sides[i]] = grid.sides[j]
+        mirrors.append(Mirror(mirror.normal, mirror.offset, removed_edges))
     return mirrors
 
 
-def lines_on(
+def mirror_lines(
     mirror: Mirror, grid: Grid, embedding: Embedding
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Coordinates of the grid lines, of either axis, that lie in a mirror plane within the chart."""
-    t, lines = np.linspace(0, 1, 9), []
+    """Return the coordinates of the grid lines, of either axis, that lie in a mirror plane.
+
+    These are lines within the chart.
+    """
+    t, lines = np.linspace(0, 1, LINE_SAMPLES), []
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
     for axis in range(2):
-        on = []
+        coordinates = []
         for share in (0.25, 0.5, 0.75) if grid.glued[axis] else (0.5,):
             chart = np.empty((len(t), 2))
             chart[:, axis], chart[:, 1 - axis] = share, t
-            if np.abs(mirror.beyond(embedding(low + chart * extent))).max() < ROUNDING:
-                on.append(float(low[axis] + share * extent[axis]))
-        lines.append(tuple(on))
+            distances = mirror.signed_distance(embedding(low + chart * extent))
+            if np.abs(distances).max() < ROUNDING:
+                coordinates.append(float(low[axis] + share * extent[axis]))
+        lines.append(tuple(coordinates))
     return lines[0], lines[1]
 
 
 def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -> list[Mirror]:
-    """Planes that map a triangulation, its named edges and its patches onto themselves.
+    """Return the planes that map a triangulation, its edges and its patches onto themselves.
 
     Parameters
     ----------
     vectors
-        Which the plane should hold, where the shape itself leaves a choice.
+        (3,) which the plane should contain, where the shape itself leaves a choice.
     loosely
-        Take planes too that only the shape has, as far as areas and centres tell, where edges of
+        Take planes too that only the shape has, as far as areas and centres show, where edges of
         the mesh lie in them.
     """
-    if CUT in patch.edges:
+    if SYMMETRY_EDGE in patch.edges:
         return []
     mirrors: list[Mirror] = []
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
-    centre, (middle, _) = corners.mean(axis=0), _centre(patch)
+    centre, (area_centre, _) = corners.mean(axis=0), _centre_and_area(patch)
     tree = scipy.spatial.cKDTree(patch.nodes)
-    for normal in _normals(patch, vectors):
-        mirror = Mirror.of(normal)
-        exact = _with_edges(
-            Mirror(mirror.normal, _rounded(float(mirror.normal @ centre))), patch, tree
-        )
-        if exact:
-            mirrors.append(exact)
+    for normal in _candidate_normals(patch, vectors):
+        unit = Mirror.with_normal(normal).normal
+        mirror = _with_edges(Mirror(unit, _rounded(float(unit @ centre))), patch, tree)
+        if mirror:
+            mirrors.append(mirror)
         elif loosely:
-            heights = corners @ mirror.normal
-            nearest = float(heights[np.argmin(np.abs(heights - mirror.normal @ middle))])
-            if _halves_alike(loose := Mirror(mirror.normal, _rounded(nearest)), patch):
-                mirrors.append(loose)
+            heights = corners @ unit
+            nearest = float(heights[np.argmin(np.abs(heights - unit @ area_centre))])
+            loose_mirror = Mirror(unit, _rounded(nearest))
+            if _has_equal_halves(loose_mirror, patch):
+                mirrors.append(loose_mirror)
     return mirrors
-
-
-def _edge(grid: Grid, side: int) -> bool:
-    return not grid.glued[side // 2]
 
 
 def _rounded(offset: float) -> float:
     return 0.0 if abs(offset) < ROUNDING else offset
 
 
-def _normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[Array]:
-    """Each once: normal to what the parts need, the axes of inertia, those of space, and halfway
-    between.
+def _candidate_normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[Array]:
+    """Yield unit normals (3,) of planes that may be symmetry planes, each once.
+
+    They are normal to the vectors, along the axes of inertia, those of space, and halfway between.
     """
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
     principal = np.linalg.eigh(np.cov(corners.T))[1].T
     axes = np.eye(3)
-    diagonals = [
-        a + s * b
-        for a, b in ((axes[0], axes[1]), (axes[1], axes[2]), (axes[0], axes[2]))
-        for s in (1, -1)
-    ]
-    crossed = [np.cross(v, w) for v in vectors for w in (*axes[::-1], *vectors)]
-    seen: list[Array] = []
-    for normal in (*crossed, axes[1], axes[0], axes[2], *principal, *diagonals):
+    pairs = ((axes[0], axes[1]), (axes[1], axes[2]), (axes[0], axes[2]))
+    diagonals = [a + sign * b for a, b in pairs for sign in (1, -1)]
+    normal_to_vectors = [np.cross(v, w) for v in vectors for w in (*axes[::-1], *vectors)]
+    yielded: list[Array] = []
+    for normal in (*normal_to_vectors, axes[1], axes[0], axes[2], *principal, *diagonals):
         size = np.linalg.norm(normal)
-        if size > ROUNDING and all(abs(abs(n @ normal) - size) > ROUNDING * size for n in seen):
-            seen.append(normal / size)
-            yield seen[-1]
+        if size <= ROUNDING:
+            continue
+        if all(abs(abs(n @ normal) - size) > ROUNDING * size for n in yielded):
+            yielded.append(normal / size)
+            yield yielded[-1]
 
 
 def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree") -> Mirror | None:
-    """The mirror with its pairs of edges; None if it does not map the triangulation onto itself."""
+    """Return the mirror with its pairs of edges.
+
+    None if it does not map the triangulation, whose nodes are in the tree, onto itself.
+    """
     nodes = patch.nodes
-    near = ROUNDING * np.ptp(nodes, axis=0).max()
-    if tree.query(mirror.image(nodes[:50]))[0].max() > near:
+    tolerance = ROUNDING * np.ptp(nodes, axis=0).max()
+    if tree.query(mirror.image(nodes[:FIRST_NODES]))[0].max() > tolerance:
         return None
     distance, image = tree.query(mirror.image(nodes))
-    if distance.max() > near or np.abs(mirror.beyond(nodes)).max() <= near:
+    if distance.max() > tolerance or np.abs(mirror.signed_distance(nodes)).max() <= tolerance:
         return None
-    twin = _twins(patch.cells[:, :3], image)
-    if twin is None or any((inside != inside[twin]).any() for inside in patch.patches.values()):
+    twin = _image_triangles(patch.cells[:, :3], image)
+    if twin is None or any((mask != mask[twin]).any() for mask in patch.patches.values()):
         return None
-    lost = {}
-    for name, lines in patch.edges.items():
-        other = next(
-            (o for o, pairs in patch.edges.items() if _same_rows(image[lines], pairs)), None
+    removed_edges = {}
+    for name, pairs in patch.edges.items():
+        images = (
+            other
+            for other, other_pairs in patch.edges.items()
+            if _same_pairs(image[pairs], other_pairs)
         )
-        if other is None:
+        image_name = next(images, None)
+        if image_name is None:
             return None
-        if other != name and mirror.beyond(nodes[lines]).mean() < 0:
-            lost[name] = other
+        if image_name != name and mirror.signed_distance(nodes[pairs]).mean() < 0:
+            removed_edges[name] = image_name
     try:
         cut(patch, mirror)
     except MeshError:
         return None
-    return Mirror(mirror.normal, mirror.offset, lost)
+    return Mirror(mirror.normal, mirror.offset, removed_edges)
 
 
-def _twins(cells: Numbers, image: Numbers) -> Numbers | None:
-    """For each triangle the number of its mirror image; None if one has none."""
+def _image_triangles(cells: Numbers, image: Numbers) -> Numbers | None:
+    """Return for each triangle (m, 3) the number of its mirror image, (m,); None if one has none.
+
+    Parameters
+    ----------
+    image
+        (n,) number of the mirror image of each node.
+    """
     corners, images = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
-    order, mirrored = np.lexsort(corners.T), np.lexsort(images.T)
-    if (corners[order] != images[mirrored]).any():
+    order, order_of_images = np.lexsort(corners.T), np.lexsort(images.T)
+    if (corners[order] != images[order_of_images]).any():
         return None
     twin = np.empty(len(cells), dtype=np.int64)
-    twin[mirrored] = order
+    twin[order_of_images] = order
     return twin
 
 
-def _same_rows(a: Numbers, b: Numbers) -> bool:
+def _same_pairs(a: Numbers, b: Numbers) -> bool:
+    """Return whether pairs of vertices (e, 2) are the same, in any order."""
     a, b = (np.unique(np.sort(x, axis=1), axis=0) for x in (a, b))
     return a.shape == b.shape and not (a != b).any()
 
 
-def _halves_alike(mirror: Mirror, patch: PatchMesh) -> bool:
+def _has_equal_halves(mirror: Mirror, patch: PatchMesh) -> bool:
+    """Return whether the halves at a plane have one area, and centres that are mirror images."""
     try:
-        one, other = (_centre(cut(patch, half)) for half in (mirror, mirror.reversed))
+        half, other_half = (_centre_and_area(cut(patch, m)) for m in (mirror, mirror.reversed))
     except MeshError:
         return False
-    extent, whole = np.ptp(patch.nodes, axis=0).max(), one[1] + other[1]
-    return bool(
-        abs(one[1] - other[1]) < ALIKE * whole
-        and np.abs(mirror.image(one[0]) - other[0]).max() < ALIKE * extent
-    )
+    (centre, area), (other_centre, other_area) = half, other_half
+    extent = np.ptp(patch.nodes, axis=0).max()
+    distance = np.abs(mirror.image(centre) - other_centre).max()
+    has_equal_areas = abs(area - other_area) < HALVES_TOLERANCE * (area + other_area)
+    return bool(has_equal_areas and distance < HALVES_TOLERANCE * extent)
 
 
-def _centre(patch: PatchMesh) -> tuple[Array, float]:
-    """Centre and area of the flat triangles."""
+def _centre_and_area(patch: PatchMesh) -> tuple[Array, float]:
+    """Return the centre (3,) and the area of the flat triangles."""
     a, b, c = (patch.nodes[patch.cells[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     return np.asarray(areas @ (a + b + c) / 3 / areas.sum()), float(areas.sum())

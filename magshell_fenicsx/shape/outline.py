@@ -1,5 +1,8 @@
-"""The chart of each geometry, over the reference length R: what is meshed, and how it is put into
-space.
+"""The surface of a shell as a chart and its map to space, over the reference length R.
+
+An `Outline` says what is meshed, how it is put into space, and which symmetry the surface has.
+`outline` makes that of any geometry, and `reference_shell_of` what imperfections, bodies and
+sources need of it.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,40 +12,71 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.assembly import Assembly
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.mirror import CUT, SECOND_CUT, Y0, Mirror, Sector, rotation
-from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
-from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
-from magshell_fenicsx.mesh.revolved import Capped, Profile, Revolved
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape, flat, sphere, upwards
-from magshell_fenicsx.shape.ground import Ground
-from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
-from magshell_fenicsx.shape.revolved import CapSurface, RevolutionSurface, RoundSection
-from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface, ShellSection, Surface
-from magshell_fenicsx.shape.turning import Span
+from magshell_fenicsx.mesh.mirror import (
+    SECOND_SYMMETRY_EDGE,
+    SYMMETRY_EDGE,
+    Y0_PLANE,
+    Mirror,
+    Sector,
+    rotation,
+)
+from magshell_fenicsx.mesh.msh import MeshFile, node_normals, read_msh, space_embedding
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation, Embedding, MeshError
+from magshell_fenicsx.mesh.shapes import (
+    DiscShape,
+    PlaneShape,
+    StripShape,
+    plane_embedding,
+    plane_normals,
+    sphere_embedding,
+)
+from magshell_fenicsx.mesh.surfaces_of_revolution import (
+    CappedEmbedding,
+    Profile,
+    RevolvedEmbedding,
+)
+from magshell_fenicsx.shape.meridian_chart import MeridianChart
+from magshell_fenicsx.shape.mirrors import grid_mirrors, mesh_mirrors, mirror_lines
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
+from magshell_fenicsx.shape.revolution_sections import (
+    CapSurface,
+    RevolutionSurface,
+    RoundSection,
+)
+from magshell_fenicsx.shape.shell_sections import (
+    MeshSurface,
+    PlateSurface,
+    ShellSection,
+    Surface,
+)
 
 Array = NDArray[np.float64]
-Chart = Shape | Grid | MeshFile
-ANY = Grading([], 1.0)
-ROUNDING = 1e-9
-AROUND = 41  # samples of a meridian that is turned
+Chart = PlaneShape | Grid | MeshFile
+ANY_GRADING = Grading([], 1.0)  # where only the chart's extent matters
+ROUNDING = 1e-9  # over R: a coordinate across the symmetry plane that is zero
+CHART_SAMPLES = 41  # along each axis of a chart
+SAMPLED_AZIMUTHS = 41  # of meridians turned about e3
+PROFILE_SAMPLES, CURVATURE_SAMPLES = 101, 1001  # along a profile
+CURVATURE_DIGITS = 3  # decimals of the largest curvature, which is not known to rounding
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A geometry as a chart with its map to space.
+    """A surface as a chart with its map to space.
 
     Attributes
     ----------
     chart
-        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of
-        grids).
+        Symmetry plane in the model's frame or None, and element sizes (of grids) -> what is meshed.
+    embedding
+        Chart -> places (n, 3), with imperfections if the surface has some.
     normal
         Chart -> outward unit normals.
     inverse
-        Chart (2,) of a place (3,); of a mesh file the place itself.
+        Place (3,) -> its chart (2,); of a mesh file the place itself.
     highest
         Chart of the point whose displacement is reported where the case names none: a pole, a tip;
         None: the reader of the mesh file takes the highest.
@@ -53,16 +87,16 @@ class Outline:
     round
         Whether it is closed around e3.
     mirrors
-        Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a
-        plane should hold, and whether its edges suffice (see `mesh_mirrors`).
+        Its symmetry planes, but for those through e3 of what is `round`; of a mesh file for vectors
+        that a plane should contain, and whether its edges suffice (see `mesh_mirrors`).
     from_pole
         Places -> length of the meridian from the pole; None but for a pole of a surface of
         revolution.
-    span
+    meridian
         The meridian; None if it is closed, or the surface is none of revolution.
-    also
+    extra_samples
         Places (n, 3) that samples have besides: those where formulas are narrow.
-    askew
+    why_no_meridian
         Why several shells have no meridian.
     """
 
@@ -76,68 +110,69 @@ class Outline:
     round: bool = False
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = lambda vectors, loosely: []
     from_pole: Callable[[Array], Array] | None = None
-    span: Span | None = None
-    also: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    askew: str | None = None
+    meridian: MeridianChart | None = None
+    extra_samples: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    why_no_meridian: str | None = None
 
     def on_half(self, chart: Array) -> Array:
-        """A place of the chart on its half, from which rounding may have moved it; grids and meshes
-        are cut.
+        """Return a place of the chart (2,) on its half, from which rounding may have moved it.
+
+        Grids and meshes are cut, and their places are returned as they are.
         """
-        if self.grid or isinstance(self.chart(None, ANY), MeshFile):
+        if self.grid or isinstance(self.chart(None, ANY_GRADING), MeshFile):
             return chart
         return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
 
     @property
     def grid(self) -> Grid | None:
-        """What is meshed, if that is a grid."""
-        shape = self.chart(None, ANY)
+        """The grid that is meshed; None of other charts."""
+        shape = self.chart(None, ANY_GRADING)
         return shape if isinstance(shape, Grid) else None
 
     def sample(self) -> Array:
-        """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
-        if self.span and self.span.pieces:
-            along = self.span.sample()
-            return np.vstack(
-                [*(along @ rotation(angle) for angle in np.linspace(0, 2 * pi, AROUND)), self.also]
-            )
-        chart, nodes = self.charts(), self.nodes
+        """Return places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        if self.meridian and self.meridian.shell_meridians:
+            in_plane = self.meridian.sample()
+            azimuths = np.linspace(0, 2 * pi, SAMPLED_AZIMUTHS)
+            return np.vstack([*(in_plane @ rotation(a) for a in azimuths), self.extra_samples])
+        chart, nodes = self.chart_samples(), self.nodes
         if chart is None:
             assert nodes is not None
-            return np.vstack([in_space(nodes), self.also])
-        return np.vstack([self.embedding(chart), self.also])
+            return np.vstack([space_embedding(nodes), self.extra_samples])
+        return np.vstack([self.embedding(chart), self.extra_samples])
 
-    def looked_at(self, places: Array) -> "Outline":
-        """With these places among its samples."""
-        return replace(self, also=places, span=self.span and replace(self.span, also=places))
+    def with_samples(self, places: Array) -> "Outline":
+        """Return the outline with places (n, 3) among its samples."""
+        meridian = self.meridian and replace(self.meridian, narrow_places=places)
+        return replace(self, extra_samples=places, meridian=meridian)
 
     @property
     def nodes(self) -> Array | None:
-        """Those of a mesh file, places with normals (n, 6) or alone (n, 3); None without a file."""
-        shape = self.chart(None, ANY)
+        """Nodes of a mesh file, places with normals (n, 6) or alone (n, 3); None without a file."""
+        shape = self.chart(None, ANY_GRADING)
         return read_msh(shape, {}).nodes if isinstance(shape, MeshFile) else None
 
     def normal_near(self, chart: Array) -> Array:
-        """The outward unit normal (3,) at a chart (2,), or of the nearest node of a mesh file to a
-        place (3,).
+        """Return the outward unit normal (3,) at a chart (2,).
+
+        Of a mesh file that of the node nearest to a place (3,).
         """
-        shape = self.chart(None, ANY)
+        shape = self.chart(None, ANY_GRADING)
         if not isinstance(shape, MeshFile):
             return np.asarray(self.normal(chart[None])[0])
-        if isinstance(shape.given, Assembly):
-            assert shape.given.normal
-            return shape.given.normal(chart)
+        if isinstance(shape.in_memory, MultiShellMesh):
+            assert shape.in_memory.normal
+            return shape.in_memory.normal(chart)
         nodes = read_msh(replace(shape, normals=True), {}).nodes
-        return np.asarray(
-            normals(nodes[[np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()]])[0]
-        )
+        nearest = np.linalg.norm(nodes[:, :3] - chart, axis=1).argmin()
+        return np.asarray(node_normals(nodes[[nearest]])[0])
 
-    def charts(self) -> Array | None:
-        """Their charts (n, 2); None for a mesh file."""
-        shape = self.chart(None, ANY)
+    def chart_samples(self) -> Array | None:
+        """Return charts (n, 2) all over the surface; None for a mesh file."""
+        shape = self.chart(None, ANY_GRADING)
         if isinstance(shape, MeshFile):
             return None
-        t = np.linspace(0, 1, 41)
+        t = np.linspace(0, 1, CHART_SAMPLES)
         if isinstance(shape, DiscShape):
             rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
             x, y = rho * np.cos(theta), rho * np.sin(theta)
@@ -145,14 +180,13 @@ class Outline:
             x, y = np.meshgrid(t, (t - 0.5) * shape.width)
         else:
             assert isinstance(shape, Grid)
-            x, y = np.meshgrid(
-                *(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True))
-            )
+            axes = [a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True)]
+            x, y = np.meshgrid(*axes)
         return np.column_stack([x.ravel(), y.ravel()])
 
-    def within(self, chart: Array) -> Array:
-        """The nearest place of the chart (2,) to one that may be beside it."""
-        shape = self.chart(None, ANY)
+    def clip_to_chart(self, chart: Array) -> Array:
+        """Return the nearest place of the chart (2,) to one that may be outside."""
+        shape = self.chart(None, ANY_GRADING)
         if isinstance(shape, DiscShape):
             return np.asarray(chart / max(float(np.hypot(*chart)) / self.edge, 1.0))
         if isinstance(shape, StripShape):
@@ -162,42 +196,52 @@ class Outline:
 
     @property
     def perfect(self) -> Embedding:
-        """Chart -> the surface without its imperfections."""
-        return self.embedding.perfect if isinstance(self.embedding, Deviated) else self.embedding
+        """Chart -> places (n, 3) of the surface without its imperfections."""
+        is_deviated = isinstance(self.embedding, DeviatedEmbedding)
+        return self.embedding.perfect if is_deviated else self.embedding
 
     def deviated(
         self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float
     ) -> "Outline":
-        """The outline with imperfections; the curvature jumps on circles around the pole, `largest`
-        cells show them.
+        """Return the outline with imperfections.
+
+        Parameters
+        ----------
+        circles
+            Radii around the pole at which the curvature jumps.
+        largest
+            Cell size that resolves the imperfections.
         """
-        span = self.span and replace(
-            self.span,
-            embedding=Deviated(self.span.embedding, self.span.normal, deviations),
-            circles=circles,
+        meridian = self.meridian and replace(
+            self.meridian,
+            embedding=DeviatedEmbedding(self.meridian.embedding, self.meridian.normal, deviations),
+            curvature_jumps=circles,
             largest=largest / 2,
         )
-        return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
+        embedding = DeviatedEmbedding(self.embedding, self.normal, deviations)
+        return replace(self, embedding=embedding, meridian=meridian)
 
-    def placed(self, shape: Chart) -> Embedding:
-        """The map to space of what is meshed: halves of several shells have charts in frames of
-        their own.
+    def embedding_of(self, shape: Chart) -> Embedding:
+        """Return the map to space of what is meshed.
+
+        Halves of several shells have charts in frames of their own.
         """
-        if isinstance(shape, MeshFile) and isinstance(shape.given, Assembly):
-            return shape.given.patch.embedding
+        if isinstance(shape, MeshFile) and isinstance(shape.in_memory, MultiShellMesh):
+            return shape.in_memory.patch.embedding
         return self.embedding
 
     @property
     def disc(self) -> bool:
-        """Whether it is of revolution about e3, up to its pole."""
+        """Whether it is a surface of revolution about e3, up to its pole."""
         return self.edge < inf
 
 
-def ground_of(shell: Surface | ShellSection) -> Ground:
-    """What imperfections, bodies and sources need of a shell, which has none as yet."""
+def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
+    """Return what imperfections, bodies and sources need of a shell, without imperfections."""
     perfect = outline(shell)
     factor = shell.thickness_factor
-    return Ground(
+    azimuth = getattr(shell, "azimuth", None)
+    return ReferenceShell(
         shell.geometry,
         perfect,
         perfect,
@@ -212,82 +256,119 @@ def ground_of(shell: Surface | ShellSection) -> Ground:
             shell.digest if isinstance(shell, MeshSurface) else None,
         ),
         hole_polar=getattr(shell, "hole", None) or 0.0,
-        azimuths=(azimuth[0], azimuth[1]) if (azimuth := getattr(shell, "azimuth", None)) else None,
+        azimuths=(azimuth[0], azimuth[1]) if azimuth else None,
     )
 
 
 def outline(shell: Surface | ShellSection) -> Outline:
-    """The outline of a perfect shell."""
+    """Return the outline of a perfect shell."""
     if isinstance(shell, MeshSurface):
-        scale, given = (shell.unit or 1.0) / shell.reference, shell.files.given.get(shell.path)
-        file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, given)
-        if isinstance(given, Assembly):
-            span = given.turned
-
-            def embedded(nodes: Array) -> Array:  # they are meshed when it is asked for
-                return given.patch.embedding(nodes)
-
-            return Outline(
-                lambda mirror, size: (
-                    replace(file, given=given.half(mirror)) if mirror and given.half else file
-                ),
-                embedded,
-                normals,
-                lambda x: x,
-                None,
-                mirrors=given.mirrors,
-                span=span if isinstance(span, Span) else None,
-                askew=span if isinstance(span, str) else None,
-            )
-
-        def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
-            try:
-                bare = replace(file, normals=False)
-                return _either_half(mesh_mirrors(read_msh(bare, {}), vectors, loosely=loosely))
-            except MeshError:  # for whoever builds it to report
-                return []
-
-        return Outline(
-            lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes
-        )
+        return _mesh_outline(shell)
     if isinstance(shell, ShellSection) and shell.width is not None:
-        width = shell.width
-        tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
-
-        def within(x: Array) -> Array:
-            return np.clip(_plane(x), corner, -corner + tip)
-
-        return Outline(
-            lambda m, size: StripShape(width, m is not None),
-            flat,
-            upwards,
-            within,
-            tip,
-            mirrors=lambda *_: [Y0],
-        )
+        return _strip_outline(shell.width)
     if isinstance(shell, ShellSection) and shell.geometry == "disc":
-        return _disc(1.0, "rim", flat, upwards, _plane)
-    if isinstance(shell, ShellSection) or (isinstance(shell, CapSurface) and shell.hole is None):
-        hemisphere = isinstance(shell, ShellSection)
-        edge, name = (pi / 2, "equator") if hemisphere else (radians(shell.polar), "rim")  # type: ignore[union-attr]
-        return _disc(edge, name, sphere, sphere, _of_sphere, sphere=True)
+        return _disc_outline(1.0, "rim", plane_embedding, plane_normals, _plane_chart)
+    if isinstance(shell, ShellSection):
+        return _sphere_outline(pi / 2, "equator")
+    if isinstance(shell, CapSurface) and shell.hole is None:
+        return _sphere_outline(radians(shell.polar), "rim")
     if isinstance(shell, PlateSurface):
         high = np.array([1.0, shell.width / shell.reference])
         grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
-        return _grid(grid, flat, upwards, lambda x: np.clip(x[:2], 0.0, high), high)
-    profile, names = shell.turned
-    if names[1] is None:
-        capped, bent = Capped(profile), _curvature(profile)
-        drawn = _disc(
-            profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent
+        return _grid_outline(
+            grid, plane_embedding, plane_normals, lambda x: np.clip(x[:2], 0.0, high), high
         )
-        return replace(drawn, from_pole=capped.from_pole)
-    return _ring(shell, profile, (names[0], names[1]))
+    profile, names = shell.profile_and_edges
+    if names[1] is not None:
+        return _ring_outline(shell, profile, (names[0], names[1]))
+    embedding = CappedEmbedding(profile)
+    perfect = _disc_outline(
+        profile.length,
+        names[0],
+        embedding,
+        embedding.normal,
+        embedding.inverse,
+        curvature=_largest_curvature(profile),
+    )
+    return replace(perfect, from_pole=embedding.from_pole)
 
 
-def _disc(
+def _mesh_outline(shell: MeshSurface) -> Outline:
+    """Return the outline of a mesh file, of a program's triangles, or of several shells."""
+    scale = (shell.unit or 1.0) / shell.reference
+    in_memory = shell.files.given.get(shell.path)
+    file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, in_memory)
+    if isinstance(in_memory, MultiShellMesh):
+        return _multi_shell_outline(file, in_memory)
+
+    def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        try:
+            patch = read_msh(replace(file, normals=False), {})
+            return _with_reversed(mesh_mirrors(patch, vectors, loosely=loosely))
+        except MeshError:  # for whoever builds it to report
+            return []
+
+    return Outline(
+        lambda mirror, size: file,
+        space_embedding,
+        node_normals,
+        lambda x: x,
+        None,
+        mirrors=mirrors,
+    )
+
+
+def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
+    """Return the outline of several shells that stand in place of a mesh file."""
+    meridian = shells.meridian
+
+    def chart(mirror: Mirror | None, size: Grading) -> MeshFile:
+        if mirror and shells.symmetric_part:
+            return replace(file, in_memory=shells.symmetric_part(mirror))
+        return file
+
+    def embedding(nodes: Array) -> Array:  # the shells are meshed when it is asked for
+        return shells.patch.embedding(nodes)
+
+    return Outline(
+        chart,
+        embedding,
+        node_normals,
+        lambda x: x,
+        None,
+        mirrors=shells.mirrors,
+        meridian=meridian if isinstance(meridian, MeridianChart) else None,
+        why_no_meridian=meridian if isinstance(meridian, str) else None,
+    )
+
+
+def _strip_outline(width: float) -> Outline:
+    """Return the outline of a flat strip of length 1 along e1."""
+    tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
+
+    def inverse(x: Array) -> Array:
+        return np.clip(_plane_chart(x), corner, -corner + tip)
+
+    return Outline(
+        lambda mirror, size: StripShape(width, mirror is not None),
+        plane_embedding,
+        plane_normals,
+        inverse,
+        tip,
+        mirrors=lambda *_: [Y0_PLANE],
+    )
+
+
+def _sphere_outline(edge: float, edge_name: str) -> Outline:
+    """Return the outline of a part of the unit sphere, up to the polar angle of its edge (rad)."""
+    return _disc_outline(
+        edge, edge_name, sphere_embedding, sphere_embedding, _sphere_chart, sphere=True
+    )
+
+
+def _disc_outline(
     edge: float,
-    name: str,
+    edge_name: str,
     embedding: Embedding,
     normal: Embedding,
     inverse: Callable[[Array], Array],
@@ -295,116 +376,156 @@ def _disc(
     sphere: bool = False,
     curvature: float = 1.0,
 ) -> Outline:
+    """Return the outline of a surface of revolution with a pole, charted by a disc.
+
+    Parameters
+    ----------
+    edge
+        Radius of the disc.
+    curvature
+        The largest of the meridian.
+    """
+
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
         waves = mirror.waves if isinstance(mirror, Sector) else 1
-        return DiscShape(edge, mirror is not None, edge=name, waves=waves)
+        return DiscShape(edge, mirror is not None, edge=edge_name, waves=waves)
 
-    def within(x: Array) -> Array:
+    def inverse_in_disc(x: Array) -> Array:
         chart = inverse(x)
-        beyond = np.hypot(*chart) / edge
-        return np.asarray(chart / max(beyond, 1.0))
+        return np.asarray(chart / max(np.hypot(*chart) / edge, 1.0))
 
-    def place(chart: Array) -> tuple[float, float]:
+    def locate(chart: Array) -> tuple[float, float]:
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
 
-    span = Span(edge, (), (None, name), embedding, normal, place, curvature)
+    meridian = MeridianChart(edge, (), (None, edge_name), embedding, normal, locate, curvature)
     return Outline(
-        chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span
+        chart,
+        embedding,
+        normal,
+        inverse_in_disc,
+        np.zeros(2),
+        edge,
+        sphere,
+        round=True,
+        meridian=meridian,
     )
 
 
-def _ring(
+def _ring_outline(
     shell: RoundSection | RevolutionSurface, profile: Profile, names: tuple[str, str]
 ) -> Outline:
-    first, last = shell.turn
-    along = np.linspace(0, profile.length, 101, dtype=np.float64)
-    rho = float(profile(along)[:, 0].max())
+    """Return the outline of a surface of revolution without a pole, or of a part of one.
+
+    Parameters
+    ----------
+    names
+        Names of the edges where the profile begins and ends.
+    """
+    first, last = shell.azimuth_range
+    s = np.linspace(0, profile.length, PROFILE_SAMPLES, dtype=np.float64)
+    rho = float(profile(s)[:, 0].max())
     glued = shell.azimuth is None, shell.closed
     low, high = (first * rho, 0.0), (last * rho, profile.length)
-    embedding = Revolved(profile, rho)
+    embedding = RevolvedEmbedding(profile, rho)
 
     def inverse(x: Array) -> Array:
         return np.clip(embedding.inverse(x, first), low, high)
 
-    def section(chart: Array) -> Array:
-        r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
+    # the chart of the meridian begins at the profile's end: its normal points outwards
+    def meridian_embedding(chart: Array) -> Array:
+        r, z = profile(profile.length - chart[:, 0]).T
         return np.column_stack([r, 0 * r, z])
 
-    def normal(chart: Array) -> Array:
+    def meridian_normal(chart: Array) -> Array:
         along_r, along_z = profile.tangent(profile.length - chart[:, 0]).T
         return np.column_stack([along_z, 0 * along_z, -along_r])
 
-    def place(chart: Array) -> tuple[float, float]:
+    def locate(chart: Array) -> tuple[float, float]:
         return profile.length - float(chart[1]), float(chart[0]) / rho
 
-    span = None
+    meridian = None
     if glued == (True, False):
-        span = Span(
-            profile.length, (), (names[1], names[0]), section, normal, place, _curvature(profile)
+        meridian = MeridianChart(
+            profile.length,
+            (),
+            (names[1], names[0]),
+            meridian_embedding,
+            meridian_normal,
+            locate,
+            _largest_curvature(profile),
         )
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
-    return _grid(
-        grid, embedding, embedding.normal, inverse, np.array(low if any(glued) else high), span
-    )
+    highest = np.array(low if any(glued) else high)
+    return _grid_outline(grid, embedding, embedding.normal, inverse, highest, meridian)
 
 
-def _curvature(profile: Profile) -> float:
-    """The largest, at least 1; to a thousandth, not to rounding."""
-    s = np.linspace(0, profile.length, 1001, dtype=np.float64)
-    turned = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
-    return max(1.0, round(float(turned.max() / s[1]), 3))
+def _largest_curvature(profile: Profile) -> float:
+    """Return the largest curvature of a profile, at least 1; to a thousandth, not to rounding."""
+    s = np.linspace(0, profile.length, CURVATURE_SAMPLES, dtype=np.float64)
+    changes = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
+    return max(1.0, round(float(changes.max() / s[1]), CURVATURE_DIGITS))
 
 
-def _grid(
+def _grid_outline(
     grid: Grid,
     embedding: Embedding,
     normal: Embedding,
     inverse: Callable[[Array], Array],
     highest: Array,
-    span: Span | None = None,
+    meridian: MeridianChart | None = None,
 ) -> Outline:
-    def chart(mirror: Mirror | None, size: Grading) -> Chart:
-        if isinstance(mirror, Sector):
-            return replace(
-                _between(grid, mirror), size=size.across if size.features else size.largest
-            )
-        through = lines_on(mirror, grid, embedding) if mirror else grid.through
-        return replace(grid, size=size.across if size.features else size.largest, through=through)
+    """Return the outline of a surface that is charted by a rectangle."""
 
-    def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
-        return _either_half(grid_mirrors(grid, embedding))
+    def chart(mirror: Mirror | None, grading: Grading) -> Chart:
+        size = grading.line_spacing if grading.features else grading.largest
+        if isinstance(mirror, Sector):
+            return replace(_sector_of_grid(grid, mirror), size=size)
+        fixed_lines = mirror_lines(mirror, grid, embedding) if mirror else grid.fixed_lines
+        return replace(grid, size=size, fixed_lines=fixed_lines)
+
+    def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        return _with_reversed(grid_mirrors(grid, embedding))
 
     return Outline(
-        chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span
+        chart,
+        embedding,
+        normal,
+        inverse,
+        highest,
+        round=grid.glued[0],
+        mirrors=mirrors,
+        meridian=meridian,
     )
 
 
-def _between(grid: Grid, sector: Sector) -> Grid:
-    """The part of a grid that is closed around e3 from azimuth 0 to 180/m degrees, at least four
-    quadrilaterals.
+def _sector_of_grid(grid: Grid, sector: Sector) -> Grid:
+    """Return the part from azimuth 0 to 180/m degrees of a grid that is closed around e3.
+
+    It has at least four quadrilaterals around.
     """
     end = (grid.high[0] - grid.low[0]) / sector.copies
-    parts = tuple(end * part for part in (0.25, 0.5, 0.75))
-    sides = (CUT, SECOND_CUT, *grid.sides[2:])
+    quarters = tuple(end * part for part in (0.25, 0.5, 0.75))
+    sides = (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE, *grid.sides[2:])
     return replace(
         grid,
         low=(0.0, grid.low[1]),
         high=(end, grid.high[1]),
         sides=sides,
         glued=(False, grid.glued[1]),
-        movable=(parts, grid.movable[1]),
+        movable_lines=(quarters, grid.movable_lines[1]),
     )
 
 
-def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:
-    """The planes as those of the halves on both of their sides."""
+def _with_reversed(planes: Sequence[Mirror]) -> list[Mirror]:
+    """Return the planes with the half on either side modelled."""
     return [half for plane in planes for half in (plane, plane.reversed)]
 
 
-def _plane(x: Array) -> Array:
+def _plane_chart(x: Array) -> Array:
     return x[:2]
 
 
-def _of_sphere(x: Array) -> Array:
-    across = np.hypot(x[0], x[1])
-    return np.asarray(np.arctan2(across, x[2]) * x[:2] / across) if across > 0 else np.zeros(2)
+def _sphere_chart(x: Array) -> Array:
+    """Return the chart (2,) of a direction (3,) from the centre of the unit sphere."""
+    rho = np.hypot(x[0], x[1])
+    return np.asarray(np.arctan2(rho, x[2]) * x[:2] / rho) if rho > 0 else np.zeros(2)

@@ -18,7 +18,7 @@ from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.problem.wanted import FIELDS
+from magshell_fenicsx.problem.requests import GRADIENT_FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ def refuse_unknown_parameters(context: Context, names: Iterable[str], start: Sta
     """
     try:
         for by in names:
-            if by not in FIELDS and by not in start.mu:
+            if by not in GRADIENT_FIELDS and by not in start.mu:
                 number_of(context, by)
     except CaseError as e:
         raise CaseError(f"gradients.by: {e}") from None
@@ -158,7 +158,7 @@ def scene_with(scene: Scene, key: str, value: float) -> Scene:
         If the number breaks the symmetry by which only a part is modelled, or moves an edge of a
         patch.
     """
-    old, new = scene.problem, scene.problem.again({key: value})
+    old, new = scene.problem, scene.problem.with_values({key: value})
     if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
         raise CaseError(
             f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none"
@@ -193,7 +193,7 @@ def on_mesh_of(scene: Scene, new: Problem) -> Problem:
         scene.problem.shape,
     )
     if model.midsurface:
-        shape = model.midsurface.reshaped(new.embedding)
+        shape = model.midsurface.with_embedding(new.embedding)
     elif model.axisymmetric:
         assert new.meridian
         meridian = replace(new.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0]))

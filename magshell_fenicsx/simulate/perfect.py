@@ -48,15 +48,15 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
     CaseError
         If the perfect shell cannot be built, or its modes are not found.
     """
-    if problem.awaited is None:
+    if problem.pending_modes is None:
         return problem
-    count, bare = problem.awaited.count, problem.awaited.perfect()
+    count, bare = problem.pending_modes.count, problem.pending_modes.perfect()
     this = json.dumps([count, bare.document.data, bare.document.outside])
     if this not in _known or not bare.document.data:
         if len(_known) > 3:
             _known.clear()
         _known[this] = perfect_modes(bare, count, comm)
-    return problem.awaited.given(_known[this])
+    return problem.pending_modes.with_modes(_known[this])
 
 
 def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, ...]:

@@ -36,7 +36,7 @@ from magshell_fenicsx.parts.supports.motion import UNHELD
 from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
-from magshell_fenicsx.problem.formulas import unshown, written
+from magshell_fenicsx.problem.formulas import case_formulas, unresolved_formulas
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
@@ -160,7 +160,7 @@ class Scene:
 
     def __init__(self, problem: Problem, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         start = time.perf_counter()
-        if problem.awaited:
+        if problem.pending_modes:
             raise CaseError(
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
             )
@@ -252,10 +252,10 @@ class Scene:
     @cached_property
     def unshown(self) -> list[str]:
         """What the mesh misses of the problem's formulas, in words; collective."""
-        model, formulas = self.model, written(self.problem.context)
+        model, formulas = self.model, case_formulas(self.problem.context)
         if not formulas:
             return []
-        return unshown(
+        return unresolved_formulas(
             formulas, model.cells_of_fields(), self.problem.azimuth, self.problem.material.h
         )
 

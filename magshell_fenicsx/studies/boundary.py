@@ -275,7 +275,7 @@ def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
         refuse_beyond_memory(problem)
     except CaseError as e:
         raise CaseError(str(e).replace(f"--set {assignment}", f"--over {assignment}")) from None
-    return with_modes(problem, MPI.COMM_SELF) if problem.awaited else problem
+    return with_modes(problem, MPI.COMM_SELF) if problem.pending_modes else problem
 
 
 def _identity(source: Source, span: Range, made: Made, start: str) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors
-from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
@@ -250,7 +250,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
 def _curvatures(problem: Problem, places: Array) -> Array:
     """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
     drawn = problem.loads.natural.curvature if problem.loads.natural else None
-    if isinstance(drawn, Mapping | GivenField):
+    if isinstance(drawn, Mapping | UserField):
         raise CaseError(
             "design.curvature: natural.curvature starts by patches: start from numbers or formulas"
         )

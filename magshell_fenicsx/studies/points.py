@@ -17,7 +17,7 @@ import numpy as np
 
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.studies.runner import Case, Made
 
 MOST_POINTS = 10_000

@@ -7,7 +7,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.shape.symmetry import common_azimuth
+from magshell_fenicsx.shape.symmetry_constraint import common_azimuth
 
 
 def case(**sections: object) -> Case:
@@ -34,7 +34,7 @@ def test_coplanar_fields_give_a_half_shell_turned_into_its_mirror_plane() -> Non
         "applied": {"polar": -60, "azimuth": 20},
     }
     problem = make_problem(case(magnetic=field, loading={"kind": "pressure"}))
-    assert problem.half
+    assert problem.is_half
     assert problem.loads.magnetic
     assert problem.loads.magnetic.remanent == pytest.approx([0.5, 0, np.cos(np.pi / 6)])
     assert problem.loads.magnetic.applied == pytest.approx([-np.sin(np.pi / 3), 0, 0.5])

@@ -11,14 +11,14 @@ from mpi4py import MPI
 
 from magshell_fenicsx.mesh.midsurface import distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
-from magshell_fenicsx.mesh.shapes import DiscShape, flat, sphere
+from magshell_fenicsx.mesh.shapes import DiscShape, plane_embedding, sphere_embedding
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 
 def patch(size: float = 0.5) -> PatchMesh:
-    return triangulate(DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, flat)
+    return triangulate(DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, plane_embedding)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
@@ -51,7 +51,7 @@ def test_edges_follow_the_rim_of_the_dimple() -> None:
     """Vertices and edge nodes lie on the circle phi = phi_o: no triangle straddles it."""
     dimple = Dimple(0.05, 0.5)
     mesh = triangulate(
-        DiscShape(np.pi / 2, False, (0.5,)), lambda x: 0.3, {"pole": np.zeros(2)}, flat
+        DiscShape(np.pi / 2, False, (0.5,)), lambda x: 0.3, {"pole": np.zeros(2)}, plane_embedding
     )
     phi = np.hypot(*mesh.nodes.T)[mesh.cells[:, :9]]
     inside, outside = phi < dimple.width - 1e-9, phi > dimple.width + 1e-9
@@ -91,4 +91,4 @@ def test_flipped_triangle_is_refused() -> None:
 
 def test_smooth_sphere_has_no_dimple() -> None:
     chart = np.array([[0.3, 0.4], [0.0, 0.0]])
-    assert np.linalg.norm(sphere(chart), axis=1) == pytest.approx(1.0)
+    assert np.linalg.norm(sphere_embedding(chart), axis=1) == pytest.approx(1.0)

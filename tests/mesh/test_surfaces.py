@@ -20,7 +20,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.pressure.openings import moving
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.simulate.scene import build_midsurface
 
 COMMON = {"thickness": 0.01, "poisson_ratio": 0.3}

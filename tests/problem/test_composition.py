@@ -214,7 +214,7 @@ def test_each_part_leaves_its_symmetry(
 ) -> None:
     asked = case("hemisphere", **sections)
     problem = make_problem(asked)
-    assert (problem.axisymmetric, problem.half) == (turns, mirrors and not turns)
+    assert (problem.axisymmetric, problem.is_half) == (turns, mirrors and not turns)
     without_rotation = asked.model_copy(update={"symmetry": "half"})
     if mirrors:
         assert make_problem(without_rotation).half

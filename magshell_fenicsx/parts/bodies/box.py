@@ -16,9 +16,9 @@ from magshell_fenicsx.parts.bodies.body import (
     Size,
     rounded,
 )
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import edges
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import box_lines
 
 Array = NDArray[np.float64]
 
@@ -71,11 +71,11 @@ class Box(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.centre + line @ self.axes for line in edges(-self.half, self.half)]
+        return [self.centre + line @ self.axes for line in box_lines(-self.half, self.half)]
 
     @property
     def solid(self) -> Solid:
-        return solids.block(self.half).moved(self.axes.T, self.centre)
+        return drawn_bodies.block(self.half).transformed(self.axes.T, self.centre)
 
     @property
     def across(self) -> Sequence[Array]:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size
 from magshell_fenicsx.parts.bodies.sphere import Sphere
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import SEEN, frame, upright
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import HALF_DRAWN_EXTENT, cylinder_lines, frame_along
 
 Array = NDArray[np.float64]
 
@@ -48,11 +48,11 @@ class Cylinder(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.centre + line @ frame(self.axis).T for line in upright(self.radius, 2 * SEEN)]
+        return [self.centre + line @ frame_along(self.axis).T for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)]
 
     @property
     def solid(self) -> Solid:
-        return solids.cylinder(self.radius, 2 * SEEN).moved(frame(self.axis), self.centre)
+        return drawn_bodies.cylinder(self.radius, 2 * HALF_DRAWN_EXTENT).transformed(frame_along(self.axis), self.centre)
 
     @property
     def held(self) -> Sequence[Array]:

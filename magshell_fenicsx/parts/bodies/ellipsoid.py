@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, PlacedBody, Size
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import ball
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import sphere_lines
 
 Array = NDArray[np.float64]
 STEPS = 60  # of Newton's method, which takes about six
@@ -93,12 +93,12 @@ class Ellipsoid(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.centre + self.semi * line @ self.axes for line in ball(1.0)]
+        return [self.centre + self.semi * line @ self.axes for line in sphere_lines(1.0)]
 
     @property
     def solid(self) -> Solid:
-        round_one = solids.globe(1.0)
-        return replace(round_one, points=self.semi * round_one.points).moved(
+        round_one = drawn_bodies.globe(1.0)
+        return replace(round_one, points=self.semi * round_one.points).transformed(
             self.axes.T, self.centre
         )
 

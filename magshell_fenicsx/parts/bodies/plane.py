@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import SEEN, circle, frame
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import HALF_DRAWN_EXTENT, circle_line, frame_along
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ class Plane(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.front + circle(SEEN) @ frame(self.along).T]
+        return [self.front + circle_line(HALF_DRAWN_EXTENT) @ frame_along(self.along).T]
 
     @property
     def solid(self) -> Solid:
-        return solids.disc(SEEN).moved(frame(self.along), self.front)
+        return drawn_bodies.disc(HALF_DRAWN_EXTENT).transformed(frame_along(self.along), self.front)

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody, Size, rounded
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import SEEN, frame, upright
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import HALF_DRAWN_EXTENT, cylinder_lines, frame_along
 
 Array = NDArray[np.float64]
 
@@ -60,11 +60,11 @@ class Rod(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        middle = self.end - SEEN * self.along
-        return [middle + line @ frame(self.along).T for line in upright(self.radius, 2 * SEEN)]
+        middle = self.end - HALF_DRAWN_EXTENT * self.along
+        return [middle + line @ frame_along(self.along).T for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)]
 
     @property
     def solid(self) -> Solid:
-        return solids.cylinder(self.radius, 2 * SEEN).moved(
-            frame(self.along), self.end - SEEN * self.along
+        return drawn_bodies.cylinder(self.radius, 2 * HALF_DRAWN_EXTENT).transformed(
+            frame_along(self.along), self.end - HALF_DRAWN_EXTENT * self.along
         )

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, PlacedBody, Size
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import ball
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import sphere_lines
 
 Array = NDArray[np.float64]
 
@@ -48,8 +48,8 @@ class Sphere(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.centre + line for line in ball(self.radius)]
+        return [self.centre + line for line in sphere_lines(self.radius)]
 
     @property
     def solid(self) -> Solid:
-        return solids.globe(self.radius).moved(np.eye(3), self.centre)
+        return drawn_bodies.globe(self.radius).transformed(np.eye(3), self.centre)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.contact import Contact
@@ -19,9 +19,9 @@ from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.step import Step
-from magshell_fenicsx.shape.ground import Ground, located
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.reference_shell import ReferenceShell, locate
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 Array = NDArray[np.float64]
 RING = 0.35  # of sqrt(Rh): elements that show the ring of a contact
@@ -39,7 +39,7 @@ def contacts(
     bodies: Mapping[str, BodySection],
     approaches: Mapping[str, str],
     driven: Collection[str],
-    ground: Ground,
+    ground: ReferenceShell,
 ) -> tuple[Contact, ...]:
     """What bodies bring to the model.
 
@@ -68,7 +68,7 @@ def contacts(
     return tuple(standing)
 
 
-def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> Contact:
+def _contact(name: str, section: BodySection, approach: str, ground: ReferenceShell) -> Contact:
     key, h, Q = f"bodies.{name}", ground.h, ground.Q
     stands = section.position is not None and "at" not in section.model_fields_set
     if stands and (ground.geometry == "mesh" or section.direction is not None):
@@ -77,10 +77,10 @@ def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> 
             np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()
         ]
     else:
-        place, _ = located(section.at, ground, key)
+        place, _ = locate(section.at, ground, key)
     chart = ground.perfect.inverse(place)
     normal = ground.perfect.normal_near(chart)
-    start = place if len(chart) == 3 else ground.drawn.embedding(chart[None])[0]
+    start = place if len(chart) == 3 else ground.imperfect.embedding(chart[None])[0]
     half = float(ground.half_thickness(start[None])[0])
     placed = place_body(section, key, start, normal / np.linalg.norm(normal), half, Q, ground.R)
     D, size = h**2 / (12 * (1 - ground.nu**2)), section.blunt / placed.R
@@ -117,20 +117,20 @@ class Pressed:
     size: float
 
     @classmethod
-    def by(cls, contact: Contact, loads: Iterable[Step], ground: Ground) -> "Pressed":
+    def by(cls, contact: Contact, loads: Iterable[Step], ground: ReferenceShell) -> "Pressed":
         """Up to the largest approach of steps: a plane in a ring up to sqrt(2 R a), others on their
         front.
         """
         h, size = ground.h, contact.size
         reach = min(1.1 * sqrt(2 * (pressed(loads) or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
-        return cls(ground.drawn.inverse(contact.front), reach, size)
+        return cls(ground.imperfect.inverse(contact.front), reach, size)
 
     def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
         """Elements that show the ring of a contact, and a small body."""
         x, y = map(float, self.place)
         finer, size = sqrt(fit.h), self.size
-        small = [Disc((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)] if size < finer else []
-        return [Disc((x, y), self.reach, RING * finer / fit.refinement, growth), *small]
+        small = [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)] if size < finer else []
+        return [DiscFeature((x, y), self.reach, RING * finer / fit.refinement, growth), *small]
 
 
 def pressed(loads: Iterable[Step]) -> float:
@@ -141,7 +141,7 @@ def pressed(loads: Iterable[Step]) -> float:
     )
 
 
-def body_leaves(contact: Contact) -> Leaves:
+def body_leaves(contact: Contact) -> SymmetryConstraint:
     """The symmetry that a body leaves, found at random places."""
     x = np.random.default_rng(17).uniform(-2, 2, (40, 3))
     g, d = contact.distance(x)[0], contact.direction
@@ -160,7 +160,7 @@ def body_leaves(contact: Contact) -> Leaves:
     def mirrors(mirror: Mirror) -> bool:
         return alike(mirror.reflection, mirror.image(x))
 
-    return Leaves(
+    return SymmetryConstraint(
         None if turns else f"bodies.{contact.body} is not turned about e3",
         tilted,
         mirrors,
@@ -168,20 +168,20 @@ def body_leaves(contact: Contact) -> Leaves:
     )
 
 
-def least_gap(contact: Contact, ground: Ground) -> float:
+def least_gap(contact: Contact, ground: ReferenceShell) -> float:
     """The least gap over R between a body and the face of the undeformed shell."""
-    drawn = ground.drawn
+    drawn = ground.imperfect
 
     def gap(x: Array) -> Array:
         return contact.gap(x @ ground.Q.T, 0.0, ground.half_thickness(x))[0]
 
-    chart = drawn.charts()
+    chart = drawn.chart_samples()
     if chart is None:
         return float(gap(drawn.sample()).min())
     reach = np.full(2, 0.1 * float(np.ptp(chart, axis=0).max()))
 
     def on_chart(x: Array) -> Array:
-        return gap(drawn.embedding(np.array([drawn.within(p) for p in x])))
+        return gap(drawn.embedding(np.array([drawn.clip_to_chart(p) for p in x])))
 
     values = gap(drawn.embedding(chart))
     return _refined(on_chart, chart[values.argmin()], float(values.min()), reach)

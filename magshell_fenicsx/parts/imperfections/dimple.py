@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.imperfections.imperfection import Local, LocalSection
-from magshell_fenicsx.shape.ground import Angle, Distance
+from magshell_fenicsx.shape.reference_shell import AngularDistance, Distance
 
 Array = NDArray[np.float64]
-AT_POLE = Angle(np.array([0.0, 0.0, 1.0]))
+AT_POLE = AngularDistance(np.array([0.0, 0.0, 1.0]))
 WIDEST, OF_EDGE = 0.9 * pi, 0.9  # half-width (rad), and over the polar angle of a sphere's edge
 
 

@@ -21,7 +21,7 @@ from magshell_fenicsx.input.section import Section, Sized, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.part import Context, KeyAbility
-from magshell_fenicsx.shape.ground import At, Distance, Ground, located
+from magshell_fenicsx.shape.reference_shell import At, Distance, ReferenceShell, locate
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values")
@@ -219,7 +219,7 @@ class ImperfectionSection(Section):
         return self.kind
 
     @property
-    def awaited(self) -> int:
+    def pending_modes(self) -> int:
         """How many modes of the perfect shell it needs that are not yet computed."""
         return 0
 
@@ -243,7 +243,7 @@ class ImperfectionSection(Section):
             Polar angle of the edge of a sphere (rad); None of other shells.
         """
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """What it brings to a problem; `key` is its own, with dots.
 
         Raises
@@ -278,9 +278,9 @@ class LocalSection(ImperfectionSection):
         depth = abs(self.amplitude) / R_over_h
         _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         of, width = self.deviation, self.half_width(ground.R_over_h, ground.nu)
-        place, distance = located(self.at, ground, key)
+        place, distance = locate(self.at, ground, key)
         size = min(SHOWN / sqrt(ground.R_over_h), of.shown * width)
         deviation = of(self.amplitude / ground.R_over_h, width, distance)
         return Flaw(deviation, size, place, distance, of.reach * width, of.rim)
@@ -317,6 +317,6 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 raise ValueError(f"shell.{key}: {e}") from None
 
 
-def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:
+def flaws(imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell) -> dict[str, Flaw]:
     """Key of each imperfection below `shell` -> what it brings."""
     return {key: section.flaw(ground, f"shell.{key}") for key, section in imperfections.items()}

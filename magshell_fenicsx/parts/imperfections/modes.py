@@ -69,7 +69,7 @@ class ModesSection(FileKeys, ImperfectionSection):
         return self._shapes
 
     @property
-    def awaited(self) -> int:
+    def pending_modes(self) -> int:
         return len(self.amplitudes) if self.file is None and self.shapes is None else 0
 
     @property

@@ -20,7 +20,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
     over,
     sizes_noted,
 )
-from magshell_fenicsx.shape.ground import Ground
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
 WAVES = 512
@@ -83,7 +83,7 @@ class RandomSection(ImperfectionSection):
             ) from None
         return {f"dimples.{i}": each for i, each in enumerate(sections)}
 
-    def flaw(self, ground: Ground, key: str) -> Flaw:
+    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`; of the field, which the length of correlation shows."""
         assert self.amplitude is not None
         assert self.length

@@ -13,15 +13,15 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, Local
-from magshell_fenicsx.shape.ground import Angle, Straight
+from magshell_fenicsx.shape.meridian_chart import ANGLES
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.symmetry import Leaves, common_azimuth
-from magshell_fenicsx.shape.turning import ANGLES
+from magshell_fenicsx.shape.reference_shell import AngularDistance, StraightDistance
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, common_azimuth
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # of the largest w0
@@ -91,8 +91,8 @@ class _Sum:
         """What it is made of, if that is local deviations alone: there may be thousands."""
         local = [d for d in self.deviations if isinstance(d, Local)]
         kinds = list(dict.fromkeys(type(d) for d in local))
-        angles = [d.distance.axis for d in local if isinstance(d.distance, Angle)]
-        places = angles or [d.distance.place for d in local if isinstance(d.distance, Straight)]
+        angles = [d.distance.axis for d in local if isinstance(d.distance, AngularDistance)]
+        places = angles or [d.distance.place for d in local if isinstance(d.distance, StraightDistance)]
         if not places or len(places) < len(self.deviations):
             return None
         shapes = [(d.width, kinds.index(type(d))) for d in local]
@@ -118,7 +118,7 @@ class _Sum:
         return False if differs > 2 * SAME * np.abs(depths).sum() else None
 
 
-def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Leaves]:
+def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[SymmetryConstraint]:
     """What imperfections leave.
 
     Parameters
@@ -149,18 +149,18 @@ def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
     reason = None
     if off and drawn.round:
         reason = "an imperfection is off the axis"
-    elif drawn.span:
-        places = drawn.span.between()
+    elif drawn.meridian:
+        places = drawn.meridian.interior_sample()
         turned = [
             np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
         ]
         if not all(_same(turned[0], w0) for w0 in turned):
             reason = "an imperfection differs around e3"
     if not drawn.round:
-        return [Leaves(reason, (), mirrors)]
+        return [SymmetryConstraint(reason, (), mirrors)]
     if common_azimuth(off) is None:
-        return [Leaves(reason, (), mirrors, azimuths=_between(off))]
-    return [Leaves(reason, off, mirrors)]
+        return [SymmetryConstraint(reason, (), mirrors, azimuths=_between(off))]
+    return [SymmetryConstraint(reason, off, mirrors)]
 
 
 def _between(centres: Sequence[Array]) -> tuple[float, ...]:
@@ -222,7 +222,7 @@ class Spot:
     def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
         """Small elements on it and a little around it, which grow so fast away from there."""
         radius, size = self.radius + 0.7 * sqrt(fit.h), self.size / fit.refinement
-        return [Disc((float(x), float(y)), radius, size, growth) for x, y in images(self, outline)]
+        return [DiscFeature((float(x), float(y)), radius, size, growth) for x, y in images(self, outline)]
 
 
 def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:

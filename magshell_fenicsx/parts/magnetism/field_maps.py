@@ -21,7 +21,7 @@ from magshell_fenicsx.parts.magnetism.sensors import (
 )
 from magshell_fenicsx.parts.part import Context, KeyAbility
 from magshell_fenicsx.parts.seen import MapGrid, Seen, Sight
-from magshell_fenicsx.shape.ground import Coordinates
+from magshell_fenicsx.shape.reference_shell import Coordinates
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State

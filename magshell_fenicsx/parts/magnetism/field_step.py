@@ -14,7 +14,7 @@ from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, stre
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
-from magshell_fenicsx.shape.symmetry import Leaves
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -122,8 +122,8 @@ class RotationSection(Step):
             where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
             raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
-        return [Leaves("the field turns", [self.to.vector()])]
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+        return [SymmetryConstraint("the field turns", [self.to.vector()])]
 
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:
         return {name} | {other for other in mu if other.startswith("lambda_")}

@@ -14,7 +14,7 @@ from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads

@@ -214,7 +214,7 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     remanent = magnetic.remanent or RemanentSection.model_construct()
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if isinstance(remanent.components, UserField):
-        return [SymmetryConstraint("the remanence is a function on a mesh", mirrors=nothing)]
+        return [SymmetryConstraint("the remanence is a function on a mesh", mirrors=no_plane)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
     askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []

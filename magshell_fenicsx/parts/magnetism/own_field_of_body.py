@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.hexahedra import WHOLE
+from magshell_fenicsx.mesh.hexahedra import QUADRATURE_DEGREE
 from magshell_fenicsx.models.shell.patterns import field_in_body, places_in_body
 from magshell_fenicsx.parts.magnetism.charged import unit
 from magshell_fenicsx.parts.magnetism.charges import Family
@@ -98,7 +98,7 @@ class OwnFieldOfBody(OwnField):
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
         V = self._model.r0.function_space
-        points, weights = basix.make_quadrature(V.mesh.basix_cell(), WHOLE)
+        points, weights = basix.make_quadrature(V.mesh.basix_cell(), QUADRATURE_DEGREE)
         T, TB = (
             f.element.basix_element.tabulate(1, points)[..., 0] for f in (V, self.Br.function_space)
         )

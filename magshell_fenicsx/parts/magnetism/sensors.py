@@ -14,8 +14,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.part import Context, KeyAbility
-from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.sections import MeshSurface, ShellSection, Surface
+from magshell_fenicsx.shape.reference_shell import Coordinates
+from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 Array = NDArray[np.float64]
 STEPS, DIFFERENCE = 8, 1e-6  # of Gauss's and Newton's method for the nearest place of a surface

@@ -19,8 +19,8 @@ from magshell_fenicsx.parts.motion.history import (
 )
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
-from magshell_fenicsx.shape.symmetry import Leaves, alike
-from magshell_fenicsx.shape.turning import vector_turns, vectors_of
+from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -183,17 +183,17 @@ class TimeSection(Step):
                 except ValueError as e:
                     raise ValueError(f"{key}.history.{name}: {level}: {e}") from None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         if not self.velocity:
             return []
-        given, R = vectors_of(self.velocity), context.shell.reference
+        given, R = vector_function(self.velocity), context.shell.reference
 
         def keeps(mirror: Mirror) -> bool:
             S, x = mirror.reflection, outline.sample()
-            return alike(given(R * x) @ S, given(R * mirror.image(x)))
+            return equal_to_rounding(given(R * x) @ S, given(R * mirror.image(x)))
 
-        turns = outline.span and vector_turns(self.velocity, outline.span, R)
-        return [Leaves(None if turns else "the initial velocity differs around e3", (), keeps)]
+        turns = outline.meridian and vector_is_axisymmetric(self.velocity, outline.meridian, R)
+        return [SymmetryConstraint(None if turns else "the initial velocity differs around e3", (), keeps)]
 
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Key and text of each time with a unit."""

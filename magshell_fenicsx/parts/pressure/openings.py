@@ -14,7 +14,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.mesh.mirror import STRAIGHT
+from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 
@@ -58,7 +58,7 @@ def without_potential(
         if not isinstance(condition, Held):
             return False
         axes = list(condition.components)
-        return len(axes) == 2 or bool(np.ptp(places(name)[:, axes], axis=0).max() < STRAIGHT)
+        return len(axes) == 2 or bool(np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE)
 
     return tuple(name for name in names if not has(name))
 

@@ -12,8 +12,13 @@ from pydantic import BeforeValidator, Field, ValidationError
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.parts.part import Ability, Context, Offer
-from magshell_fenicsx.shape.sections import ShellSection
-from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, nothing, tilted
+from magshell_fenicsx.shape.shell_sections import ShellSection
+from magshell_fenicsx.shape.symmetry_constraint import (
+    PARALLEL,
+    SymmetryConstraint,
+    no_plane,
+    tilted,
+)
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -118,11 +123,11 @@ class BoundarySection(Section, Ability):
             for each in self.conditions().values()
         )
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """A half that is loaded does not see rigid motions across its plane: it needs a support
         against all.
         """
-        parts = list[Leaves]()
+        parts = list[SymmetryConstraint]()
         for name, condition in self.conditions().items():
             reason = None
             if isinstance(condition, HeldSection):
@@ -136,16 +141,16 @@ class BoundarySection(Section, Ability):
                     else None
                 )
                 reason = why and f"boundary.{name}: {why}"
-            parts.append(Leaves(reason, mirrors=partial(self._mirrored, context, name)))
+            parts.append(SymmetryConstraint(reason, mirrors=partial(self._mirrored, context, name)))
         at_rest = not context.steps and context.sections.get("frequencies") is not None
         if not at_rest and not self.fixes:  # a meridian asks for itself whether it is held
-            parts.append(Leaves(mirrors=nothing))
+            parts.append(SymmetryConstraint(mirrors=no_plane))
         return parts
 
     def _mirrored(self, context: Context, name: str, mirror: Mirror) -> bool:
         """The other half is held in the same way, and a point that is held is on the plane."""
         conditions = self.conditions()
-        condition, other = conditions[name], conditions.get(mirror.other(name), "free")
+        condition, other = conditions[name], conditions.get(mirror.image_of_edge(name), "free")
         if isinstance(condition, HeldSection):
             held, S = (
                 np.diag([float(i in condition.components) for i in range(3)]),
@@ -157,7 +162,7 @@ class BoundarySection(Section, Ability):
         off = (
             0.0
             if place is None
-            else float(mirror.beyond(np.array(place) / context.shell.reference))
+            else float(mirror.signed_distance(np.array(place) / context.shell.reference))
         )
         return abs(off) < ROUNDING and condition == other
 

@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.mirror import STRAIGHT
+from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
@@ -139,7 +139,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:
     """See that the surface crosses the plane of an end at right angles."""
-    s, near = meridian.parameter(name), STRAIGHT if meridian.begins(name) else -STRAIGHT
+    s, near = meridian.parameter(name), PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + near]))
     if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))

@@ -43,11 +43,11 @@ from magshell_fenicsx.parts.touching.curves import (
 )
 from magshell_fenicsx.parts.touching.faces import slope_of, unknowns
 from magshell_fenicsx.parts.touching.facing import STEEP, between_held
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 from magshell_fenicsx.parts.touching.nearest import FOLLOWING, Joined, highest
 from magshell_fenicsx.parts.touching.rings import IN_PLANE, Rings
 from magshell_fenicsx.parts.touching.section import WHOLE, Pair
 from magshell_fenicsx.parts.touching.touching import EVERYWHERE, NEARER, PART, REACH
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, of_each
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]

@@ -8,8 +8,8 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
-from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, of_patches
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -104,10 +104,10 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     def refuse_unfit(self, context: Context) -> None:
         refuse_unfit_pairs(self.given, context)
 
-    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """All, but no meridian of a part of a shell."""
         names = {name for pair in self.given for name in names_in(pair)} - {WHOLE}
-        return [of_patches("contact", names, context.shell)]
+        return [patch_constraint("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         several = context.shell.assembly if isinstance(context.shell, MeshSurface) else None

@@ -305,7 +305,7 @@ class Segments:
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         self._turns = cells.turns(r0, TURN)
         for plane in planes:
-            self._turns &= np.abs(plane.beyond(corners)) > CLOSE
+            self._turns &= np.abs(plane.signed_distance(corners)) > CLOSE
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         inside, at_edge = covers(inner_rule(degrees[0])[0]), covers(ending_rule(degrees[0])[0])
         self.within: Array = (

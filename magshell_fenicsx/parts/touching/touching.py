@@ -40,10 +40,10 @@ from magshell_fenicsx.parts.touching.faces import (
     unknowns,
 )
 from magshell_fenicsx.parts.touching.facing import BLUR, SAME, Facing, nowhere
+from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 from magshell_fenicsx.parts.touching.nearest import Cells, Joined, Longs, Places
 from magshell_fenicsx.parts.touching.section import Pair
 from magshell_fenicsx.parts.touching.segments import Cuts, Points, Segments, divisions_of
-from magshell_fenicsx.parts.touching.in_steps import Along, ContactTerm, Kept, Number
 
 Array = NDArray[np.float64]
 REACH = 4.0  # thicknesses: farther places are not looked for

@@ -29,9 +29,9 @@ from magshell_fenicsx.continuation.system import Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.models.shell.law import work
-from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.memory import refuse_beyond_memory
+from magshell_fenicsx.problem.mesh_sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.problem.sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round, equidistributed
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
@@ -344,7 +344,7 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     """
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
-    if scene.problem.axisymmetric or scene.problem.given or isinstance(scene.problem.shape, Grid):
+    if scene.problem.axisymmetric or scene.problem.mesh_file or isinstance(scene.problem.shape, Grid):
         change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
             change = max(change, LINES)

@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Edge, Jet
@@ -114,9 +114,9 @@ def test_symmetry() -> None:
     assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
     assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)
     around = ms.OwnTerm("own", ring, on="rim")
-    assert (around.turns, around.mirrored(Y0)) == (True, True)
+    assert (around.turns, around.mirrored(Y0_PLANE)) == (True, True)
     along = ms.OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.along, u.r), on="rim")
-    assert (along.turns, along.mirrored(Y0)) == (True, False)
+    assert (along.turns, along.mirrored(Y0_PLANE)) == (True, False)
 
 
 def test_what_is_refused() -> None:

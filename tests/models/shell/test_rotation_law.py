@@ -15,7 +15,7 @@ from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
 from test_magnetic_energies import order, smooth
 
-from magshell_fenicsx.mesh.mirror import Y0
+from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import tangential
@@ -148,4 +148,4 @@ def test_tangent_changes_with_each_amplitude(amplitude: str) -> None:
 def test_symmetry(name: str) -> None:
     """That of the other law: fields in the plane y = 0 mirror and do not turn."""
     term = OwnTerm("own", getattr(laws, name), (E3, np.eye(3)[0] + E3))
-    assert (term.turns, term.mirrored(Y0)) == (False, True)
+    assert (term.turns, term.mirrored(Y0_PLANE)) == (False, True)

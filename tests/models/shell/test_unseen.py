@@ -5,7 +5,7 @@ import numpy as np
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.models.shell.unseen import Lattice, Parts, _seen
-from magshell_fenicsx.problem.formulas import Together
+from magshell_fenicsx.input.expressions import FormulaGroup
 
 
 def test_a_rank_without_parts() -> None:
@@ -14,7 +14,7 @@ def test_a_rank_without_parts() -> None:
         Lattice.of(basix.CellType.triangle, 4),
         Parts(np.zeros(0, int), np.zeros((0, 2)), np.ones((0, 2))),
     )
-    formulas = Together([formula("exp(0.6*x + 0.8*y)"), formula("x")], None, 1.0)
+    formulas = FormulaGroup([formula("exp(0.6*x + 0.8*y)"), formula("x")], None, 1.0)
     seen = _seen(
         formulas, none, lambda parts: (np.zeros((0, len(lattice.places), 3)), np.zeros(0)), lattice
     )

@@ -8,15 +8,15 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
-from magshell_fenicsx.mesh.hexahedra import Body, sweep
-from magshell_fenicsx.mesh.shapes import DiscShape, flat
+from magshell_fenicsx.mesh.hexahedra import BodyMesh, sweep
+from magshell_fenicsx.mesh.shapes import DiscShape, plane_embedding
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 
 def hemisphere(
     size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None
-) -> Body:
+) -> BodyMesh:
     """A body around the hemisphere of radius 1; the triangles' size holds everywhere."""
     shape = DiscShape(np.pi / 2, half, (dimple.width,) if dimple else ())
     points = {"pole": np.zeros(2)}
@@ -25,15 +25,15 @@ def hemisphere(
     )
 
 
-def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body:
+def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> BodyMesh:
     """A disc of radius 1."""
-    patch = triangulate(DiscShape(1.0, half), lambda x: size, {"pole": np.zeros(2)}, flat)
+    patch = triangulate(DiscShape(1.0, half), lambda x: size, {"pole": np.zeros(2)}, plane_embedding)
     return sweep(patch, h, layers, MPI.COMM_SELF)
 
 
 def body_of(
     shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None
-) -> Body:
+) -> BodyMesh:
     """A body around a shell as a case describes it."""
     data = {
         "shell": {"poisson_ratio": 0.3, **shell},

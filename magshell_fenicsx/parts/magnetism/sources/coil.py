@@ -15,7 +15,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import (
     SourceSection,
     magpylib,
 )
-from magshell_fenicsx.shape.ground import circle
+from magshell_fenicsx.shape.reference_shell import circle_line
 
 Array = NDArray[np.float64]
 NOWHERE = "on the wire of"
@@ -59,7 +59,7 @@ class CoilSection(SourceSection):
         def distance(x: Array) -> Array:
             return np.hypot(np.hypot(x[:, 0], x[:, 1]) - r, x[:, 2])
 
-        return FieldOfSource(Harmonic(loop.getB, distance), [circle(r)], NOWHERE)
+        return FieldOfSource(Harmonic(loop.getB, distance), [circle_line(r)], NOWHERE)
 
 
 def to_polygon(x: Array, corners: Array) -> Array:

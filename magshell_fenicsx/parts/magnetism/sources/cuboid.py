@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import edges
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import box_lines
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ class CuboidSection(MagnetSection):
         return to_box(np.abs(x) - self.half)
 
     def lines(self) -> list[Array]:
-        return edges(-self.half, self.half)
+        return box_lines(-self.half, self.half)
 
     def solid(self) -> Solid:
-        return solids.block(self.half)
+        return drawn_bodies.block(self.half)

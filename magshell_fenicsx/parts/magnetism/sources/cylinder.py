@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import upright
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import cylinder_lines
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class CylinderSection(MagnetSection):
         return to_box(np.column_stack([beyond_side, np.abs(x[:, 2]) - self.height / 2]))
 
     def lines(self) -> list[Array]:
-        return upright(self.diameter / 2, self.height)
+        return cylinder_lines(self.diameter / 2, self.height)
 
     def solid(self) -> Solid:
-        return solids.cylinder(self.diameter / 2, self.height)
+        return drawn_bodies.cylinder(self.diameter / 2, self.height)

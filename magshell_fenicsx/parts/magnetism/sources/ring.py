@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import upright
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import cylinder_lines
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class RingSection(MagnetSection):
         )
 
     def lines(self) -> list[Array]:
-        return [line for radius in self.radii for line in upright(radius, self.height)]
+        return [line for radius in self.radii for line in cylinder_lines(radius, self.height)]
 
     def solid(self) -> Solid:
-        return solids.cylinder(self.diameter / 2, self.height, self.inner_diameter / 2)
+        return drawn_bodies.cylinder(self.diameter / 2, self.height, self.inner_diameter / 2)

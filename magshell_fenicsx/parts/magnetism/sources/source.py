@@ -17,7 +17,7 @@ from pydantic import Field
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.driven import FieldInSpace
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
 Values = Callable[[Array], Array]
@@ -205,7 +205,7 @@ class PlacedSource:
     def solid(self) -> Solid | None:
         """Its faces, over R."""
         own = self.own.solid
-        return own.moved(self.axes, self.position, 1 / self.length) if own else None
+        return own.transformed(self.axes, self.position, 1 / self.length) if own else None
 
 
 def magpylib(key: str) -> ModuleType:

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values
-from magshell_fenicsx.shape import solids
-from magshell_fenicsx.shape.ground import ball
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.shape import drawn_bodies
+from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shape.reference_shell import sphere_lines
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class SphereSection(MagnetSection):
         return np.asarray(np.linalg.norm(x, axis=1) - self.diameter / 2)
 
     def lines(self) -> list[Array]:
-        return ball(self.diameter / 2)
+        return sphere_lines(self.diameter / 2)
 
     def solid(self) -> Solid:
-        return solids.globe(self.diameter / 2)
+        return drawn_bodies.globe(self.diameter / 2)

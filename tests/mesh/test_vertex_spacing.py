@@ -11,8 +11,13 @@ import pytest
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.distinct import FLAT, SAME_PLACE, flatness, told_apart
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.mesh.vertex_spacing import (
+    MAX_FLATNESS,
+    SAME_PLACE_TOLERANCE,
+    distinguishable_texts,
+    flatness,
+)
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
@@ -98,9 +103,9 @@ def test_near_coordinates_share_a_line(kind: str) -> None:
     vertices = patch.embedding(patch.nodes[np.unique(patch.cells[:, :3])])
     for name in points:
         place = patch.embedding(patch.points[name][None])[0]
-        assert place == pytest.approx(points[name], abs=2 * SAME_PLACE)
+        assert place == pytest.approx(points[name], abs=2 * SAME_PLACE_TOLERANCE)
         assert np.linalg.norm(vertices - place, axis=1).min() < 1e-12
-    assert flatness(patch).max() < FLAT / 2
+    assert flatness(patch).max() < MAX_FLATNESS / 2
 
 
 @pytest.mark.parametrize(
@@ -178,11 +183,11 @@ def test_places_too_near_are_told(
 
 
 def test_digits_that_tell_apart() -> None:
-    assert told_apart(np.array([1.0, 0.3333333]), np.array([1.0, 0.33333339])) == (
+    assert distinguishable_texts(np.array([1.0, 0.3333333]), np.array([1.0, 0.33333339])) == (
         "1, 0.3333333",
         "1, 0.33333339",
     )
-    assert told_apart(np.array([1.0]), np.array([2.0])) == ("1", "2")
+    assert distinguishable_texts(np.array([1.0]), np.array([2.0])) == ("1", "2")
 
 
 def columns(file: Path, width: float) -> Path:

@@ -1,4 +1,7 @@
-"""What is asked of a path besides itself: modes, natural frequencies, gradients and pictures."""
+"""Sections of what a case requests besides the path: modes, frequencies, gradients and pictures.
+
+Their docstrings and those of their keys are the text of docs/case.md.
+"""
 
 from typing import Annotated, Literal
 
@@ -19,7 +22,7 @@ class StabilitySection(Section):
     """At which points of the path"""
 
 
-At = Annotated[
+PathPoints = Annotated[
     Annotated[Literal["ends", "end", "all"], Tag("a word")]
     | Annotated[list[Annotated[int, Field(ge=0)]], Tag("points"), Field(min_length=1)],
     Discriminator(lambda data: "points" if isinstance(data, list) else "a word"),
@@ -36,11 +39,12 @@ class FrequenciesSection(Section):
 
     count: int = Field(default=6, ge=1, le=50)
     """How many of the lowest; every unstable one is listed besides"""
-    at: At = "ends"
-    """At which points: the start and the end of the path, the end, all, or numbers of points in path.csv"""
+    at: PathPoints = "ends"
+    """At which points: the start and the end of the path, the end, all, or numbers of points in
+    path.csv"""
 
 
-FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
+GRADIENT_FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
 
 
 class GradientsSection(Section):
@@ -53,15 +57,16 @@ class GradientsSection(Section):
     """
 
     of: Annotated[list[str], Field(min_length=1)] = Field(default=["knockdown"])
-    """Results: knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT), barrier, natural
-    frequencies (omega2_1, ..., hertz_1, ...), or columns of path.csv where the path ends, such as force_N or forces of
-    supports; where it ends at an instability, its load alone"""
+    """Results: knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT),
+    barrier, natural frequencies (omega2_1, ..., hertz_1, ...), or columns of path.csv where the
+    path ends, such as force_N or forces of supports; where it ends at an instability, its load
+    alone"""
     by: Annotated[list[str], Field(min_length=1)] = Field(default=["magnitude", "thickness"])
-    """remanence, magnitude, thickness, curvature, deviation; amplitudes (lambda_m); keys of the case with a number,
-    in SI if it has a unit"""
+    """remanence, magnitude, thickness, curvature, deviation; amplitudes (lambda_m); keys of the
+    case with a number, in SI if it has a unit"""
 
 
-DRAWN = (  # fields with colours
+COLOURED_FIELDS = (  # fields with colours
     *("w_over_h", "E_1", "E_2", "M_1", "M_2"),
     *("stretch_1", "stretch_2", "stretch_3", "sigma_1", "sigma_2"),
     *("p_mag", "f_mag", "k", "tau", "couple", "gap_over_h", "contact_pressure"),
@@ -79,8 +84,8 @@ class CameraSection(Section):
 
 
 class OutputSection(Section):
-    """Pictures of a run, and shells for ParaView; `magshell plot` has the same keys as options. PNG files are always
-    drawn."""
+    """Pictures of a run, and shells for ParaView; `magshell plot` has the same keys as options.
+    PNG files are always drawn."""
 
     formats: list[Literal["png", "svg", "pdf"]] = Field(default_factory=list)
     """Further formats: svg and pdf have text as text, and the shell as an image"""
@@ -91,20 +96,24 @@ class OutputSection(Section):
     font_size: float = Field(default=8.0, ge=3, le=40)
     """Of all text [points]"""
     camera: CameraSection | None = None
-    """From where the shell is seen; by default from above, on the side of its largest displacement"""
+    """From where the shell is seen; by default from above, on the side of its largest
+    displacement"""
     ranges: dict[str, Range] = Field(default_factory=dict)
-    """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, stretch_1, stretch_2, stretch_3,
-    sigma_1, sigma_2, p_mag, f_mag, k, tau, couple,
-    gap_over_h, contact_pressure; by default those of the data"""
+    """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, stretch_1,
+    stretch_2, stretch_3, sigma_1, sigma_2, p_mag, f_mag, k, tau, couple, gap_over_h,
+    contact_pressure; by default those of the data"""
     whole: bool = False
-    """With the pictures of a half shell, write the whole one at every point for ParaView: fields/whole.pvd"""
+    """With the pictures of a half shell, write the whole one at every point for ParaView:
+    fields/whole.pvd"""
 
     @field_validator("ranges")
     @classmethod
     def _ranges_are_known(cls, ranges: dict[str, list[float]]) -> dict[str, list[float]]:
         for name, (low, high) in ranges.items():
-            if name not in DRAWN:
-                raise ValueError(f"{name}: no field with colours; there are {', '.join(DRAWN)}")
+            if name not in COLOURED_FIELDS:
+                raise ValueError(
+                    f"{name}: no field with colours; there are {', '.join(COLOURED_FIELDS)}"
+                )
             if not low < high:
                 raise ValueError(f"{name}: the first value must be less than the second")
         return ranges

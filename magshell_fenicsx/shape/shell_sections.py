@@ -1,4 +1,7 @@
-"""Any mid-surface: the shells of the paper, surfaces of revolution, plates, and a user's mesh."""
+"""Sections of all mid-surfaces: the paper's shells, surfaces of revolution, plates and meshes.
+
+The docstrings of sections and of their keys are the text of docs/case.md.
+"""
 
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -21,9 +24,9 @@ from magshell_fenicsx.input.section import (
     in_units,
     with_unit,
 )
-from magshell_fenicsx.mesh.assembly import Assembly
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
-from magshell_fenicsx.shape.revolved import (
+from magshell_fenicsx.shape.revolution_sections import (
     AnnulusSurface,
     CapSurface,
     CylinderSurface,
@@ -39,7 +42,8 @@ class PlateSurface(SurfaceSection):
 
     geometry: Literal["plate"]
     length: Measure
-    """Along e1; the reference length R, which formulas and dimensionless results are over [length]"""
+    """Along e1; the reference length R, which formulas and dimensionless results are over
+    [length]"""
     width: Measure
     """Along e2 [length]"""
 
@@ -80,13 +84,13 @@ class MeshSurface(FileKeys, SurfaceSection):
         return self.radius
 
     @property
-    def assembly(self) -> Assembly | None:
-        """The several shells for which it stands."""
-        given = self.files.given.get(self.path)
-        return given if isinstance(given, Assembly) else None
+    def assembly(self) -> MultiShellMesh | None:
+        """Several shells that stand in place of the file; None of a file."""
+        in_memory = self.files.given.get(self.path)
+        return in_memory if isinstance(in_memory, MultiShellMesh) else None
 
 
-FLAT = ("disc", "strip", "plate", "annulus")  # geometries
+FLAT_GEOMETRIES = ("disc", "strip", "plate", "annulus")  # geometries
 Surface = (
     CapSurface
     | CylinderSurface
@@ -99,7 +103,7 @@ Surface = (
 
 
 def _over_the_length(value: Any, info: ValidationInfo) -> Any:
-    """The width of a strip over its length: a number unchanged, or text with a unit."""
+    """Return the width of a strip over its length: a number unchanged, or text with a unit."""
     if not isinstance(value, str):
         return value
     radius = info.data.get("radius")
@@ -160,11 +164,12 @@ class ShellSection(ShellKeys, OneShape):
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
         sizes = [data.get(key) for key in ("radius", "thickness")] if isinstance(data, dict) else []
-        plain = [size for size in sizes if isinstance(size, int | float) and size > 0]
-        if len(plain) == 2:
-            ratio = f"{plain[0] / plain[1]:.12g}"
+        numbers = [size for size in sizes if isinstance(size, int | float) and size > 0]
+        if len(numbers) == 2:
+            ratio = f"{numbers[0] / numbers[1]:.12g}"
             raise ValueError(
-                f"radius and thickness: give each a unit, or radius_to_thickness: {ratio} in their place"
+                "radius and thickness: give each a unit, "
+                f"or radius_to_thickness: {ratio} in their place"
             )
         cls.note_sizes(
             data,
@@ -190,13 +195,15 @@ class ShellSection(ShellKeys, OneShape):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
         if self.density is not None and (self.youngs_modulus is None or self.radius is None):
             raise ValueError(
-                "density turns frequencies into hertz: that needs youngs_modulus, radius and thickness"
+                "density turns frequencies into hertz: "
+                "that needs youngs_modulus, radius and thickness"
             )
         if self.defect and self.geometry != "hemisphere":
             raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
         if self.width is not None and self.width * self.R_over_h < 1:
             raise ValueError(
-                f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"
+                "the strip is narrower than its thickness; "
+                f"width must be at least {1 / self.R_over_h:.4g}"
             )
         return self
 
@@ -210,12 +217,12 @@ class ShellSection(ShellKeys, OneShape):
 
     @property
     def edge_polar(self) -> float | None:
-        """Of a part of a sphere the angle of its edge from e3 (degrees); None of other geometries."""
+        """Angle of the edge of a part of a sphere from e3 (degrees); None of other geometries."""
         return 90.0 if self.geometry == "hemisphere" else None
 
     @property
     def reference(self) -> float:
-        """R, or 1 where the case has no lengths: those of points are then over R."""
+        """R in the unit of the case, or 1 without lengths: those of points are then over R."""
         return self.radius or 1.0
 
     @property
@@ -225,5 +232,5 @@ class ShellSection(ShellKeys, OneShape):
 
     @property
     def modulus(self) -> float | None:
-        """E that dead loads are over: of a case without lengths 1, so that forces are over E R²."""
+        """E that dead loads are over; 1 of a case without lengths: forces are then over E R²."""
         return self.youngs_modulus if self.with_units else 1.0

@@ -16,9 +16,9 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.given import Home
 from magshell_fenicsx.mesh.msh import oriented
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.user_mesh import UserMesh
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -69,7 +69,7 @@ def sides(domain: mesh.Mesh) -> mesh.MeshTags:
 )
 def test_parts_that_are_none(part: Any, said: str) -> None:
     with pytest.raises(MeshError, match=said):
-        Home(made(*plate(4))).triangles({"rim": part}, {})
+        UserMesh(made(*plate(4))).triangles({"rim": part}, {})
 
 
 def test_cells_that_are_none() -> None:
@@ -78,8 +78,8 @@ def test_cells_that_are_none() -> None:
         (np.ones(16, dtype=bool), "is neither a value"),
     ):
         with pytest.raises(MeshError, match=rf"patches\.a: {said}"):
-            Home(made(*plate(4))).triangles({}, {"a": np.array(part)})
-    found = Home(made(*plate(4))).triangles({}, {"a": [0, 3]})  # type: ignore[dict-item]
+            UserMesh(made(*plate(4))).triangles({}, {"a": np.array(part)})
+    found = UserMesh(made(*plate(4))).triangles({}, {"a": [0, 3]})  # type: ignore[dict-item]
     assert found.patches["a"].sum() == 2
 
 
@@ -88,8 +88,8 @@ def test_tags_of_another_mesh() -> None:
     with pytest.raises(
         MeshError, match=r"edges\.rim: 1: facet_tags belong to another mesh than that of the shell"
     ):
-        Home(domain).triangles({"rim": 1}, {}, sides(other))
-    assert len(Home(domain).triangles({"rim": 1}, {}, sides(domain)).edges["rim"]) == 12
+        UserMesh(domain).triangles({"rim": 1}, {}, sides(other))
+    assert len(UserMesh(domain).triangles({"rim": 1}, {}, sides(domain)).edges["rim"]) == 12
 
 
 def test_part_of_another_mesh() -> None:
@@ -97,7 +97,7 @@ def test_part_of_another_mesh() -> None:
     whole = made(*plate(8, 2.0))
     near = mesh.locate_entities(whole, 2, lambda x: x[0] < 1 + 1e-9)
     part = mesh.create_submesh(whole, 2, near)[0]
-    home = Home(part)
+    home = UserMesh(part)
     found = home.triangles({}, {})
     alone = plate(4)
     assert len(found.cells) == len(alone[1])
@@ -150,7 +150,7 @@ import sys
 sys.path[:0] = sys.argv[1:]
 import numpy as np
 from mpi4py import MPI
-from test_given import made, plate, sides
+from test_user_mesh import made, plate, sides
 import magshell_fenicsx as ms
 from magshell_fenicsx.mesh.patch import MeshError
 

@@ -1,0 +1,191 @@
+"""Non-manifold edges of a mesh file: an edge with three and more triangles is a T-junction.
+
+Of the triangles at such an edge the two that are nearest to one plane are one sheet; each other one
+ends there, with nodes of its own, and is tied to these two.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from magshell_fenicsx.mesh.patch import border_pairs, directed_sides
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int64]
+JUNCTION_NAME = "junction"  # of the first T-junction of a mesh; further ones have a number
+COSINE_DIGITS = 9  # decimals of the cosine between triangles: differences below are rounding
+
+
+@dataclass(frozen=True)
+class TJunction:
+    """The edge of a sheet that ends on another one.
+
+    Attributes
+    ----------
+    pairs
+        (e, 2) vertices of the edge.
+    supports
+        (m,) whether each triangle is one of those that the sheet ends on.
+    """
+
+    pairs: Cells
+    supports: NDArray[np.bool_]
+
+
+def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str, TJunction]]:
+    """Take a triangulation (m, 3 | 6 | 10) apart until each edge has two triangles at most.
+
+    Returns
+    -------
+    origin
+        (n,) the old node at the place of each node. New nodes stand after the old ones.
+    cells
+        Triangles with new nodes.
+    t_junctions
+        Name -> an edge at which a sheet was taken off.
+    """
+    m = len(cells)
+    pairs, edge_of_side, times = np.unique(
+        np.sort(directed_sides(cells), axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    if (times <= 2).all():
+        return np.arange(len(nodes)), cells, {}
+    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
+    first_of_edge = np.concatenate([[0], np.cumsum(times)])
+    supporting_cells = dict[int, tuple[int, int]]()  # by edge
+    neighbours = list[tuple[int, int]]()  # pairs of triangles of one sheet
+    ending_cells = list[tuple[int, int]]()  # edges, and triangles whose sheet ends there
+    for edge in np.flatnonzero(times > 1):
+        sides = sides_by_edge[first_of_edge[edge] : first_of_edge[edge + 1]]
+        cells_at_edge = [int(side) % m for side in sides]
+        if len(cells_at_edge) == 2:
+            neighbours.append((cells_at_edge[0], cells_at_edge[1]))
+            continue
+        conormals = {cell: _conormal(nodes, pairs[edge], cells[cell, :3]) for cell in cells_at_edge}
+
+        def cosine(two_cells: tuple[int, int], conormals: dict[int, Array] = conormals) -> float:
+            first, second = two_cells
+            return round(float(conormals[first] @ conormals[second]), COSINE_DIGITS)
+
+        flattest = min(combinations(cells_at_edge, 2), key=cosine)
+        neighbours.append(flattest)
+        supporting_cells[int(edge)] = flattest
+        ending_cells += [(int(edge), cell) for cell in cells_at_edge if cell not in flattest]
+    vertices = np.unique(pairs[times > 2])
+    cells, copied_nodes = _with_own_nodes(len(nodes), cells, neighbours, vertices)
+    sheets = _sheet_numbers(m, neighbours)
+    origin = np.append(np.arange(len(nodes)), copied_nodes)
+    t_junctions = dict[str, TJunction]()
+    for sheet in dict.fromkeys(sheets[cell] for _, cell in ending_cells):
+        end_pairs, supports = list[list[int]](), np.zeros(m, dtype=bool)
+        for edge, cell in ending_cells:
+            if sheets[cell] == sheet:
+                corners = [int(corner) for corner in cells[cell, :3]]
+                end_pairs.append([corner for corner in corners if origin[corner] in pairs[edge]])
+                supports[list(supporting_cells[edge])] = True
+        number = len(t_junctions) + 1
+        name = JUNCTION_NAME if number == 1 else f"{JUNCTION_NAME}_{number}"
+        t_junctions[name] = TJunction(np.array(end_pairs), supports)
+    return origin, cells, t_junctions
+
+
+def _conormal(nodes: Array, edge: Cells, corners: Cells) -> Array:
+    """Return the unit vector (3,) in a triangle, normal to its edge and away from it."""
+    a, b = nodes[edge]
+    (apex,) = (corner for corner in corners if corner not in edge)
+    tangent = (b - a) / np.linalg.norm(b - a)
+    offset = nodes[apex] - a
+    normal_part = offset - offset @ tangent * tangent
+    return np.asarray(normal_part / np.linalg.norm(normal_part))
+
+
+def _sheet_numbers(count: int, neighbours: list[tuple[int, int]]) -> NDArray[np.int32]:
+    """Return the number of the sheet of each triangle (count,), from pairs of one sheet."""
+    first, second = np.array(neighbours, dtype=np.int64).reshape(-1, 2).T
+    graph = scipy.sparse.coo_array((np.ones(len(first)), (first, second)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _with_own_nodes(
+    total: int, cells: Cells, neighbours: list[tuple[int, int]], vertices: Cells
+) -> tuple[Cells, list[int]]:
+    """Give triangles nodes that they share with triangles of their own sheet only.
+
+    Parameters
+    ----------
+    total
+        Number of nodes.
+    neighbours
+        Pairs of triangles of one sheet.
+    vertices
+        Ends of the edges with more than two triangles.
+
+    Returns
+    -------
+    cells
+        Triangles with new nodes, whose numbers begin at `total`, in place of some of these
+        vertices and of nodes between them.
+    copied_nodes
+        The old node of each new one.
+    """
+    cells, copied_nodes = np.array(cells), list[int]()
+    is_at_junction = np.isin(cells[:, :3], vertices).any(axis=1)
+    cells_of_node = dict[int, list[int]]()
+    for cell in np.flatnonzero(is_at_junction):
+        for node in cells[cell]:
+            cells_of_node.setdefault(int(node), []).append(int(cell))
+    neighbours_of_cell = dict[int, set[int]]()
+    for first, second in neighbours:
+        neighbours_of_cell.setdefault(first, set()).add(second)
+        neighbours_of_cell.setdefault(second, set()).add(first)
+    for node, cells_at_node in cells_of_node.items():
+        if node not in vertices and node in cells[:, :3]:
+            continue
+        for number, group in enumerate(_connected_groups(cells_at_node, neighbours_of_cell)):
+            if number:  # the first group keeps the node
+                for cell in group:
+                    cells[cell][cells[cell] == node] = total + len(copied_nodes)
+                copied_nodes.append(node)
+    return cells, copied_nodes
+
+
+def _connected_groups(
+    cells: Iterable[int], neighbours: Mapping[int, set[int]]
+) -> Iterator[set[int]]:
+    """Yield the cells in groups that are connected by neighbours among them."""
+    remaining = set(cells)
+    while remaining:
+        group, queue = set[int](), [min(remaining)]
+        while queue:
+            cell = queue.pop()
+            if cell in remaining:
+                remaining.discard(cell)
+                group.add(cell)
+                queue += [other for other in neighbours.get(cell, ()) if other in remaining]
+        yield group
+
+
+def edges_with_new_nodes(
+    edges: Mapping[str, Cells], cells: Cells, origin: Cells
+) -> dict[str, Cells]:
+    """Return named curves (e, 2) whose sides on the border have its new nodes.
+
+    The parameters `cells` and `origin` are results of `separate_sheets`.
+    """
+    border = border_pairs(directed_sides(cells))
+    border_sides = dict[tuple[int, ...], list[Cells]]()
+    for side in border:
+        old_nodes = tuple(sorted(int(origin[node]) for node in side))
+        border_sides.setdefault(old_nodes, []).append(side)
+    new_edges = dict[str, Cells]()
+    for name, pairs in edges.items():
+        sides = list[Cells]()
+        for side in pairs:
+            sides += border_sides.get(tuple(sorted(map(int, side))), [side])
+        new_edges[name] = np.array(sides)
+    return new_edges

@@ -1,0 +1,223 @@
+"""A smooth function of place through values at scattered places, noise included.
+
+Each patch of the surface has a spline of its own that minimises sum (f - w)^2 + lambda |f|^2 in the
+seminorm of the kernel -r^5 (Duchon 1977). The weights of the patches add up to one (Wendland,
+*Scattered Data Approximation*, 2005, chapter 15), so that the function is twice continuously
+differentiable. Generalised cross-validation over all patches estimates the noise (Craven and Wahba
+1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
+
+Lengths are over R.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+MIN_VALUES = 80  # in a patch; at most twice as many are used
+MAX_NOISE_PATCHES = 60  # patches that estimate the noise
+# radius of a patch in a hole of the data over the distance of the nearest value: it reaches across
+HOLE_RADIUS = 2.5
+INNER_RADIUS = 0.7  # part of its radius up to which a patch covers the surface
+RADIUS_MARGIN = 1e-9  # relative: the farthest value is in the patch
+SAME_PLACE_TOLERANCE = 1e-9  # over R
+# height of a patch over its width, below which polynomials along the surface are enough
+FLATNESS_TOLERANCE = 0.1
+RANK_TOLERANCE = 1e-6  # relative size below which a polynomial depends on others
+MIN_EIGENVALUE = 1e-15  # over the largest: what rounding leaves of the kernel's eigenvalues
+SMOOTHINGS = np.logspace(-13, 3, 161)  # lambda over the largest eigenvalue of a kernel
+
+
+@dataclass(frozen=True)
+class ScatteredSpline:
+    """A smooth function made of splines on patches; see `fit_scattered`.
+
+    Attributes
+    ----------
+    centres, radii, splines
+        (p, 3), (p,) and p splines: the patches.
+    noise
+        Standard deviation of the values about the function, estimated or given.
+    residual
+        Root mean square of the function less the values.
+    """
+
+    centres: Array
+    radii: Array
+    splines: tuple["_PatchSpline", ...]
+    noise: float = 0.0
+    residual: float = 0.0
+
+    def __call__(self, x: Array) -> Array:
+        """Return values (n,) at places (n, 3); NaN where no patch reaches."""
+        total, weights = np.zeros(len(x)), np.zeros(len(x))
+        places_of_patches = scipy.spatial.cKDTree(x).query_ball_point(self.centres, self.radii)
+        for centre, radius, spline, in_patch in zip(
+            self.centres, self.radii, self.splines, places_of_patches, strict=True
+        ):
+            if in_patch:
+                weight = _wendland(np.linalg.norm(x[in_patch] - centre, axis=1) / radius)
+                total[in_patch] += weight * spline(x[in_patch])
+                weights[in_patch] += weight
+        with np.errstate(invalid="ignore"):
+            return np.asarray(total / weights)
+
+
+def fit_scattered(
+    places: Array, values: Array, cover: Array, *, noise: float | None = None
+) -> ScatteredSpline:
+    """Return a smooth function through values (n,) at places (n, 3).
+
+    Of several values at one place the first counts.
+
+    Parameters
+    ----------
+    cover
+        Places (m, 3) all over the surface: patches reach them and their neighbourhoods.
+    noise
+        Standard deviation of the values' noise; None to estimate it, 0 to interpolate.
+    """
+    tree = scipy.spatial.cKDTree(places)
+    if len(duplicates := tree.query_pairs(SAME_PLACE_TOLERANCE, output_type="ndarray")):
+        places, values = (np.delete(f, duplicates.max(axis=1), axis=0) for f in (places, values))
+        tree = scipy.spatial.cKDTree(places)
+    centres, radii = _covering_balls(tree, np.vstack([cover, places]))
+    patches = list[tuple[_PatchPlaces, Array]]()
+    for centre, numbers in zip(centres, tree.query_ball_point(centres, radii), strict=True):
+        in_patch = _thinned(numbers)
+        patch = _PatchPlaces.around_centre(places[in_patch], np.asarray(centre))
+        patches.append((patch, values[in_patch]))
+    if noise is None:
+        noise = _estimated_noise(patches[:: max(1, len(patches) // MAX_NOISE_PATCHES)])
+    splines = tuple(patch.spline(w, noise) for patch, w in patches)
+    function = ScatteredSpline(centres, radii, splines, noise)
+    residual = float(np.sqrt(np.mean((function(places) - values) ** 2)))
+    return replace(function, residual=residual)
+
+
+def _covering_balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:
+    """Return centres (p, 3) and radii (p,) of balls with enough places of the tree in each.
+
+    Their inner parts hold all places of `cover` (m, 3).
+    """
+    nearest, farthest = tree.query(cover, [1, min(MIN_VALUES, tree.n)])[0].T
+    radii = np.maximum(farthest, HOLE_RADIUS * nearest) * (1 + RADIUS_MARGIN)
+    cover_tree, is_uncovered = scipy.spatial.cKDTree(cover), np.ones(len(cover), dtype=bool)
+    centres = []
+    for i in range(len(cover)):
+        if is_uncovered[i]:
+            centres.append(i)
+            inner = cover_tree.query_ball_point(cover[i], INNER_RADIUS * radii[i])
+            is_uncovered[inner] = False
+    return np.asarray(cover[centres]), np.asarray(radii[centres])
+
+
+def _thinned(numbers: list[int]) -> NDArray[np.int64]:
+    """Return the numbers of the values of a patch; of too many around a hole a random part."""
+    if len(numbers) <= 2 * MIN_VALUES:
+        return np.array(numbers)
+    generator = np.random.default_rng(len(numbers))
+    return np.sort(generator.permutation(numbers)[: 2 * MIN_VALUES])
+
+
+@dataclass(frozen=True)
+class _PatchSpline:
+    """A sum of kernels -r^5 and of quadratic polynomials, in lengths of `scale`."""
+
+    places: Array
+    centre: Array
+    scale: float
+    axes: Array
+    kernel: Array
+    polynomial: Array
+
+    def __call__(self, x: Array) -> Array:
+        y = np.asarray((x - self.centre) / self.scale)
+        of_kernels = _kernel(y, self.places) @ self.kernel
+        return np.asarray(of_kernels + _quadratics(y, self.axes) @ self.polynomial)
+
+
+@dataclass(frozen=True)
+class _PatchPlaces:
+    """Places of a patch in lengths of `scale`, and the axes along which they extend."""
+
+    places: Array
+    centre: Array
+    scale: float
+    axes: Array
+
+    @classmethod
+    def around_centre(cls, places: Array, centre: Array) -> "_PatchPlaces":
+        """Return places (n, 3) over R, scaled to a ball of radius one around a centre (3,)."""
+        scale = float(np.linalg.norm(places - centre, axis=1).max())
+        y = np.asarray((places - centre) / scale)
+        _, sizes, axes = np.linalg.svd(y - y.mean(axis=0), full_matrices=False)
+        return cls(y, centre, scale, axes[sizes > FLATNESS_TOLERANCE * sizes[0]])
+
+    @cached_property
+    def polynomials(self) -> Array:
+        """An orthonormal basis (n, q) of the quadratic polynomials."""
+        U, sizes, _ = np.linalg.svd(_quadratics(self.places, self.axes), full_matrices=False)
+        return np.asarray(U[:, sizes > RANK_TOLERANCE * sizes[0]])
+
+    @cached_property
+    def modes(self) -> tuple[Array, Array]:
+        """Eigenvalues (n - q,) of the kernel on the complement of the polynomials, in lengths of R.
+
+        And its eigenvectors (n, n - q).
+        """
+        basis = np.linalg.qr(self.polynomials, mode="complete")[0]
+        complement = basis[:, self.polynomials.shape[1] :]
+        kernel = complement.T @ _kernel(self.places, self.places) @ complement
+        sizes, vectors = np.linalg.eigh(kernel)
+        sizes = np.maximum(sizes, MIN_EIGENVALUE * sizes[-1])
+        return sizes * self.scale**5, complement @ vectors
+
+    def spline(self, values: Array, noise: float) -> _PatchSpline:
+        """Return the spline through values (n,) with noise of a standard deviation."""
+        sizes, modes = self.modes
+        components, smoothing = modes.T @ values, 0.0
+        if noise:
+            candidates = sizes[-1] * SMOOTHINGS
+            removed = candidates[:, None] / (candidates[:, None] + sizes)
+            risk = removed**2 @ components**2 - 2 * noise**2 * removed.sum(axis=1)
+            smoothing = candidates[np.argmin(risk)]
+        kernel = modes @ (components / (sizes + smoothing)) * self.scale**5
+        of_kernels = _kernel(self.places, self.places) @ kernel
+        remainder = values - of_kernels - smoothing / self.scale**5 * kernel
+        quadratics = _quadratics(self.places, self.axes)
+        polynomial = np.asarray(np.linalg.lstsq(quadratics, remainder, rcond=RANK_TOLERANCE)[0])
+        return _PatchSpline(self.places, self.centre, self.scale, self.axes, kernel, polynomial)
+
+
+def _estimated_noise(patches: Sequence[tuple[_PatchPlaces, Array]]) -> float:
+    """Return the standard deviation of the noise by generalised cross-validation.
+
+    One lambda for all patches has the least score.
+    """
+    sizes = np.concatenate([patch.modes[0] for patch, _ in patches])
+    components = np.concatenate([patch.modes[1].T @ values for patch, values in patches])
+    candidates = sizes.max() * SMOOTHINGS
+    removed = candidates[:, None] / (candidates[:, None] + sizes)
+    squares, freedom = removed**2 @ components**2, removed.sum(axis=1)
+    best = np.argmin(squares / freedom**2)
+    return float(np.sqrt(squares[best] / freedom[best]))
+
+
+def _kernel(x: Array, y: Array) -> Array:
+    return -np.asarray(scipy.spatial.distance.cdist(x, y) ** 5)
+
+
+def _quadratics(y: Array, axes: Array) -> Array:
+    t = y @ axes.T
+    products = [t[:, i] * t[:, j] for i in range(t.shape[1]) for j in range(i + 1)]
+    return np.column_stack([np.ones(len(y)), t, *products])
+
+
+def _wendland(r: Array) -> Array:
+    """Return Wendland's weight: 1 at 0, falling to 0 at 1, twice continuously differentiable."""
+    return np.asarray(np.maximum(1 - r, 0) ** 4 * (4 * r + 1))

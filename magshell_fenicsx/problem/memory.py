@@ -1,0 +1,140 @@
+"""Memory that a run needs, estimated before anything is built; what is too large is refused.
+
+The estimates are fits of measured runs (docs/scale.md).
+"""
+
+from dataclasses import dataclass
+from math import log
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.platform.environment import available_memory
+from magshell_fenicsx.problem.mesh_sizes import degree_of
+from magshell_fenicsx.problem.problem import Problem, layer_bounds
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+
+BYTES_PER_PROCESS = 0.25e9  # before its model
+# degree -> bytes over N ln N of N unknowns, of full shells
+BYTES_PER_UNKNOWN = {2: 1.0e3, 3: 1.1e3, 4: 1.3e3, 5: 1.65e3}
+BYTES_PER_UNKNOWN_OF_SOLID = 0.7e3
+# parts that are added: for the symmetry-breaking modes of a half, and past an instability
+SYMMETRY_BREAKING_SHARE, INDEFINITE_SHARE = 0.6, 0.7
+UNKNOWNS_PER_TRIANGLE = 1.5  # over the square of the degree
+UNKNOWNS_PER_SOLID_LAYER = 36  # of three hexahedra of degree 2, for a layer of nodes
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Memory that the ranks of a run on one machine need.
+
+    Attributes
+    ----------
+    unknowns
+        Number of unknowns of the problem, of which each rank has a part.
+    min_bytes
+        Bytes on a path where the tangent stays positive definite, as measured (docs/scale.md).
+    max_bytes
+        Bytes past an instability, where factors of CHOLMOD and of MUMPS are kept.
+    """
+
+    unknowns: float
+    min_bytes: float
+    max_bytes: float
+
+    @classmethod
+    def for_unknowns(
+        cls,
+        context: Context,
+        unknowns: float,
+        *,
+        half: bool = False,
+        ranks: int = 1,
+        local_ranks: int = 1,
+    ) -> "MemoryEstimate":
+        """Estimate the memory for a number of unknowns.
+
+        Parameters
+        ----------
+        half
+            Whether a half or a sector is modelled.
+        ranks, local_ranks
+            The processes of the run, and those of them on this machine.
+        """
+        if context.solid:
+            bytes_per_unknown = BYTES_PER_UNKNOWN_OF_SOLID
+        else:
+            of_highest = BYTES_PER_UNKNOWN[max(BYTES_PER_UNKNOWN)]
+            bytes_per_unknown = BYTES_PER_UNKNOWN.get(degree_of(context), of_highest)
+        of_model = bytes_per_unknown * unknowns * log(max(unknowns, 2.0)) * local_ranks / ranks
+        min_bytes = BYTES_PER_PROCESS * local_ranks + of_model * (
+            1 + SYMMETRY_BREAKING_SHARE * half
+        )
+        return cls(unknowns, min_bytes, min_bytes + INDEFINITE_SHARE * of_model)
+
+    def words(self, free_bytes: float) -> str:
+        """Return the estimate beside the free memory (bytes) as text."""
+        return (
+            f"{self.min_bytes / 1e9:.3g} to {self.max_bytes / 1e9:.3g} GB of memory, "
+            f"and {free_bytes / 1e9:.3g} GB are free"
+        )
+
+
+def unknowns_of(context: Context, cells: float) -> float:
+    """Estimate the unknowns of a number of triangles before they are made.
+
+    Of degree k one brings 3 k^2/2. The body over it brings three hexahedra of degree 2 in each
+    layer.
+    """
+    if context.solid:
+        return cells * (UNKNOWNS_PER_SOLID_LAYER * (2 * len(layer_bounds(context)) - 1))
+    return cells * (UNKNOWNS_PER_TRIANGLE * degree_of(context) ** 2)
+
+
+def refuse_beyond_memory(problem: Problem, ranks: int = 1, local_ranks: int = 1) -> str | None:
+    """Refuse a problem that needs more memory than is free.
+
+    Parameters
+    ----------
+    ranks, local_ranks
+        The processes of the run, and those of them on this machine.
+
+    Returns
+    -------
+    warning
+        About a model that may be too large past an instability; None of others.
+
+    Raises
+    ------
+    CaseError
+        If even the least memory that it takes is not there.
+    """
+    try:
+        free_bytes = available_memory()
+    except ValueError as e:
+        raise CaseError(str(e)) from None
+    needed = MemoryEstimate.for_unknowns(
+        problem.context,
+        problem.unknowns,
+        half=problem.is_half,
+        ranks=ranks,
+        local_ranks=local_ranks,
+    )
+    if problem.axisymmetric or needed.max_bytes <= free_bytes:
+        return None
+    if needed.min_bytes <= free_bytes:
+        return (
+            f"mesh: about {needed.unknowns:.2g} unknowns take {needed.words(free_bytes)}: "
+            "past an instability that may be too little"
+        )
+    shell, degree = problem.context.shell, degree_of(problem.context)
+    how = f"lower mesh.refinement ({problem.mesh.refinement:g}) or mesh.degree ({degree})"
+    if isinstance(shell, MeshSurface):
+        how = f"take a coarser mesh file, or a lower mesh.degree ({degree})"
+    hint = ""
+    if not problem.is_half:
+        hint = "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
+    raise CaseError(
+        f"mesh: about {needed.unknowns:.2g} unknowns at radius/thickness {shell.R_over_h:g} take "
+        f"{needed.words(free_bytes)}: {how}{hint}; ranks on several machines share it; "
+        "MAGSHELL_MEMORY=GB in the environment says what to count on in place of what is free"
+    )

@@ -1,0 +1,183 @@
+"""Sections of the elements, and the element sizes that imperfections, loads and edges need.
+
+Sizes follow the length sqrt(Rh); they are over R. The docstrings of sections and of their keys are
+the text of docs/case.md.
+"""
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import TYPE_CHECKING, Annotated, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFeature
+from magshell_fenicsx.parts.course import Fit
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
+Loaded = tuple[Array, Sequence[Step]]  # place in the chart, and the loads there
+SOLID_DEGREE = 2
+MAX_SIZE = 0.35  # over R, where nothing needs smaller elements
+UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the largest of grids
+MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
+EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
+GROWTH = 0.4  # of the size per distance
+
+
+class MeshSection(Section):
+    """The elements: C0 interior penalty on triangles, graded towards dimple, load and held
+    edges."""
+
+    degree: int = Field(default=4, ge=2, le=5)
+    """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
+    refinement: float = Field(default=1.0, ge=0.1, le=20)
+    """Divides every element size; not of a mesh file"""
+    size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
+    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R
+    [the shell's length]"""
+    penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
+    """σ of the interior penalty; by default 5 k²"""
+    tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
+    """Relative error of the run's result; chooses degree and refinement, of a solid refinement
+    and layers"""
+
+    @model_validator(mode="after")
+    def _tolerance_chooses_the_mesh(self) -> Self:
+        if self.tolerance is not None and self.model_fields_set & {"degree", "refinement"}:
+            raise ValueError("tolerance chooses degree and refinement: give it or them")
+        return self
+
+    def refuse_unfit_solid(self, *, mesh_file: bool) -> None:
+        """Refuse what a solid does not have; `mesh_file`: whether its elements are a file's."""
+        for key in self.model_fields_set & {"degree", "penalty"}:
+            if key != "degree" or self.degree != SOLID_DEGREE:
+                remedy = "a file with smaller elements" if mesh_file else "mesh.refinement"
+                raise ValueError(
+                    f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; "
+                    f"{remedy} makes it finer"
+                )
+
+
+class SolidSection(Section):
+    """Hexahedra of degree 2 through the thickness, and the compressibility that stands for
+    poisson_ratio: 0.5.
+    """
+
+    layers: int = Field(default=1, ge=1, le=10)
+    """Elements through the thickness"""
+    bulk_to_shear: float = Field(default=100.0, ge=10, le=1e5)
+    """κ/μ, in place of ν = 0.5 and only there"""
+
+    def refuse_unfit(self, poisson_ratio: float) -> None:
+        """Refuse a compressibility beside a ratio that says all."""
+        if "bulk_to_shear" in self.model_fields_set and poisson_ratio != 0.5:
+            raise ValueError(
+                "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
+                f"{poisson_ratio:g}, which says all"
+            )
+
+
+def mesh_section(context: Context) -> MeshSection:
+    """Return the elements that a case requests."""
+    return context.of(MeshSection) or MeshSection()
+
+
+def degree_of(context: Context) -> int:
+    """Return the degree of the displacement."""
+    return SOLID_DEGREE if context.solid else mesh_section(context).degree
+
+
+class Refined(Protocol):
+    """A part of a case that needs small elements somewhere."""
+
+    def features(self, outline: "Outline", fit: Fit, growth: float) -> list[Feature]:
+        """Return where elements are small, with sizes that grow by `growth` per distance."""
+
+
+def grading(
+    context: Context,
+    outline: "Outline",
+    h: float,
+    refined: Sequence[Refined],
+    largest: float,
+    loaded: Sequence[Loaded],
+    varying: Sequence[Feature] = (),
+    *,
+    local: bool = False,
+) -> Grading:
+    """Return element sizes for errors of 1e-4 in k_d and 1e-3 in F at degree 4.
+
+    A size that the case gives is the same everywhere, and so is that of a mesh file.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    refined, largest
+        Parts that need small elements somewhere, and the largest size that resolves the others.
+    loaded
+        The concentrated loads.
+    varying
+        Where formulas vary.
+    local
+        Whether the shell has local imperfections.
+    """
+    mesh = mesh_section(context)
+    if mesh.size is not None or isinstance(context.shell, MeshSurface):
+        default = min(UNIFORM_SIZE * sqrt(h), MAX_SIZE)
+        size = mesh.size / context.shell.reference if mesh.size else default
+        return Grading([], size / mesh.refinement)
+    fit = Fit(h, mesh.refinement, context.solid, local)
+    growth = _growth(context, fit)
+    features = _edge_features(context, outline, fit)
+    for part in refined:
+        features += part.features(outline, fit, growth)
+    for place, loads in loaded:
+        for kind in {type(load): None for load in loads}:
+            features += kind.around([load for load in loads if type(load) is kind], place, fit)
+    features += varying
+    return Grading(features, min(_largest_size(context, outline, fit), largest) / mesh.refinement)
+
+
+def _largest_size(context: Context, outline: "Outline", sizing: Fit) -> float:
+    """Return the element size where nothing needs smaller ones."""
+    if outline.grid:
+        return min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
+    if not outline.disc or context.shell.geometry == "disc":
+        width = getattr(context.shell, "width", None) or 1.0
+        return min(MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH * width)
+    sizes = (step.load.largest(sizing) for step in context.steps)
+    return min((size for size in sizes if size is not None), default=MAX_SIZE)
+
+
+def _growth(context: Context, sizing: Fit) -> float:
+    return max((step.load.growth(sizing) for step in context.steps), default=GROWTH)
+
+
+def _edge_features(context: Context, outline: "Outline", sizing: Fit) -> list[Feature]:
+    """Return smaller elements along held edges of a grid, and along the rim of a curved disc."""
+    h, growth = sizing.h, _growth(context, sizing)
+    if grid := outline.grid:
+        boundary = context.of(BoundarySection)
+        size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
+        conditions = boundary.conditions() if boundary else {}
+        features = list[Feature]()
+        for i, name in enumerate(grid.sides):
+            axis, end = i // 2, (grid.low, grid.high)[i % 2]
+            is_held = conditions.get(name, "free") not in ("free", "symmetry")
+            if is_held and not grid.glued[axis]:
+                features.append(LineFeature(axis, end[axis], size, growth))
+        return features
+    if not outline.disc or context.shell.geometry == "disc":
+        return []
+    size = max((step.load.rim(sizing) for step in context.steps), default=EDGE_SIZE)
+    return [RingFeature(outline.edge, size * sqrt(h) / sizing.refinement, growth)]

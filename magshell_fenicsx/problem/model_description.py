@@ -1,0 +1,106 @@
+"""Description of a model in words: what is included, and what is left out."""
+
+from collections import Counter
+from math import degrees
+
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, plane_text
+from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
+from magshell_fenicsx.parts.laminate import laminate_account
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
+from magshell_fenicsx.parts.rubber import law_account, laws_of
+from magshell_fenicsx.problem.problem import SolidBody, solid_body_of
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+
+MAX_LISTED_IMPERFECTIONS = 6  # of more only the kinds are told
+
+
+def describe_model(
+    context: Context, loads: Loads, model: str, mirror: Mirror | None, rims: int
+) -> tuple[list[str], list[str]]:
+    """Return phrases for what a model includes, and for what it leaves out.
+
+    Parameters
+    ----------
+    model
+        "meridian", "half shell", ...
+    mirror
+        Symmetry plane of a half, or the sector.
+    rims
+        Number of different rims besides the pole's.
+    """
+    body = solid_body_of(context)
+    included = [model, _body_text(body) if body else _law_text(context)]
+    left_out = list[str]()
+    for part_account in accounts(context, loads):
+        included += part_account.included
+        left_out += part_account.left_out
+    if context.sections.get("imperfections"):
+        included.append(_imperfections_text(context, rims))
+    for step in {step.name: step for step in context.steps}.values():
+        if text := step.load.account(step, context):
+            included.append(text)
+    parts = parts_of(context)
+    for key, part in PARTS.items():
+        if key in parts:
+            included.append(parts[key].account(context.scales))
+        else:
+            left_out.append(part.absent)
+    if model == "meridian":
+        with_contact = ""
+        if loads.pairs:
+            with_contact = "; where shells touch, not those that come and go between two"
+        left_out.append(f"waves around the axis (they are looked for at each point{with_contact})")
+    if isinstance(mirror, Sector):
+        begin = degrees(mirror.azimuth) + 0.0
+        left_out.append(
+            f"the other {mirror.copies - 1} sectors: mirror planes through e3 at azimuths "
+            f"{begin:.5g} and {begin + degrees(mirror.angle):.5g} degrees "
+            "(modes that they exclude are counted, not located)"
+        )
+    elif mirror:
+        plane = plane_text(mirror)
+        if mirror.through_e3:
+            plane = f"through e3 at azimuth {degrees(mirror.azimuth) + 0.0:g} degrees"
+        left_out.append(
+            f"the other half: mirror plane {plane} "
+            "(modes antisymmetric to it are looked for along the path)"
+        )
+    return included, left_out
+
+
+def _imperfections_text(context: Context, rims: int) -> str:
+    """Return a phrase about each of a few imperfections; of many about how many of each kind."""
+    sections = context.sections["imperfections"].values()
+    words = [section.account() for section in sections]
+    if len(words) > MAX_LISTED_IMPERFECTIONS:
+        kinds = Counter(section.kind for section in sections)
+        words = [f"{count} of kind {kind}" for kind, count in kinds.items()]
+    warning = ""
+    is_mesh_file = isinstance(context.shell, MeshSurface)
+    if any(section.patch for section in sections) and (is_mesh_file or rims > MOST_RIMS):
+        reason = "of a mesh file" if is_mesh_file else f"of more than {MOST_RIMS}"
+        warning = f"; elements lie across the rims of dimples, {reason}: k_d is then less exact"
+    return f"imperfections: {', '.join(words)}{warning}"
+
+
+def _law_text(context: Context) -> str:
+    """Return a phrase about the laws of a shell."""
+    laminate, laws = context.shell.laminate, laws_of(context)
+    if {*laws} - {context.shell.law}:
+        return f"membrane and bending energy, each of its own law: {', '.join(laws)}"
+    if laminate:
+        return laminate_account(laminate, context.shell)
+    return law_account(context.shell.rubber)
+
+
+def _body_text(body: SolidBody) -> str:
+    """Return a phrase about the law and the elements of a solid."""
+    material, count = body.material, len(body.layer_bounds) - 1
+    ratio = material.bulk / material.shear
+    small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
+    law, share = "neo-Hookean energy", material.share
+    if share:
+        law = f"Mooney-Rivlin energy, C01/C10 = {share / (1 - share):.5g}"
+    return f"{law}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"

@@ -1,0 +1,241 @@
+"""The meridian of a surface of revolution, and whether formulas are axisymmetric about e3.
+
+`MeridianChart` is the chart of one meridian, or of those of several shells with one axis. The other
+functions compare a formula of x, y, z, or a field, along many meridians. Lengths are over R.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import Embedding
+
+Array = NDArray[np.float64]
+# azimuths (rad) by the golden angle: nothing periodic meets them all, nor anything wider than 0.01
+ANGLES = [2.399963 * i for i in range(720)]
+SMOOTH_ANGLES, SMOOTH_STRIDE = 12, 20  # azimuths, and places passed over, for a smooth field
+SAMPLES = 401  # places along a meridian
+MAX_OFFSET = 0.1  # over R, of the places beside the surface that it may move to
+OFFSET_SEED = 2026
+RELATIVE_TOLERANCE = 1e-9  # over the largest value: differences that are rounding
+
+
+@dataclass(frozen=True)
+class ShellMeridian:
+    """The meridian of one of several shells, a part of a `MeridianChart`.
+
+    Attributes
+    ----------
+    name
+        Name of the shell.
+    ends
+        First and last value of the parameter.
+    place
+        Place (3,) in space -> parameter of the nearest place of the meridian, and azimuth (rad).
+    vertices
+        Pairs of the size of a contact, and the distance from the pole up to which it is possible
+        -> vertices (n,) of the mesh of the meridian.
+    """
+
+    name: str
+    ends: tuple[float, float]
+    place: Callable[[Array], tuple[float, float]]
+    vertices: Callable[[Sequence[tuple[float, float]]], Array]
+
+    @property
+    def length(self) -> float:
+        """Length of the interval of the parameter."""
+        return self.ends[1] - self.ends[0]
+
+
+@dataclass(frozen=True)
+class MeridianChart:
+    """A meridian from the pole or one edge to the other; or those of several shells with one axis.
+
+    Attributes
+    ----------
+    length
+        Length of its chart, which starts at 0.
+    curvature_jumps
+        Parameters at which the curvature jumps.
+    names
+        Names of its ends; None for a pole, and where shells are joined.
+    embedding, normal
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the
+        perfect surface there.
+    locate
+        Chart (2,) of the surface -> parameter of this meridian and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1; of several that which has the most waves
+        around e3.
+    largest
+        Cell size that resolves the imperfections.
+    vertices
+        (n,) vertices of its mesh, if that is given.
+    narrow_places
+        Places (n, 3) of the surface at which formulas are narrow.
+    shell_meridians
+        Those of several shells; none of one.
+    joints
+        For each joint of shells both parameters: two edges that meet have the same one.
+    """
+
+    length: float
+    curvature_jumps: tuple[float, ...]
+    names: tuple[str | None, ...]
+    embedding: Embedding
+    normal: Embedding
+    locate: Callable[[Array], tuple[float, float]]
+    curvature: float = 1.0
+    largest: float = inf
+    vertices: Array | None = None
+    narrow_places: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    shell_meridians: tuple[ShellMeridian, ...] = ()
+    joints: tuple[tuple[float, float], ...] = ()
+
+    def sample(self) -> Array:
+        """Return places (n, 3) along the meridian, its ends among them."""
+        return self._places_at(
+            [np.linspace(first, last, SAMPLES, dtype=np.float64) for first, last in self._intervals]
+        )
+
+    def interior_sample(self) -> Array:
+        """Return places (n, 3) without the ends: a formula may divide by zero on the axis."""
+        return self._places_at(
+            [
+                np.linspace(first, last, SAMPLES, dtype=np.float64)[1:-1]
+                for first, last in self._intervals
+            ]
+        )
+
+    def locate_named(self, name: str, x: Array) -> tuple[float, float]:
+        """Return parameter and azimuth (rad) of a named place; its name begins with its shell's."""
+        meridians = (m for m in self.shell_meridians if name.startswith(f"{m.name}_"))
+        meridian = next(meridians, None)
+        return meridian.place(x) if meridian else self.locate(x)
+
+    @property
+    def knots(self) -> Array:
+        """Parameters (n,) at which cells end: ends and jumps of the curvature."""
+        return np.array(sorted({*np.ravel(self._intervals), *self.curvature_jumps}))
+
+    def ends(self) -> dict[str, Array]:
+        """Return the place (rho, z) of each named end."""
+        places = self._places_at([np.array(ends) for ends in self._intervals])[:, [0, 2]]
+        return {
+            name: np.asarray(place) for name, place in zip(self.names, places, strict=True) if name
+        }
+
+    @property
+    def _intervals(self) -> list[tuple[float, float]]:
+        """First and last parameter of each shell."""
+        return [meridian.ends for meridian in self.shell_meridians] or [(0.0, self.length)]
+
+    def _places_at(self, parameters: Sequence[Array]) -> Array:
+        s = np.concatenate(parameters)
+        return self.embedding(np.column_stack([s, 0 * s]))
+
+
+def scalar_is_axisymmetric(text: str, meridian: MeridianChart, length: float = 1.0) -> bool:
+    """Return whether a formula has the same value all around e3.
+
+    Parameters
+    ----------
+    length
+        R in the unit of length of the formula.
+    """
+    f, places = formula(text), length * meridian.interior_sample()
+    narrow_places = length * meridian.narrow_places
+    at_azimuth_zero = length * _at_azimuth_zero(meridian.narrow_places)[0]
+    of_angles = [f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]
+    return _all_equal(of_angles) and _all_equal(
+        [f(*narrow_places.T)[:, None], f(*at_azimuth_zero.T)[:, None]]
+    )
+
+
+def vector_is_axisymmetric(
+    components: Sequence[str],
+    meridian: MeridianChart,
+    length: float = 1.0,
+    *,
+    in_space: bool = False,
+) -> bool:
+    """Return whether a vector turns with the meridian and has no component across it.
+
+    Parameters
+    ----------
+    components
+        Formulas of the components.
+    length
+        R in the unit of length of the formulas.
+    in_space
+        Whether it is so beside the surface too, where this may move to.
+    """
+    vectors, places = vector_function(components), meridian.interior_sample()
+    if in_space:
+        places = with_nearby_places(places) * [1.0, 0.0, 1.0]
+    at_azimuth_zero, Q = _at_azimuth_zero(meridian.narrow_places)
+    rotated = np.einsum("nij,nj->ni", Q, vectors(length * meridian.narrow_places))
+    return _turns_with_meridian(lambda x: vectors(length * x), places) and _all_equal(
+        [vectors(length * at_azimuth_zero), rotated]
+    )
+
+
+def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
+    """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3)."""
+    rho, ones, zeros = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
+    c, s = np.where(rho > 0, x[:, :2].T / np.where(rho > 0, rho, 1.0), [[1.0], [0.0]])
+    Q = np.array([[c, s, zeros], [-s, c, zeros], [zeros, zeros, ones]])
+    return np.column_stack([rho, zeros, x[:, 2]]), np.moveaxis(Q, 2, 0)
+
+
+def field_is_axisymmetric(
+    field: Callable[[Array], Array], meridian: MeridianChart, *, smooth: bool = True
+) -> bool:
+    """Return whether a field turns with the meridian and has no component across it.
+
+    Parameters
+    ----------
+    field
+        Places (n, 3) -> vectors (n, 3).
+    smooth
+        Whether few places show it, as of the field of sources.
+    """
+    places = meridian.interior_sample()
+    if smooth:
+        return _turns_with_meridian(field, places[::SMOOTH_STRIDE], ANGLES[:SMOOTH_ANGLES])
+    return _turns_with_meridian(field, places)
+
+
+def _turns_with_meridian(
+    field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES
+) -> bool:
+    """Return whether a field at places (n, 3) of the plane y = 0 turns with them, without e2."""
+    in_plane = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
+    return _all_equal([*in_plane, in_plane[0] * [1.0, 0.0, 1.0]])
+
+
+def vector_function(components: Sequence[str]) -> Callable[[Array], Array]:
+    """Return the function of places (n, 3) to vectors (n, 3) with these formulas as components."""
+    fs = [formula(text) for text in components]
+    return lambda x: np.stack([f(*x.T) for f in fs], axis=-1)
+
+
+def with_nearby_places(x: Array) -> Array:
+    """Return places (n, 3) and others near them, (2 n, 3)."""
+    offsets = np.random.default_rng(OFFSET_SEED).uniform(-1, 1, x.shape)
+    return np.vstack([x, x + MAX_OFFSET * offsets])
+
+
+def _all_equal(values: Sequence[Array]) -> bool:
+    """Return whether arrays are equal to the first one, to rounding."""
+    first = values[0]
+    if not first.size:
+        return True
+    tolerance = RELATIVE_TOLERANCE * np.abs(first).max()
+    return all(bool((np.abs(v - first) <= tolerance).all()) for v in values)

@@ -1,0 +1,272 @@
+"""Symmetry that the parts of a case preserve; the smallest model has what all preserve.
+
+Each part states a `SymmetryConstraint`. `common_mirror` and `common_sector` find planes that all
+parts allow, and `why_not_axisymmetric` says what forbids the model of a meridian (docs/design.md).
+Lengths are over R.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import atan2, cos, hypot, pi, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, Sector
+from magshell_fenicsx.mesh.patch import UserField
+from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
+
+if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
+    from magshell_fenicsx.shape.outline import Outline
+    from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
+
+Array = NDArray[np.float64]
+Vectors = Sequence[Array]
+PARALLEL = 1e-12  # component across e3, or along a normal, that is rounding
+COMMON_PLANE_TOLERANCE = 1e-10  # sine between vectors that one plane through e3 contains
+
+
+def any_plane(mirror: Mirror) -> bool:
+    """Allow all planes: the `mirrors` of a part without a constraint."""
+    return True
+
+
+def no_plane(mirror: Mirror) -> bool:
+    """Allow no plane."""
+    return False
+
+
+@dataclass(frozen=True)
+class SymmetryConstraint:
+    """The symmetry that one part of a case preserves.
+
+    Attributes
+    ----------
+    not_axisymmetric
+        Why the case is not axisymmetric about e3 with this part; None if it is.
+    vectors
+        Vectors and places (3,) that a mirror plane through e3 must contain, so that they choose
+        one.
+    mirrors
+        Whether a plane is one of the part's symmetry.
+    energy
+        Name of the energy that states the constraint, if one does.
+    azimuths
+        Azimuths (rad) of further planes through e3 that may be preserved.
+    """
+
+    not_axisymmetric: str | None = None
+    vectors: Vectors = ()
+    mirrors: Callable[[Mirror], bool] = any_plane
+    energy: str = ""
+    azimuths: tuple[float, ...] = ()
+
+
+def common_azimuth(vectors: Vectors) -> float | None:
+    """Return the azimuth (rad) of the plane through e3 that contains all vectors.
+
+    0 if every vector is along e3, None if there is no such plane.
+    """
+    tilted_vectors = [v[:2] for v in vectors if hypot(*v[:2]) > PARALLEL]
+    if not tilted_vectors:
+        return 0.0
+    x, y = tilted_vectors[0]
+    for v in tilted_vectors:
+        if abs(x * v[1] - y * v[0]) > COMMON_PLANE_TOLERANCE * hypot(x, y) * hypot(*v):
+            return None
+    return atan2(y, x)
+
+
+def common_mirror(
+    parts: Sequence[SymmetryConstraint], outline: "Outline", *, loosely: bool = False
+) -> Mirror | None:
+    """Return a plane that all parts allow, through e3 if there is one; None if there is none.
+
+    Parameters
+    ----------
+    loosely
+        Of a mesh file, see `mesh_mirrors`.
+    """
+    if any(part.mirrors is no_plane for part in parts):
+        return None
+    vectors = [v for part in parts for v in part.vectors]
+    units = [unit(v) for v in vectors]
+
+    def first_allowed(planes: Sequence[Mirror]) -> Mirror | None:
+        allowed = (plane for plane in planes if all(part.mirrors(plane) for part in parts))
+        return next(allowed, None)
+
+    planes_through_axis = _planes_through_axis(parts, vectors) if outline.round else []
+    mirror = first_allowed(planes_through_axis) or first_allowed(outline.mirrors(units, False))
+    if mirror is None and loosely:
+        return first_allowed(outline.mirrors(units, True))
+    return mirror
+
+
+def _planes_through_axis(parts: Sequence[SymmetryConstraint], vectors: Vectors) -> list[Mirror]:
+    """Return the planes through e3 that contain all vectors, and further ones of the parts."""
+    planes = list[Mirror]()
+    azimuth = common_azimuth(vectors)
+    if azimuth is not None:
+        turns = (0.0, pi) if any(tilted(v) for v in vectors) else (0.0, pi, pi / 2, -pi / 2)
+        planes += [Mirror.through_axis(azimuth + turn) for turn in turns]
+    azimuths_of_parts = [a for part in parts for a in part.azimuths]
+    for a in azimuths_of_parts:
+        for turn in (0.0, pi):
+            plane = Mirror.through_axis(a + turn)
+            if all(abs(plane.normal @ unit(v)) <= PARALLEL for v in vectors):
+                planes.append(plane)
+    return planes
+
+
+def common_sector(
+    parts: Sequence[SymmetryConstraint], outline: "Outline", waves: int, places: Vectors = ()
+) -> Sector | None:
+    """Return a sector of 180/m degrees between two planes that all parts allow, or None.
+
+    Parameters
+    ----------
+    waves
+        m.
+    places
+        Named places (3,), which may choose where it begins.
+    """
+    vectors = [v for part in parts for v in part.vectors]
+    azimuth = common_azimuth(vectors)
+    if azimuth is None:
+        return None
+    if outline.round:
+        azimuths = [azimuth, *(a for part in parts for a in part.azimuths)]
+        azimuths += [atan2(x[1], x[0]) for x in places if tilted(x)]
+        begins = [a + turn for a in azimuths for turn in (0.0, -pi / waves, pi)]
+    else:
+        units = [unit(v) for v in (*vectors, *places)]
+        begins = [plane.azimuth for plane in _outline_planes_through_axis(outline, units)]
+    for begin in begins:
+        sector = Sector.from_azimuth(begin, waves)
+        planes = sector.planes.values()
+        is_allowed = all(part.mirrors(plane) for part in parts for plane in planes)
+        if is_allowed and (outline.round or _ends_at_symmetry_plane(outline, sector)):
+            return sector
+    return None
+
+
+def _outline_planes_through_axis(outline: "Outline", vectors: Vectors) -> list[Mirror]:
+    """Return the planes through e3 of an outline that is not round, which keep each edge."""
+    planes = outline.mirrors(vectors, False)
+    return [plane for plane in planes if plane.through_e3 and not plane.removed_edges]
+
+
+def _ends_at_symmetry_plane(outline: "Outline", sector: Sector) -> bool:
+    """Return whether the second plane of a sector is a symmetry plane of an outline too."""
+    end = sector.azimuth + sector.angle
+    planes = _outline_planes_through_axis(outline, [np.array([cos(end), sin(end), 0.0])])
+    return any(sector.second_plane.is_plane_of(plane) for plane in planes)
+
+
+def why_not_axisymmetric(parts: Sequence[SymmetryConstraint]) -> str | None:
+    """Return why the model of a meridian turned about e3 is not enough; None if it is."""
+    return next((part.not_axisymmetric for part in parts if part.not_axisymmetric), None)
+
+
+def energy_without_mirror(parts: Sequence[SymmetryConstraint], outline: "Outline") -> str | None:
+    """Return the name of an energy that alone keeps a case from being a half; None without one."""
+    plane = common_mirror([part for part in parts if not part.energy], outline, loosely=True)
+    if plane is None:
+        return None
+    energies = (part.energy for part in parts if part.energy and not part.mirrors(plane))
+    return next(energies, None)
+
+
+def tilted(v: Array) -> bool:
+    """Return whether a vector or a place (3,) is not along e3."""
+    return bool(hypot(*v[:2]) > PARALLEL)
+
+
+def unit(v: Array) -> Array:
+    """Return a vector (3,) over its length.
+
+    Zero stays zero, and a vector as short as 1e-200 has a direction.
+    """
+    largest = np.abs(v).max()
+    if not largest:
+        return v
+    scaled = v / largest
+    return np.asarray(scaled / np.linalg.norm(scaled))
+
+
+def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> SymmetryConstraint:
+    """Return the symmetry that the mid-surface and its thickness preserve."""
+    factor, geometry = shell.thickness_factor, shell.geometry
+
+    def mirrors(mirror: Mirror) -> bool:
+        if not isinstance(factor, str):
+            return not isinstance(factor, UserField)  # patches are mapped onto themselves
+        return mirrors_formula(factor, mirror, outline.sample())
+
+    reason, meridian = outline.why_no_meridian, outline.meridian
+    if reason is None and not (outline.round or meridian):
+        reason = f"not with a {geometry} that is not closed around e3"
+    elif reason is None and not meridian:
+        reason = "the section of the tube is closed: it has no edge to hold it by"
+    elif isinstance(factor, str) and meridian and not scalar_is_axisymmetric(factor, meridian):
+        reason = "the thickness differs around e3"
+    return SymmetryConstraint(reason, mirrors=mirrors)
+
+
+def patch_constraint(
+    key: str, names: Iterable[str], shell: "ShellSection | Surface"
+) -> SymmetryConstraint:
+    """Return the constraint of named patches: on a meridian no patch but a whole shell is known.
+
+    So is the message about a patch that is not there.
+    """
+    assembly = getattr(shell, "assembly", None)
+    patch = None
+    if assembly:
+        patch = next((name for name in sorted(names) if name not in assembly.laws), None)
+    return SymmetryConstraint(f"{key}: {patch}: is no whole shell" if patch else None)
+
+
+def points_constraint(
+    points: Iterable[Sequence[float]], R: float, outline: "Outline"
+) -> SymmetryConstraint:
+    """Return the constraint that named points lie on the half that is modelled.
+
+    So does the point that is reported where none is named.
+    """
+    named_places = [np.array(x) / R for x in points]
+    places = named_places
+    if not named_places and outline.highest is not None:
+        places = [outline.embedding(outline.highest[None])[0]]
+
+    def mirrors(mirror: Mirror) -> bool:
+        # the chart of a round surface begins at the plane, and the reported point with it
+        if outline.round and mirror.through_e3 and not named_places:
+            return True
+        return all(float(mirror.signed_distance(x)) > -ROUNDING for x in places)
+
+    return SymmetryConstraint(mirrors=mirrors)
+
+
+def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) -> bool:
+    """Return whether a formula is the same at places and at their images.
+
+    Parameters
+    ----------
+    x
+        (n, 3) places over R.
+    length
+        R in the unit of length of the formula.
+    """
+    f = formula(text)
+    return equal_to_rounding(f(*(length * x).T), f(*(length * mirror.image(x)).T))
+
+
+def equal_to_rounding(a: Array, b: Array) -> bool:
+    """Return whether arrays are equal to rounding of the largest value, and finite."""
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return False
+    return bool((np.abs(a - b) <= ROUNDING * np.abs(a).max(initial=0.0)).all())
