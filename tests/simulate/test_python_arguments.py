@@ -48,11 +48,11 @@ def test_what_makes_a_problem(tmp_path: Path) -> None:
     assert ms.Scene(problem).problem is problem
     data = {**case.origin.data, "mesh": {"degree": 3}}
     assert ms.Scene(data).problem.mesh.degree == 3
-    assert problem.again({"mesh.degree": 3}).document.data["mesh"]["degree"] == 3
+    assert problem.with_values({"mesh.degree": 3}).document.data["mesh"]["degree"] == 3
     with pytest.raises(ms.CaseError, match="terms: a problem has its energies already"):
         ms.Scene(problem, terms=[ms.OwnTerm("springs", lambda r0, u: u.r[2])])
     with pytest.raises(ms.CaseError, match=r"mesh\.degree: needs the problem with another value"):
-        replace(problem, remade=None).again({"mesh.degree": 3})
+        replace(problem, remade=None).with_values({"mesh.degree": 3})
     with pytest.raises(ms.CaseError, match="give the problem a 'document'"):
         ms.run(replace(problem, document=Document()), tmp_path)
 

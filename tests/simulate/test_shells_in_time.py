@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.nonlocal_terms import times
+from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped

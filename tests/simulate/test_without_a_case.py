@@ -215,7 +215,7 @@ def test_own_energies_with_functions(dome: Dome) -> None:
 def test_the_displacement_as_a_function(dome: Dome) -> None:
     """On the user's mesh, in its lengths: at the pole, and at the rim."""
     scene = ms.Scene(ms.Problem(shell(dome), ms.Clamped("rim"), PRESSED), MPI.COMM_SELF)
-    assert not scene.problem.half
+    assert not scene.problem.is_half
     *_, record = ms.follow(scene)
     u = record.u
     assert u.function_space.mesh is dome[0]

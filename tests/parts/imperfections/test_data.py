@@ -11,7 +11,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.data import _on_quadrics, feet
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
-from magshell_fenicsx.shape.outline import Outline, ground_of, outline
+from magshell_fenicsx.shape.outline import Outline, outline, reference_shell_of
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(16)
@@ -39,7 +39,7 @@ def made(shell: dict[str, Any], folder: Path = Path(), **item: Any) -> Case:
 
 
 def read(case: Case) -> Flaw:
-    return case.shell.imperfections[0].flaw(ground_of(case.shell), "shell.imperfections.0")
+    return case.shell.imperfections[0].flaw(reference_shell_of(case.shell), "shell.imperfections.0")
 
 
 def places(drawn: Outline, count: int) -> tuple[Array, Array]:

@@ -13,13 +13,13 @@ from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.patch import Deviated, check_orientation
+from magshell_fenicsx.mesh.patch import DeviatedEmbedding, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.ground import Angle
-from magshell_fenicsx.shape.outline import ground_of, outline
+from magshell_fenicsx.shape.outline import outline, reference_shell_of
+from magshell_fenicsx.shape.reference_shell import AngularDistance
 
 Array = NDArray[np.float64]
 H = 1 / 90
@@ -77,7 +77,7 @@ def beside_rim(
     problem: Problem, centre: np.ndarray, *, angle: bool, near: float = 1e-5
 ) -> tuple[int, int]:
     """The number of cells with nodes of their sides on both sides of a rim, and of nodes inside."""
-    assert isinstance(problem.embedding, Deviated)
+    assert isinstance(problem.embedding, DeviatedEmbedding)
     patch = problem.triangulated()
     check_orientation(patch)
     x = problem.embedding.perfect(patch.nodes)
@@ -113,7 +113,7 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
     place, spherical = np.array(centre), case.shell.geometry in ("hemisphere", "cap")
     if case.symmetry == "auto" and name not in ("plate", "torus", "strip", "disc"):
         problem = make_problem(case)
-        assert problem.half
+        assert problem.is_half
         place = np.array(
             [np.hypot(*place[:2]), 0.0, place[2]]
         )  # the frame is turned into the plane
@@ -131,7 +131,7 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
 def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None:
     """Where they touch, the mesh has them a little wider."""
     problem = make_problem(shaped("hemisphere", dimple(), towards(polar)))
-    assert problem.half
+    assert problem.is_half
     for angle in (0.0, np.radians(polar)):
         assert (
             beside_rim(problem, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[
@@ -157,7 +157,7 @@ def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None
 )
 def test_symmetry_that_is_left(imperfections: list[dict[str, Any]], model: str) -> None:
     problem = make_problem(shaped("hemisphere", *imperfections))
-    assert model == ("meridian" if problem.axisymmetric else "half" if problem.half else "full")
+    assert model == ("meridian" if problem.axisymmetric else "half" if problem.is_half else "full")
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "dimple"])
@@ -165,7 +165,7 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
     """Pairs across a plane, a depth in two parts, depths that cancel, a width or a depth that
     differs a little.
     """
-    ground = ground_of(shaped("hemisphere").shell)
+    ground = reference_shell_of(shaped("hemisphere").shell)
     drawn = ground.perfect
 
     def answers(*places: tuple[float, float, float, float], formula: bool = False) -> list[bool]:
@@ -182,7 +182,7 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
         (left,) = leaves(
             flaws(shaped("hemisphere", *every).imperfections, ground), drawn, each=False
         )
-        return [left.mirrors(Mirror.upright(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
+        return [left.mirrors(Mirror.through_axis(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
     one, image = (40.0, 10.0, 0.1, 2.0), (40.0, 50.0, 0.1, 2.0)
     half, other = (*image[:2], 0.05, 2.0), (60.0, 0.0, 0.1, 2.0)
@@ -202,7 +202,7 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
         )  # a formula has no numbers: all are compared at places
 
 
-class Unasked(Angle):
+class Unasked(AngularDistance):
     """An angle that is not to be computed."""
 
     def __call__(self, places: Array) -> Array:
@@ -222,16 +222,16 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
         *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats),
     )
     drawn, found = outline(case.shell), dict[str, Flaw]()
-    for key, flaw in flaws(case.imperfections, ground_of(case.shell)).items():
+    for key, flaw in flaws(case.imperfections, reference_shell_of(case.shell)).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
-        assert isinstance(deviation.distance, Angle)
+        assert isinstance(deviation.distance, AngularDistance)
         found[key] = replace(
             flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis))
         )
     (left,) = leaves(found, drawn, each=False)
     assert len(left.azimuths) == 400
-    assert not any(left.mirrors(Mirror.upright(a)) for a in left.azimuths)
+    assert not any(left.mirrors(Mirror.through_axis(a)) for a in left.azimuths)
 
 
 def test_deviations_add_up_along_the_normal() -> None:
@@ -330,7 +330,7 @@ def test_patches_within_each_rim() -> None:
     }
     magnetic = {"lambda_m": 1e-3, "remanent": remanent}
     problem = make_problem(shaped("hemisphere", towards(60.0), towards(20.0), magnetic=magnetic))
-    assert problem.half
+    assert problem.is_half
     assert problem.loads.magnetic
     angle = np.radians([60.0, 20.0, 40.0])
     places = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])[:, None]
