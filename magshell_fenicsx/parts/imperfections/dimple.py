@@ -12,12 +12,13 @@ from magshell_fenicsx.shape.reference_shell import AngularDistance, Distance
 
 Array = NDArray[np.float64]
 AT_POLE = AngularDistance(np.array([0.0, 0.0, 1.0]))
-WIDEST, OF_EDGE = 0.9 * pi, 0.9  # half-width (rad), and over the polar angle of a sphere's edge
+MAX_HALF_WIDTH = 0.9 * pi  # of a dimple, rad
+MAX_HALF_WIDTH_OVER_EDGE = 0.9  # half-width over the polar angle of a sphere's edge
 
 
 @dataclass(frozen=True)
 class Dimple(Local):
-    """Its deviation."""
+    """Radial profile (1 - (phi/phi_o)^2)^2 of the dimple, zero outside its half-width phi_o."""
 
     steepest: ClassVar[float] = 8 / sqrt(27)  # at phi_o/sqrt(3)
     rim: ClassVar[bool] = True
@@ -25,6 +26,7 @@ class Dimple(Local):
 
     @staticmethod
     def profile(squared: Array) -> Array:
+        """Return (1 - s)^2 of the squared relative distances s = (phi/phi_o)^2, 0 where s >= 1."""
         return np.where(squared < 1, (1 - squared) ** 2, 0.0)
 
 
@@ -43,16 +45,18 @@ class DimpleSection(LocalSection):
         return f"dimple of {self.amplitude:g} h {self.at.words()}"
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
+        """Raise ValueError where the half-width exceeds its limits (`MAX_HALF_WIDTH...`)."""
         phi_o = self.half_width(R_over_h, nu)
-        if phi_o >= WIDEST:
-            raise ValueError(_too_wide(phi_o, WIDEST))
+        if phi_o >= MAX_HALF_WIDTH:
+            raise ValueError(_too_wide(phi_o, MAX_HALF_WIDTH))
         super().refuse_unfit(R_over_h, nu, edge)
-        if edge is not None and phi_o >= OF_EDGE * edge:
-            raise ValueError(_too_wide(phi_o, OF_EDGE * edge))
+        if edge is not None and phi_o >= MAX_HALF_WIDTH_OVER_EDGE * edge:
+            raise ValueError(_too_wide(phi_o, MAX_HALF_WIDTH_OVER_EDGE * edge))
 
 
-def _too_wide(phi_o: float, most: float) -> str:
+def _too_wide(phi_o: float, max_phi_o: float) -> str:
+    """Return the message that the half-width `phi_o` reaches its limit, both in rad."""
     return (
         f"the dimple's half-width phi_o is {phi_o * 180 / pi:.1f} degrees at this R/h "
-        f"and poisson_ratio; it must stay below {most * 180 / pi:.3g}"
+        f"and poisson_ratio; it must stay below {max_phi_o * 180 / pi:.3g}"
     )

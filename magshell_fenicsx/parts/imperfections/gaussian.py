@@ -12,14 +12,16 @@ Array = NDArray[np.float64]
 
 
 class Gaussian(Local):
-    """Its deviation."""
+    """Radial profile exp(-(phi/phi_g)^2) of a Gaussian dimple."""
 
     steepest: ClassVar[float] = sqrt(2) * exp(-0.5)
-    reach: ClassVar[float] = 2.0  # where 2 % of the depth is left
+    # in half-widths phi_g: 2 % of the depth is left there
+    reach: ClassVar[float] = 2.0
     shown: ClassVar[float] = 0.4
 
     @staticmethod
     def profile(squared: Array) -> Array:
+        """Return exp(-s) of the squared relative distances s = (phi/phi_g)^2, same shape."""
         return np.asarray(np.exp(-squared))
 
 

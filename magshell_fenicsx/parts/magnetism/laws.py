@@ -18,36 +18,36 @@ from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Remanenc
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """-Ba . (R - R0) Br."""
+    """Return the full energy density -Ba . (R - R0) Br of a remanence that only rotates."""
     r, n0, up = r0 + u, kin.normal(r0), kin.dual_basis(r0)
     n, area0 = kin.normal(r), kin.area_ratio(r0)
     J = kin.area_ratio(r) / area0
     trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))
-    moved = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
-    across = (
+    in_surface = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
+    cofactor_part = (
         ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)
     ) / area0
-    along = ufl.dot(n0, Br)
-    return -ufl.dot(Ba, (moved + across) / ufl.sqrt(trace + 2 * J) - Br + along * n)
+    normal_Br = ufl.dot(n0, Br)
+    return -ufl.dot(Ba, (in_surface + cofactor_part) / ufl.sqrt(trace + 2 * J) - Br + normal_Br * n)
 
 
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """U1, linear in u: the surface turns in itself."""
+    """Return the term U1, linear in u; the surface turns in itself."""
     return (densities.magnetic_first(r0, u, Br, Ba) - densities.magnetic_first(r0, u, Ba, Br)) / 2
 
 
 def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Uq, quadratic in the rotations q_i = n0 . u,_i of the normal and w of the surface in itself."""
+    """Return Uq, quadratic in the rotations q_i = n0 . u,_i of the normal and w in the surface."""
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
     w = ufl.dot(n0, ufl.cross(up1, u.r1) + ufl.cross(up2, u.r2)) / 2
     in_surface = ufl.dot(Ba, Br) - ufl.dot(n0, Ba) * ufl.dot(n0, Br)
-    turned = ufl.dot(q, Ba) * ufl.dot(q, Br) + w**2 * in_surface
-    return densities.magnetic_torque(r0, u, Br, Ba) + turned / 2
+    rotation_products = ufl.dot(q, Ba) * ufl.dot(q, Br) + w**2 * in_surface
+    return densities.magnetic_torque(r0, u, Br, Ba) + rotation_products / 2
 
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Utau: rotations times strains or, of the normal's part, times the surface gradient of u."""
+    """Return Utau: rotations times strains or, of the normal part, times surface gradients of u."""
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
     in_surface = Br - ufl.dot(n0, Br) * n0
@@ -86,14 +86,19 @@ _TERMS: dict[MagneticEnergy, tuple[str, ...]] = {
 
 
 def full_density(law: RemanenceLaw, *, thins: bool) -> MagneticDensity:
-    """The full energy's, of a shell whose thickness changes with its area or does not."""
-    return densities.magnetic_thinned if thins and law == "deformation" else _FULL[law]
+    """Return the density of the full energy.
+
+    `thins` says whether the thickness of the shell changes with its area.
+    """
+    if thins and law == "deformation":
+        return densities.magnetic_thinned
+    return _FULL[law]
 
 
 def magnetic_densities(
     law: RemanenceLaw, energy: MagneticEnergy, *, thins: bool
 ) -> dict[str, MagneticDensity]:
-    """Name of the term -> its density, linear in the applied field."""
+    """Return the density of each term by its name, linear in the applied field."""
     if energy == "full":
         return {"magnetic": full_density(law, thins=thins)}
     return {name: _EXPANDED[law][name] for name in _TERMS[energy]}
