@@ -208,7 +208,7 @@ class Members:
             places[part.name], apart[part.name] = place(sample), APART * sqrt(h) * scale
             thickness[part.name] = 2 * varies(sample) if varies else h * scale
             if ground.perfect.chart_samples() is not None:
-                near[part.name] = Charted(ground.perfect, place, place.own, varies)
+                near[part.name] = Charted(ground.perfect, place, place.to_shell_frame, varies)
         found = meetings(several.pairs, places, thickness, apart, near)
         return {
             part.name: [several.place(part).to_shell_frame(x) for x in found[part.name]]

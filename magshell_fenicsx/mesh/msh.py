@@ -23,7 +23,7 @@ from magshell_fenicsx.mesh.non_manifold import edges_with_new_nodes, separate_sh
 from magshell_fenicsx.mesh.patch import (
     MeshError,
     PatchMesh,
-    Triangles,
+    SurfaceTriangles,
     as_set,
     border_pairs,
     directed_sides,
@@ -209,14 +209,14 @@ class MeshFile:
     scale: float
     normals: bool = False
     files: Files = field(default_factory=Files, compare=False)
-    in_memory: Triangles | MultiShellMesh | None = None
+    in_memory: SurfaceTriangles | MultiShellMesh | None = None
 
     @property
     def user_mesh(self) -> "UserMesh | None":
         """The mesh of a program; None for a file."""
         return self.in_memory.user_mesh if self.in_memory else None
 
-    def content(self) -> Triangles:
+    def content(self) -> SurfaceTriangles:
         """Return the triangles of the file or of the program.
 
         Raises
@@ -391,7 +391,7 @@ def _named_vertices(
     return vertices
 
 
-def _triangles_of_file(file: MeshFile) -> Triangles:
+def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
     """Return the triangles of a file, with curves and patches by its physical groups."""
     try:
         content = parsed(file.files.content(file.path))
@@ -418,7 +418,7 @@ def _triangles_of_file(file: MeshFile) -> Triangles:
         ]
         if lines:  # a curve of the geometry may have no elements
             edges[name] = _node_indices(file, content, np.concatenate(lines))
-    return Triangles(content.places, cells, edges, patches)
+    return SurfaceTriangles(content.places, cells, edges, patches)
 
 
 def _blocks_of_dimension(

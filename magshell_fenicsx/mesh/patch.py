@@ -1,6 +1,6 @@
 """A triangulated mid-surface before it is given to dolfinx, and the sides of its triangles.
 
-`Triangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the triangulation
+`SurfaceTriangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the triangulation
 that the shell is computed on: nodes in a chart or in space, the embedding into space, named edges,
 points and patches. Lengths are over R, if nothing else is said. Arrays are NumPy's, and no function
 here is collective but `refuse_places`.
@@ -26,7 +26,7 @@ Pairs = NDArray[np.int64]  # (n, 2) vertices of edges
 
 
 @dataclass(frozen=True, eq=False)
-class Triangles:
+class SurfaceTriangles:
     """A surface in space as a file or a program gives it; it is never changed.
 
     Attributes
@@ -63,7 +63,7 @@ class Triangles:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UserField:
-    """A field on `Triangles` as a program gives it, a polynomial in each; it is never changed.
+    """A field on `SurfaceTriangles` as a program gives it, a polynomial in each; it is never changed.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class PatchMesh:
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
     source_triangles
-        (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1
+        (m, 2) of a surface that was given as `SurfaceTriangles`: the number of each triangle there, and 1
         where its orientation is reversed; None for other surfaces.
     joints
         For each joint, two masks (m,): whether each triangle has a side on the first edge, and on

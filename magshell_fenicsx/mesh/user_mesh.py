@@ -14,7 +14,7 @@ from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_gmsh
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import MeshError, Pairs, Triangles, UserField
+from magshell_fenicsx.mesh.patch import MeshError, Pairs, SurfaceTriangles, UserField
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -65,7 +65,7 @@ class UserMesh:
         patches: Mapping[str, MeshPart],
         facet_tags: mesh.MeshTags | None = None,
         cell_tags: mesh.MeshTags | None = None,
-    ) -> Triangles:
+    ) -> SurfaceTriangles:
         """Return the triangles of all ranks with named edges and patches.
 
         Parameters
@@ -93,7 +93,7 @@ class UserMesh:
             name: self._entities_of_part(f"patches.{name}", part, cell_tags, 2)
             for name, part in patches.items()
         }
-        return Triangles(
+        return SurfaceTriangles(
             places,
             number[index_of_used].reshape(cells.shape),
             {name: number[np.searchsorted(used, ends)] for name, ends in pairs_of_edges.items()},

@@ -42,7 +42,7 @@ def test_coplanar_fields_give_a_half_shell_turned_into_its_mirror_plane() -> Non
 
 def test_non_coplanar_fields_need_the_full_shell() -> None:
     field = {"lambda_m": 1e-3, "remanent": {"polar": 45}, "applied": {"polar": 45, "azimuth": 90}}
-    assert not make_problem(case(magnetic=field)).half
+    assert not make_problem(case(magnetic=field)).is_half
     with pytest.raises(CaseError, match="no common mirror plane"):
         make_problem(case(magnetic=field, symmetry="half"))
 

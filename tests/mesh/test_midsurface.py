@@ -18,7 +18,9 @@ from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 
 def patch(size: float = 0.5) -> PatchMesh:
-    return triangulate(DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, plane_embedding)
+    return triangulate(
+        DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, plane_embedding
+    )
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])

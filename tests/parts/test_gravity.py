@@ -229,7 +229,7 @@ def test_a_half_beside_the_first_axis(factor: str | None) -> None:
         },
     }
     half, whole = (made(**sections, symmetry=symmetry) for symmetry in ("auto", "none"))
-    assert make_problem(half).half
+    assert make_problem(half).is_half
     row, known = ended(half), ended(whole)
     assert row["here_ux"] > 0
     assert row["here_uy"] > 0

@@ -108,8 +108,8 @@ def test_a_dead_force_along_the_normal_is_an_indentation(shape: str) -> None:
     }
     indented = case(shape, points=points, mesh=mesh, loading=loading)
     a, b = end(dead), end(indented)
-    assert make_problem(dead).half
-    assert make_problem(indented).half
+    assert make_problem(dead).is_half
+    assert make_problem(indented).is_half
     for column in ("w_over_h", "A_ux", "A_uy", "A_uz"):
         # the vertex's normal is that of flat triangles: to the square of their angle
         assert a[column] == pytest.approx(b[column], rel=2e-3, abs=1e-9)
@@ -136,7 +136,7 @@ def test_a_strip_bent_by_its_tip(symmetry: str, load: dict[str, Any]) -> None:
     asked = case(
         "strip", {"poisson_ratio": 0}, points=points, loading=loading, symmetry=symmetry, mesh=mesh
     )
-    assert make_problem(asked).half == (symmetry == "half")
+    assert make_problem(asked).is_half == (symmetry == "half")
     assert end(asked)["A_uz"] == pytest.approx(1e-4, rel=1e-2)
 
 
@@ -217,7 +217,7 @@ def test_each_part_leaves_its_symmetry(
     assert (problem.axisymmetric, problem.is_half) == (turns, mirrors and not turns)
     without_rotation = asked.model_copy(update={"symmetry": "half"})
     if mirrors:
-        assert make_problem(without_rotation).half
+        assert make_problem(without_rotation).is_half
     else:
         with pytest.raises(CaseError, match="no common mirror plane"):
             make_problem(without_rotation)
@@ -292,7 +292,7 @@ def test_half_of_a_cylinder_dented_at_one_side() -> None:
         case("cylinder", points=points, mesh=mesh, loading=loading, symmetry=s)
         for s in ("half", "none")
     ]
-    assert [make_problem(each).half for each in asked] == [True, False]
+    assert [make_problem(each).is_half for each in asked] == [True, False]
     half, whole = map(end, asked)
     assert half["force"] == pytest.approx(whole["force"], rel=1e-2)
     assert half["A_uy"] / half["A_ux"] == pytest.approx(np.tan(0.5), rel=1e-9)

@@ -262,7 +262,7 @@ def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> No
     if column == "force":
         data |= {"points": {"A": [0, 0, 1]}, "loading": loading | {"at": {"point": "A"}}}
     half, whole = (ms.Case.from_source(data | {"symmetry": s}) for s in ("auto", "none"))
-    assert (make_problem(half).half, make_problem(whole).half) == (True, False)
+    assert (make_problem(half).is_half, make_problem(whole).is_half) == (True, False)
     found = result(half, column)
     assert found == pytest.approx(result(built_in, column), rel=2e-4)
     assert found == pytest.approx(result(whole, column), rel=1e-9)

@@ -336,8 +336,8 @@ def test_half_model_of_another_plane() -> None:
         "magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"
     ]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
-    assert make_problem(case, [OwnTerm("own", winkler)]).half
-    assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
+    assert make_problem(case, [OwnTerm("own", winkler)]).is_half
+    assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).is_half
     within = np.array([np.cos(np.radians(20)), np.sin(np.radians(20)), 0.5])
     problem = make_problem(case, [OwnTerm("own", weight, (within,))])
     assert problem.is_half

@@ -60,7 +60,7 @@ def test_check_tells_the_mesh_that_is_built() -> None:
         BUCKLING, ["mesh.refinement=0.2", "shell.radius_to_thickness=20", "solid={layers: 2}"]
     )
     scene = Scene(case)
-    assert make_problem(case).half
+    assert make_problem(case).is_half
     assert f"mesh: {scene.cells} cells of degree 2, {scene.model.system.dofs} unknowns" in describe(
         case
     )

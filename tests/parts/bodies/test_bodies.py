@@ -84,7 +84,7 @@ def test_places() -> None:
     assert inside.front == pytest.approx((1 - h / 2) * normal)
     assert inside.direction == pytest.approx(normal)
     half = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at}}, symmetry="half")
-    assert half.half
+    assert half.is_half
     assert half.azimuth % np.pi == pytest.approx(np.radians(50))
     (turned,) = half.loads.contacts
     assert turned.direction[1] == pytest.approx(0, abs=1e-12)
@@ -114,7 +114,7 @@ def test_places() -> None:
 def test_symmetry(body: dict[str, Any], model: str) -> None:
     """`symmetry: auto` finds the smallest model that a body leaves."""
     found = problem({"a": body}, symmetry="auto")
-    assert ("meridian" if found.axisymmetric else "half" if found.half else "full") == model
+    assert ("meridian" if found.axisymmetric else "half" if found.is_half else "full") == model
 
 
 def test_plane_of_an_oblique_box() -> None:
@@ -131,7 +131,7 @@ def test_plane_of_an_oblique_box() -> None:
         "direction": [0, 0, -1],
     }
     found = problem({"a": box, "b": ball}, symmetry="auto")
-    assert found.half
+    assert found.is_half
     assert np.degrees(found.azimuth) % 180 == pytest.approx((along + 90) % 180)
 
 

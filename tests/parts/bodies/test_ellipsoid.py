@@ -112,8 +112,8 @@ def test_place_and_symmetry() -> None:
     assert contact.front == pytest.approx([0, 0, 1 / 60])
     assert contact.size == pytest.approx(0.3**2 / 0.2)
     assert contact.distance(contact.front[None])[0] == pytest.approx(0, abs=1e-15)
-    assert make_problem(case()).half
-    assert make_problem(case(axis=[1, 2, 0])).half
+    assert make_problem(case()).is_half
+    assert make_problem(case(axis=[1, 2, 0])).is_half
     assert make_problem(case(semi_axes=[0.3, 0.3, 0.2])).axisymmetric
     short, unit = (
         make_problem(case(axis=[size, 2 * size, 0], direction=[0, 0, -size])).loads.contacts[0]
