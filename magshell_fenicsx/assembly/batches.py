@@ -86,7 +86,7 @@ def cell_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> li
 def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
     """Return batches of the owned interior edges."""
     cells, edges, reversed_edges = interior_edges(V)
-    kinds = np.column_stack([edges, reversed_edges])
+    kinds = np.column_stack([edges, reversed_edges.astype(np.int32)])
     return list(_edge_batches(V, degree, *_masked(cells, kinds, mask)))
 
 
