@@ -1,9 +1,9 @@
 """A triangulated mid-surface before it is given to dolfinx, and the sides of its triangles.
 
-`SurfaceTriangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the triangulation
-that the shell is computed on: nodes in a chart or in space, the embedding into space, named edges,
-points and patches. Lengths are over R, if nothing else is said. Arrays are NumPy's, and no function
-here is collective but `refuse_places`.
+`SurfaceTriangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the
+triangulation that the shell is computed on: nodes in a chart or in space, the embedding into space,
+named edges, points and patches. Lengths are over R, if nothing else is said. Arrays are NumPy's,
+and no function here is collective but `refuse_places`.
 """
 
 import hashlib
@@ -63,7 +63,7 @@ class SurfaceTriangles:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UserField:
-    """A field on `SurfaceTriangles` as a program gives it, a polynomial in each; it is never changed.
+    """A field on `SurfaceTriangles`, a polynomial in each; it is never changed.
 
     Attributes
     ----------
@@ -155,8 +155,8 @@ class PatchMesh:
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
     source_triangles
-        (m, 2) of a surface that was given as `SurfaceTriangles`: the number of each triangle there, and 1
-        where its orientation is reversed; None for other surfaces.
+        (m, 2) of a surface that was given as `SurfaceTriangles`: the number of each triangle there,
+        and 1 where its orientation is reversed; None for other surfaces.
     joints
         For each joint, two masks (m,): whether each triangle has a side on the first edge, and on
         the second one. None for a T-junction, of which nothing is glued.

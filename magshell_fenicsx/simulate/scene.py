@@ -113,7 +113,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     solid = problem.body
     assert solid
     body = sweep(
-        on_first_rank(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor
+        on_first_rank(comm, problem.triangulated), problem.material.h, solid.layer_bounds, comm, factor
     )
     return SolidModel(
         body,

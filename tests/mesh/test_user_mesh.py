@@ -154,10 +154,12 @@ from test_user_mesh import made, plate, sides
 import magshell_fenicsx as ms
 from magshell_fenicsx.mesh.patch import MeshError
 
-rank, material = MPI.COMM_WORLD.rank, {"thickness": 0.01, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
+rank = MPI.COMM_WORLD.rank
+material = {"thickness": 0.01, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
 own = made(*plate(4))
 shell = ms.Shell(own, edges={"rim": 1}, facet_tags=sides(own), **material)
-problem = ms.Problem(shell, ms.Clamped("rim"), ms.Pressure(pressure=1e-3, until="target", points=1), degree=2)
+pressure = ms.Pressure(pressure=1e-3, until="target", points=1)
+problem = ms.Problem(shell, ms.Clamped("rim"), pressure, degree=2)
 *_, record = ms.follow(ms.Scene(problem))
 *_, spread = ms.follow(ms.Scene(problem, MPI.COMM_WORLD))
 said = []

@@ -116,7 +116,7 @@ def test_a_dead_force_along_the_normal_is_an_indentation(shape: str) -> None:
 
 
 def test_named_points_are_told_in_the_frame_of_the_case() -> None:
-    """A half model stands in a frame turned into its mirror plane: the motion stays in that plane."""
+    """The frame of a half model is turned into its mirror plane: the motion stays in that plane."""
     points = {"A": PLACES["hemisphere"]}
     loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1}
     found = end(

@@ -123,7 +123,7 @@ def test_copies_make_the_half(name: str) -> None:
     ours, theirs = (
         system.at_state(State(v, mu)) for system, v in ((model.system, u), (half.system, copies))
     )
-    forces = ours.of(model.touchings[0].force), theirs.of(half.touchings[0].force)
+    forces = ours.evaluate(model.touchings[0].force), theirs.evaluate(half.touchings[0].force)
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)
     assert (forces[0] > 0) == (name == "rings")
 
