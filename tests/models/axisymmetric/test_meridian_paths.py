@@ -109,7 +109,7 @@ def test_cells_of_a_given_size() -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=0.1", "mesh.refinement=2"])
     problem = make_problem(case)
     lengths = np.diff(meridian_vertices(problem))
-    (rim,) = problem.meridian.circles
+    (rim,) = problem.meridian.curvature_jumps
     assert len(lengths) == np.ceil(rim / 0.05) + np.ceil((np.pi / 2 - rim) / 0.05)
     assert lengths.max() < 0.05 < 1.3 * lengths.min()
     tiny = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=1e-9"])
