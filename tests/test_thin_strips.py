@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Record, Scene
-from magshell_fenicsx.assembly.evaluation import VARIABLE
+from magshell_fenicsx.assembly.evaluation import NOISE_VARIABLE
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 
@@ -68,7 +68,7 @@ def test_steps_do_not_grow_with_slenderness() -> None:
 @pytest.mark.parametrize("noise", ["1e-14 2", "1e-13 3"])
 def test_the_same_instability_under_noise(noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
     _, clean = quiet()
-    monkeypatch.setenv(VARIABLE, noise)
+    monkeypatch.setenv(NOISE_VARIABLE, noise)
     _, noisy = rolled(100)
     found = [
         [r for r in records if r.label in ("fold", "bifurcation")] for records in (clean, noisy)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.assembly.evaluation import VARIABLE
+from magshell_fenicsx.assembly.evaluation import NOISE_VARIABLE
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.snes import LENGTH_PER_DISPLACEMENT
 from magshell_fenicsx.continuation.system import max_abs
@@ -57,7 +57,7 @@ class Outcome:
 
 def followed(case: ms.Case, noise: str) -> Outcome:
     """Follow a case with noise, "" for none."""
-    os.environ[VARIABLE] = noise
+    os.environ[NOISE_VARIABLE] = noise
     scene, records = ms.Scene(case), list[ms.Record]()
     history = ms.follow(scene)
     while True:

@@ -7,7 +7,7 @@ import pytest
 from models.moving_scenes import CLAMPED, PLATE, RING, move, moving_scene
 
 from magshell_fenicsx import Scene
-from magshell_fenicsx.assembly.prescribed_motion import in_space
+from magshell_fenicsx.assembly.prescribed_motion import vectors_in_space
 from magshell_fenicsx.continuation.system import State
 
 SHORT = {**PLATE, "width": 0.4}
@@ -111,7 +111,7 @@ def test_rigid_motion_of_everything(kind: str) -> None:
     model = moving_scene(
         (both,), SHORT if kind == "shell" else {**SHORT, "thickness": 0.1}, **sections
     ).model
-    places, mu = in_space(model.r0.x.array, 3), {"turn": 1.0}
+    places, mu = vectors_in_space(model.r0.x.array, 3), {"turn": 1.0}
     Q = both.motion.rotation(1.0)[0]
     u = (
         (places - both.motion.centre) @ Q.T + both.motion.centre + both.motion.shift - places

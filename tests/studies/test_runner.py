@@ -64,7 +64,7 @@ def test_an_outcome_is_kept_for_these_sources(
     file.write_text(json.dumps(content)[:-20], encoding="utf-8")
     assert kept_outcome(file) is None
     keep_outcome(OUTCOME, case, file)
-    monkeypatch.setattr(environment, "_RUNNING", "0.1.0+anotherhash00000")
+    monkeypatch.setattr(environment, "_RUNNING_VERSION", "0.1.0+anotherhash00000")
     assert kept_outcome(file) is None
 
 

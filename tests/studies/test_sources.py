@@ -21,9 +21,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.known import GROUPS, PHASES
+from magshell_fenicsx.output.store.stored_results import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
-from magshell_fenicsx.output.store.written import MESH
+from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.platform import environment
 from magshell_fenicsx.platform.processes import Usage
 from magshell_fenicsx.public import run
@@ -42,7 +42,7 @@ OTHER = "0.1.0+anotherhash00000"
 @pytest.fixture
 def edited(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Called, makes the sources others."""
-    return lambda: monkeypatch.setattr(environment, "_RUNNING", OTHER)
+    return lambda: monkeypatch.setattr(environment, "_RUNNING_VERSION", OTHER)
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
     with pytest.raises(checkpoint.OtherSources):
         checkpoint.check_resumable(file, this)
     with pytest.raises(checkpoint.OtherSources, match=r"\(0\.1\.0; these are"):
-        checkpoint.refuse_other({"version": "0.1.0", "case": known["case"]}, this, tmp_path)
+        checkpoint.refuse_other_case({"version": "0.1.0", "case": known["case"]}, this, tmp_path)
 
 
 def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None) -> None:
