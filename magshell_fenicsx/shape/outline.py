@@ -197,8 +197,9 @@ class Outline:
     @property
     def perfect(self) -> Embedding:
         """Chart -> places (n, 3) of the surface without its imperfections."""
-        is_deviated = isinstance(self.embedding, DeviatedEmbedding)
-        return self.embedding.perfect if is_deviated else self.embedding
+        if isinstance(self.embedding, DeviatedEmbedding):
+            return self.embedding.perfect
+        return self.embedding
 
     def deviated(
         self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float

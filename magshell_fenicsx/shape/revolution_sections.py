@@ -348,7 +348,8 @@ class ProfileSection(Section):
             return np.array(self.points)
         assert self.radius is not None
         assert self.heights is not None
-        z = np.linspace(*self.heights, PROFILE_SAMPLES, dtype=np.float64)
+        first, last = self.heights
+        z = np.linspace(first, last, PROFILE_SAMPLES, dtype=np.float64)
         r = formula(self.radius)(0 * z, 0 * z, z)
         on_axis = np.abs(r) < ON_AXIS * np.abs(r).max()
         return np.column_stack([np.where(on_axis, 0.0, r), z])
