@@ -27,11 +27,11 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import field_in_body, radial
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
-from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
+from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
-from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, Soft
 
 REDUCED = 3  # quadrature degree: two points in each direction
 VALUE, GRADIENT, ON_FACE = (

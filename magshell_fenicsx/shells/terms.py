@@ -48,7 +48,7 @@ from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
-from magshell_fenicsx.parts.magnetism.soft import TERM, Sheet, Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, Soft
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
 Array = NDArray[np.float64]

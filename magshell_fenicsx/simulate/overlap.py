@@ -73,8 +73,8 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     CaseError
         In the words of a scene, which sees more: parts too near for the size of their cells.
     """
-    from magshell_fenicsx.parts.magnetism.close import INSIDE
     from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
+    from magshell_fenicsx.parts.magnetism.stacked_faces import INSIDE
 
     surfaces, V = Surfaces.of(r0), r0.function_space
     nodes = surfaces.cells.nodes

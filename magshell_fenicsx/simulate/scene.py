@@ -449,7 +449,7 @@ class Scene:
         CaseError
             If nothing is magnetised, or magpylib is missing.
         """
-        from magshell_fenicsx.parts.magnetism.own_field import to_magpylib  # of few runs
+        from magshell_fenicsx.parts.magnetism.self_field import to_magpylib  # of few runs
 
         return to_magpylib(self.sight, record.point.state, parts)
 

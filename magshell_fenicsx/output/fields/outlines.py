@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.driven import carried
+from magshell_fenicsx.parts.magnetism.moving_source import carried
 from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]

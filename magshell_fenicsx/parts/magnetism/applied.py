@@ -22,7 +22,7 @@ from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
-from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
+from magshell_fenicsx.parts.magnetism.moving_source import Driven, FieldInSpace, Here, carried
 
 Array = NDArray[np.float64]
 HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the places of a path

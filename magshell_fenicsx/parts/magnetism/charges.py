@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charged import Jets, Nodal, Shape, unit
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Jets, Nodal, Shape, unit
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]

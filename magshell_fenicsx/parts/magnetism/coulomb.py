@@ -20,13 +20,13 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Weights, add
-from magshell_fenicsx.parts.magnetism.charged import STEP, Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights, add
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Sides, gauss, heights
-from magshell_fenicsx.parts.magnetism.close import Close
-from magshell_fenicsx.parts.magnetism.far import Far
-from magshell_fenicsx.parts.magnetism.near import NOTHING, Near
+from magshell_fenicsx.parts.magnetism.magnetised_cells import STEP, Nodal, Shape
+from magshell_fenicsx.parts.magnetism.multipole_expansion import Far
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.singular_pairs import NOTHING, Near
+from magshell_fenicsx.parts.magnetism.stacked_faces import Close
 from magshell_fenicsx.parts.magnetism.tree import Octree
 
 Array = NDArray[np.float64]

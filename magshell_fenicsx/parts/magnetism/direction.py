@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Curve
-from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.moving_source import carried
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 Array = NDArray[np.float64]

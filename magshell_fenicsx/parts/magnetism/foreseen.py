@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.dense_tangent import BlockProducts, SinglePrecisionBlocks
-from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther
+from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther
 
 Array = NDArray[np.float64]
 POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it

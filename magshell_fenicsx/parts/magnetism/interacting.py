@@ -24,15 +24,15 @@ from magshell_fenicsx.assembly.global_mesh import (
     global_values,
 )
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.magnetism.by_charges import Weights
-from magshell_fenicsx.parts.magnetism.charged import Shape, unit
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
 from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
-from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
-from magshell_fenicsx.parts.magnetism.near import Near
-from magshell_fenicsx.parts.magnetism.own_field import own_field
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape, unit
+from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
+from magshell_fenicsx.parts.magnetism.self_field import own_field
+from magshell_fenicsx.parts.magnetism.singular_pairs import Near
 from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.seen import Sight
 

@@ -32,7 +32,7 @@ from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
-from magshell_fenicsx.parts.magnetism.soft import Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import Soft
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled

@@ -12,8 +12,8 @@ from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
-from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
-from magshell_fenicsx.parts.magnetism.soft import Soft
+from magshell_fenicsx.parts.magnetism.moving_source import Driven, FieldInSpace
+from magshell_fenicsx.parts.magnetism.soft_magnet import Soft
 
 ACROSS = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]

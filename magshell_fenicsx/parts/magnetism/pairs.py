@@ -183,7 +183,7 @@ class Pairs:
 
     def __init__(self, comm: MPI.Comm) -> None:
         source, *behind = (
-            Path(__file__).with_name(name) for name in ("pairs.c", "far.c", "close.c")
+            Path(__file__).with_name(name) for name in ("pairs.c", "multipole_expansion.c", "stacked_faces.c")
         )
         self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *behind)
 
@@ -243,7 +243,7 @@ class Pairs:
         return [stiffness.factor, onto, blocks, p(where), where.shape[1], *nodes_of, turn, modelled]
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
-        """What `add_close` and `seen` have of all pairs: see `Cells` in close.c."""
+        """What `add_close` and `seen` have of all pairs: see `Cells` in stacked_faces.c."""
         made = self._ffi.new(
             "Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()}
         )

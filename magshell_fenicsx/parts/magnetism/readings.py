@@ -58,7 +58,7 @@ class FieldSeen(Seen):
         return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
 
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
-        from magshell_fenicsx.parts.magnetism.own_field import magnetic_moment, magnetised
+        from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetised
 
         of = magnetised(sight.loads)
         if of is None or of.absent:
@@ -139,7 +139,7 @@ class SensorsSeen(Seen):
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
-        from magshell_fenicsx.parts.magnetism.own_field import CENTRAL, STEP, own_field
+        from magshell_fenicsx.parts.magnetism.self_field import CENTRAL, STEP, own_field
 
         matching = [
             (each, i)
@@ -202,7 +202,7 @@ def field_at(
         What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n,
         1), or of all.
     """
-    from magshell_fenicsx.parts.magnetism.own_field import magnetised, own_field
+    from magshell_fenicsx.parts.magnetism.self_field import magnetised, own_field
 
     def present() -> Array:
         if magnetised(sight.loads) is None:

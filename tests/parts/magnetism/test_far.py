@@ -7,9 +7,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism import coulomb, tree
-from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.coulomb import Charged
-from magshell_fenicsx.parts.magnetism.far import ActingOnEachOther, Cells
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape
+from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther, Cells
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
 from magshell_fenicsx.parts.magnetism.turned import Turning

@@ -28,7 +28,7 @@ from magshell_fenicsx.output.pictures.field_maps import (
     section,
     with_holes,
 )
-from magshell_fenicsx.output.pictures.plot import Drawn, plot
+from magshell_fenicsx.output.pictures.plot import PicturedRun, plot
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import MapGrid
 
@@ -121,7 +121,7 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert (out / "field_maps.png").stat().st_size > 10_000
     assert "field lines and |B|" in (out / "report.html").read_text(encoding="utf-8")
-    run = Drawn(out)
+    run = PicturedRun(out)
     points = len(run.rows)
     assert (out / "fields" / "map_box.pvd").read_text().count("map_box_") == points
     assert "map_" not in (out / "fields" / "path.pvd").read_text()
@@ -130,7 +130,7 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     np.testing.assert_allclose(R * box.places[-1], MM * np.array([12.0, 9, 17]))
     plane = plane_of(box)
     np.testing.assert_array_equal(plane.values, box.values[6:])
-    surface, about = run.at(run.rows[0])
+    surface, about = run.surface_at(run.rows[0])
     level = MapGrid("level", np.array([-1.0, -1.0, 0.9]), 2 * np.eye(3)[:2], (2, 2), "T", "own")
     lines = section(surface, level)
     np.testing.assert_allclose(

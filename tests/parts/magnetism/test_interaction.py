@@ -23,9 +23,9 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism import interacting
-from magshell_fenicsx.parts.magnetism.by_charges import Weights
-from magshell_fenicsx.parts.magnetism.near import Near
-from magshell_fenicsx.parts.magnetism.own_field import own_field
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
+from magshell_fenicsx.parts.magnetism.self_field import own_field
+from magshell_fenicsx.parts.magnetism.singular_pairs import Near
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.gradients.gradient import gradient as gradient_of
 

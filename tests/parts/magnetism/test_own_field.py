@@ -16,8 +16,8 @@ from scipy.integrate import quad
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.magnetism.charged import Shape
 from magshell_fenicsx.parts.magnetism.charges import Faces, field, moment
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.public import follow, run
 

@@ -21,7 +21,7 @@ from magshell_fenicsx.assembly.dense_tangent import DenseTangent, SinglePrecisio
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.parts.magnetism.coulomb import Charged
-from magshell_fenicsx.parts.magnetism.near import Near
+from magshell_fenicsx.parts.magnetism.singular_pairs import Near
 
 __all__ = ["model"]
 

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section, or_number
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.magnetism.driven import FieldInSpace
+from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace
 from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]

@@ -16,11 +16,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, add
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Found, Sides, gauss, heights
-from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
-from magshell_fenicsx.parts.magnetism.touching import (
+from magshell_fenicsx.parts.magnetism.duffy_rules import (
     APART,
     ENDS,
     SPLIT,
@@ -32,6 +30,8 @@ from magshell_fenicsx.parts.magnetism.touching import (
     polar,
     strip,
 )
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
 from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
-from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, places
-from magshell_fenicsx.parts.magnetism.charged import STEP
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, places
+from magshell_fenicsx.parts.magnetism.magnetised_cells import STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree

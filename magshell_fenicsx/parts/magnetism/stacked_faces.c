@@ -1,4 +1,4 @@
-/* Faces of cells that lie close above each other; close.py says what for. Each point of the first cell sees the second in
+/* Faces of cells that lie close above each other; stacked_faces.py says what for. Each point of the first cell sees the second in
    polar coordinates about its foot. Compiled behind pairs.c. */
 #define GAUSS 24                  /* points of the longest of Gauss's rules that are at hand */
 #define MOST (3 * GAUSS * GAUSS)  /* points that a place sees of a cell at most */

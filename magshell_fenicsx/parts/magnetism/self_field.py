@@ -16,7 +16,6 @@ from magshell_fenicsx.mesh.mirror import Image, rotation
 from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape
 from magshell_fenicsx.parts.magnetism.charges import (
     Faces,
     Family,
@@ -28,6 +27,7 @@ from magshell_fenicsx.parts.magnetism.charges import (
 )
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, Shape
 from magshell_fenicsx.parts.seen import Sight
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ def magnetised(loads: Loads) -> Magnetisation | None:
 
 
 class OwnField:
-    """The charges of a model's shell; those of a solid are of `own_field_of_body`.
+    """The charges of a model's shell; those of a solid are of `self_field_of_solid`.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def own_field(sight: Sight) -> OwnField:
     own = model.kept.get(OwnField)
     if own is None or own.magnetised is not of:
         if sight.model.r0.function_space.mesh.topology.dim == 3:
-            from magshell_fenicsx.parts.magnetism.own_field_of_body import (
+            from magshell_fenicsx.parts.magnetism.self_field_of_solid import (
                 OwnFieldOfBody,
             )  # it is an own field
 

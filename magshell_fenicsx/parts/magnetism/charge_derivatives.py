@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charged import STEP
+from magshell_fenicsx.parts.magnetism.magnetised_cells import STEP
 from magshell_fenicsx.parts.magnetism.pairs import Points
 
 Array = NDArray[np.float64]

@@ -26,11 +26,11 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.by_charges import Complex, Weights, add
-from magshell_fenicsx.parts.magnetism.charged import Nodal, Shape, unit
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, add
 from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, gauss, heights
+from magshell_fenicsx.parts.magnetism.duffy_rules import CORNERS, ENDS, graded
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, Shape, unit
 from magshell_fenicsx.parts.magnetism.pairs import Copies, Pairs, Points, Stiffness
-from magshell_fenicsx.parts.magnetism.touching import CORNERS, ENDS, graded
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -41,7 +41,7 @@ PRECISION = 1e-9  # of what one of its points sees of the second
 GAUSS, MOST = (
     24,
     3 * 24**2,
-)  # points of the longest rule, and points that are seen at most, as in close.c
+)  # points of the longest rule, and points that are seen at most, as in stacked_faces.c
 OF_CHARGES = 5  # degree of charges on a cell
 REACH = 0.25  # of the size of cells: nearer faces are close
 DEPTH = (
@@ -49,7 +49,7 @@ DEPTH = (
 )
 LEAST = 0.00125  # of the thickness: nearer to a face no layer comes
 INSIDE = 0.5  # of the thickness: mid-surfaces that are nearer are in each other
-EXTRAPOLATED = 3.0, -3.0, 1.0  # from three layers, as in close.c
+EXTRAPOLATED = 3.0, -3.0, 1.0  # from three layers, as in stacked_faces.c
 SAME = 1e-7  # over R: places of the middle of a side of two cells
 ALONG = 0.7  # cosine of the angle of cells that lie above each other, at least
 CHARGES = basix.create_element(
@@ -65,7 +65,7 @@ BORDER = np.concatenate(
 
 
 def monomials(X: Array, degree: int) -> Array:
-    """(n, ..) at places (n, 2), in the order of close.c."""
+    """(n, ..) at places (n, 2), in the order of stacked_faces.c."""
     return np.stack(
         [X[:, 0] ** (n - j) * X[:, 1] ** j for n in range(degree + 1) for j in range(n + 1)], axis=1
     )
@@ -266,7 +266,7 @@ class Close:
         """Of layers (n, L) their heights, what multiplies charges (n, L, S), and the heights' part
         that follows t.
 
-        See `layered` of close.c.
+        See `layered` of stacked_faces.c.
         """
         S, n = len(self._heights), np.arange(len(t))
         near = np.where(inward * t < 0, 0, 1)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import QUADRATURE_DEGREE
 from magshell_fenicsx.models.shell.patterns import field_in_body, places_in_body
-from magshell_fenicsx.parts.magnetism.charged import unit
 from magshell_fenicsx.parts.magnetism.charges import Family
-from magshell_fenicsx.parts.magnetism.charges_of_body import (
+from magshell_fenicsx.parts.magnetism.charges_of_solid import (
     Body,
     CellFaces,
     Inside,
@@ -21,7 +20,8 @@ from magshell_fenicsx.parts.magnetism.charges_of_body import (
     on_faces,
     uneven,
 )
-from magshell_fenicsx.parts.magnetism.own_field import JUMP, OwnField
+from magshell_fenicsx.parts.magnetism.magnetised_cells import unit
+from magshell_fenicsx.parts.magnetism.self_field import JUMP, OwnField
 
 Array = NDArray[np.float64]
 Sides = tuple[NDArray[np.intp], NDArray[np.intp]]

@@ -14,7 +14,6 @@ import basix
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charged import Nodal, tables
 from magshell_fenicsx.parts.magnetism.charges import (
     BESIDE,
     CHUNK,
@@ -25,6 +24,7 @@ from magshell_fenicsx.parts.magnetism.charges import (
     Found,
     gauss,
 )
+from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, tables
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
