@@ -137,10 +137,10 @@ def folder_option(default: str) -> Any:
 
 def chosen_folder(out: str | None, default: str) -> Path:
     """The folder of an option, or the default one in results/."""
-    from magshell_fenicsx.output.store.folder import given_folder
+    from magshell_fenicsx.output.store.folder import user_folder
 
     with exit_codes():
-        return Path("results") / default if out is None else given_folder(out)
+        return Path("results") / default if out is None else user_folder(out)
 
 
 def picture_options(

@@ -71,7 +71,7 @@ def plot(
     """Draw the pictures and write the report of a run again, from its folder; of several runs their
     curves in one.
     """
-    from magshell_fenicsx.output.pictures.plot import plotted
+    from magshell_fenicsx.output.pictures.plot import plot_folders
 
     if world().rank:
         return
@@ -79,7 +79,7 @@ def plot(
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
         options |= {"whole": True} if whole else {}
         alone = {"point": point, "animation": animation, "shapes": points_of(shapes)}
-        print_line(plotted(folders, out, options, **alone))
+        print_line(plot_folders(folders, out, options, **alone))
 
 
 @app.command()
@@ -87,13 +87,13 @@ def view(folder: Run) -> None:
     """Open the report of a run in the web browser: the shell to turn, the path to walk along; else
     print its path.
     """
-    from magshell_fenicsx.output.report.report import opened, report_of
+    from magshell_fenicsx.output.report.report import open_in_browser, report_of
 
     if world().rank:
         return
     with exit_codes(stopped=(OSError,)):
         file = report_of(folder)
-    print_line(f"{'opened' if opened(file) else 'no web browser found; the report is'} {file}")
+    print_line(f"{'opened' if open_in_browser(file) else 'no web browser found; the report is'} {file}")
 
 
 @app.command()
@@ -215,7 +215,7 @@ def info(
     print_line(f"{'kernel cache':18} {kernels}")
     if compile_:
         from magshell_fenicsx.case.case import Case
-        from magshell_fenicsx.output.pictures.view import library
+        from magshell_fenicsx.output.pictures.rendering import library
 
         if not world().rank:
             library()

@@ -13,7 +13,7 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.studies.sweep import Sweep, sweep, sweep_row
 from magshell_fenicsx.studies.sweep_picture import loaded
@@ -107,7 +107,7 @@ def make(name: str, out: Path = OUT) -> Sweep:
         write_csv(rows, list(rows[0]), out / f"{name}.csv")
         draw(figure, rows, figure.along or "w_over_h", y, out / f"{name}.png")
 
-    by_first(MPI.COMM_WORLD, write)
+    access_disk(MPI.COMM_WORLD, write)
     return done
 
 

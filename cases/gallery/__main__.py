@@ -15,7 +15,7 @@ from PIL import Image
 import magshell_fenicsx.parts.registered  # noqa: F401
 from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.input.source import read_source
-from magshell_fenicsx.output.store.known import case_in
+from magshell_fenicsx.output.store.stored_results import case_in
 from magshell_fenicsx.output.store.table import read_rows
 
 OUT = CASES.parent / "docs" / "gallery"

@@ -1,4 +1,4 @@
-"""The output folder of one run."""
+"""The output folder of one run: whether it may be written, resumed or replaced, and its files."""
 
 import json
 import math
@@ -19,10 +19,15 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.grids import grid_content
-from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, solids
-from magshell_fenicsx.output.fields.surface import turned, whole
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
-from magshell_fenicsx.output.report.verdict import plain, read_run, verdict
+from magshell_fenicsx.output.fields.outlines import (
+    FILE_OF_ALL_POINTS,
+    FILE_OF_POINT,
+    outlines,
+    solids,
+)
+from magshell_fenicsx.output.fields.surface import completed_by_symmetry, rotated_surface
+from magshell_fenicsx.output.fields.vtu import FieldSeries, ShellData, is_whole, point_file
+from magshell_fenicsx.output.report.verdict import read_run, terminal_text, verdict
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import (
     Damaged,
@@ -31,30 +36,34 @@ from magshell_fenicsx.output.store.durable import (
     sync_folder,
     write_whole,
 )
-from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
-from magshell_fenicsx.output.store.known import SUMMARY, read_summary
-from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
-from magshell_fenicsx.output.store.written import (
+from magshell_fenicsx.output.store.folder import DiskError, access_disk, prepare_folder
+from magshell_fenicsx.output.store.manifest import (
+    FILES_OF_PATH,
     MESH,
-    NEW,
-    OF_PATH,
-    note,
+    NEW_CHECKPOINT,
+    files_of_runs,
+    is_replacement_unfinished,
     refuse_unwritten,
     remove,
-    replaced,
-    written,
+    write_manifest,
 )
-from magshell_fenicsx.output.store.written import NAME as LIST
+from magshell_fenicsx.output.store.manifest import NAME as MANIFEST
+from magshell_fenicsx.output.store.stored_results import SUMMARY, read_summary
+from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.simulate.scene import Scene
 
-INTERRUPTED = re.compile(r"^interrupted by |cannot be (written|read): ")
-COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
+INTERRUPTION = re.compile(r"^interrupted by |cannot be (written|read): ")
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9  # of recomputed values in path.csv
+COMPARED_COLUMNS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
 class AlreadyComplete(Exception):
-    """There is nothing to resume; `summary` is the summary.json of the finished run."""
+    """Signal that there is nothing to resume.
+
+    `summary` is the summary.json of the finished run.
+    """
 
     def __init__(self, summary: dict[str, Any]) -> None:
         super().__init__(summary)
@@ -67,11 +76,18 @@ class AlreadyComplete(Exception):
 def open_folder(
     out: Path, document: Document, comm: MPI.Comm, resume: bool, overwrite: bool = False
 ) -> None:
-    """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is
-    changed.
+    """Check that a folder can take a new run, or that the run in it can be resumed; collective.
+
+    Nothing in it is changed.
 
     Parameters
     ----------
+    out
+        The folder.
+    document
+        The case with what its results depend on.
+    resume
+        Whether the run in the folder goes on.
     overwrite
         Whether a new run may replace that of another case file, or an interrupted one.
 
@@ -84,121 +100,123 @@ def open_folder(
         If the run to be resumed is complete.
     """
 
-    def ready(folder: Path) -> None:
+    def check(folder: Path) -> None:
         refuse_unwritten(folder)
         for part in (folder, folder / "fields"):  # before the first file is removed
             if part.exists() and not os.access(part, os.W_OK | os.X_OK, effective_ids=True):
                 raise OSError(EACCES, os.strerror(EACCES), str(part))
         if resume:
-            _refuse_no_resuming(folder, document)
+            _check_resumable(folder, document)
         elif not overwrite:
             _refuse_other_case(folder, document)
             _refuse_interrupted(folder)
 
-    prepare_folder(out, comm, ready)
+    prepare_folder(out, comm, check)
 
 
 def _refuse_other_case(out: Path, document: Document) -> None:
-    """A run replaces one of the same case, and one of the same file with other values."""
+    """Refuse to replace a run of another case file.
+
+    A run replaces one of the same case, and one of the same file with other values.
+    """
     try:
-        begun = belongs_to(out, document)
+        identity = identity_of_run(out, document)
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
-    name = begun.get(checkpoint.FILE)
-    if (
-        name
-        and Path(name).stem != Path(document.name).stem
-        and not checkpoint.is_of(begun, document)
-    ):
+    name = identity.get(checkpoint.CASE_FILE)
+    if not name or Path(name).stem == Path(document.name).stem:
+        return
+    if not checkpoint.belongs_to(identity, document):
         raise CaseError(
             f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite"
         )
 
 
-def belongs_to(out: Path, document: Document) -> dict[str, Any]:
-    """What the run in a folder depends on; empty without checkpoint and summary.json.
+def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
+    """Return what the run in a folder depends on, see `checkpoint.identity`.
+
+    Empty without checkpoint and summary.json.
 
     Raises
     ------
     Damaged
         If it cannot be read.
     """
-    if replaced(out):  # what is left of the earlier run is no run
-        return checkpoint.begun_with(out / NEW) or {}
-    if begun := checkpoint.begun_with(out / checkpoint.NAME):
-        return begun
+    if is_replacement_unfinished(out):  # what is left of the earlier run is no run
+        return checkpoint.identity_in(out / NEW_CHECKPOINT) or {}
+    if identity := checkpoint.identity_in(out / checkpoint.NAME):
+        return identity
     summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
-    return {
-        key: summary[key] for key in ("case", checkpoint.FILE, *document.outside) if key in summary
-    }
+    keys = "case", checkpoint.CASE_FILE, *document.outside
+    return {key: summary[key] for key in keys if key in summary}
 
 
 def _refuse_interrupted(out: Path) -> None:
-    """A run that has ended, also where its solver could not go on, may be repeated; one that can go
-    on is kept.
+    """Refuse to replace a run that can be continued.
+
+    A run that has ended, also where its solver could not go on, may be repeated.
     """
-    if replaced(out):
+    if is_replacement_unfinished(out):
         return
     file, table = out / checkpoint.NAME, out / "path.csv"
     points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0
-    if not file.exists() or (
-        points < 2 and not (out / MESH).exists()
-    ):  # the undeformed shell alone is no loss
+    has_results = points >= 2 or (out / MESH).exists()  # the undeformed shell alone is no loss
+    if not file.exists() or not has_results:
         return
-    how = "killed, or its machine stopped"
+    reason = "killed, or its machine stopped"
     if (out / SUMMARY).exists():
         stopped = read_object(out / SUMMARY).get("stopped")
-        if not (isinstance(stopped, str) and INTERRUPTED.search(stopped)):
+        if not (isinstance(stopped, str) and INTERRUPTION.search(stopped)):
             return
-        how = stopped
+        reason = stopped
     when = datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
     raise CaseError(
-        f"--out {out}: has a run that was not finished: {points} point{'s' * (points != 1)}, the last on {when}; "
-        f"{how}. Give --resume to continue it, or --overwrite to start again"
+        f"--out {out}: has a run that was not finished: {points} point{'s' * (points != 1)}, "
+        f"the last on {when}; {reason}. Give --resume to continue it, or --overwrite to start again"
     )
 
 
-def _refuse_no_resuming(out: Path, document: Document) -> None:
-    """See that the run can be resumed."""
+def _check_resumable(out: Path, document: Document) -> None:
+    """Check that the run in a folder can be resumed."""
     file = out / checkpoint.NAME
-    if replaced(out):
+    if is_replacement_unfinished(out):
         raise CaseError(
-            f"--resume: {out}: a new run was interrupted while it removed the files of the earlier one; "
-            "start again without --resume, or with --overwrite"
+            f"--resume: {out}: a new run was interrupted while it removed the files of the earlier "
+            "one; start again without --resume, or with --overwrite"
         )
     if not file.exists() and (out / SUMMARY).exists():
         summary = read_summary(out)
         if summary["stopped"] is None:
-            kept = {
-                key: summary[key]
-                for key in ("case", "sources", *document.outside)
-                if key in summary
-            }
-            checkpoint.refuse_other(
-                {"version": summary["versions"]["magshell_fenicsx"], **kept}, document, out
-            )
-            try:
-                points = len(read_run(out)[1])
-            except FileNotFoundError as e:
-                raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
-            for number in range(points):
-                if not is_whole(out / "fields" / point_file(number)):
-                    raise Damaged(
-                        f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing"
-                    )
+            _check_complete(out, summary, document)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, document)
 
 
+def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> None:
+    """Check that a finished run is of this case and that all of its files are there."""
+    saved = {"version": summary["versions"]["magshell_fenicsx"]}
+    keys = "case", "sources", *document.outside
+    saved |= {key: summary[key] for key in keys if key in summary}
+    checkpoint.refuse_other_case(saved, document, out)
+    try:
+        points = len(read_run(out)[1])
+    except FileNotFoundError as e:
+        raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
+    for number in range(points):
+        fields = out / "fields" / point_file(number)
+        if not is_whole(fields):
+            raise Damaged(f"{fields}: is damaged: it is cut off, or missing")
+
+
 class RunFiles:
-    """Writes the files of a run; every method is collective, and rank 0 writes.
+    """Writer of the files of a run; every method is collective, and rank 0 writes.
 
     A new run changes nothing in the folder before `begin`: one that is refused loses no earlier
     results.
 
     Parameters
     ----------
-    begun
+    empty_checkpoint
         The content of an empty checkpoint, as the case and its files were before the scene was
         built.
     resume
@@ -215,7 +233,7 @@ class RunFiles:
     ----------
     journal
         The checkpoint.
-    kept
+    complete_points
         Number of points of an interrupted run with rows and fields on disk.
     elapsed
         Run time in seconds of the interrupted run up to the last of these points.
@@ -224,77 +242,82 @@ class RunFiles:
     journal: checkpoint.Checkpoint | None = None
 
     def __init__(
-        self, folder: Path, scene: Scene, begun: bytes, *, resume: bool, mesh: bytes | None = None
+        self,
+        folder: Path,
+        scene: Scene,
+        empty_checkpoint: bytes,
+        *,
+        resume: bool,
+        mesh: bytes | None = None,
     ) -> None:
-        self._folder, self._scene, self._comm, self._new, self._mesh = (
-            folder,
-            scene,
-            scene.comm,
-            begun,
-            mesh,
-        )
+        self._folder, self._scene, self._comm = folder, scene, scene.comm
+        self._empty_checkpoint, self._mesh = empty_checkpoint, mesh
         self._gatherer = gatherer(scene.model, scene.comm)
-        self.kept, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
+        self.complete_points, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
         if resume:
-            self.begin(again=True)
+            self.begin(continues=True)
             self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
 
-    def begin(self, *, again: bool = False) -> None:
+    def begin(self, *, continues: bool = False) -> None:
         """Make room for the files of the run, which has its first point, and open them.
 
         Parameters
         ----------
-        again
+        continues
             Keep the path of an interrupted run, and only delete what the end of a run writes.
         """
-        by_first(self._comm, self._make_room_again if again else self._make_room)
-        self.kept, self._rows = by_first(self._comm, self._open)
+        access_disk(self._comm, self._remove_end_of_run if continues else self._make_room)
+        self.complete_points, self._rows = access_disk(self._comm, self._open)
         self.journal = checkpoint.Checkpoint(
             self._folder / checkpoint.NAME, self._scene.model.V, self._comm
         )
 
     def _make_room(self) -> None:
-        """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is
-        known as a run's.
+        """Replace an earlier run by an empty checkpoint.
+
+        Whenever this is killed, what is there is known as a run's.
         """
         folder, file = self._folder, self._folder / checkpoint.NAME
-        new, earlier = folder / NEW, written(folder) - {NEW}
-        write_whole(new, self._new)  # a full disk stops here
+        new, earlier = folder / NEW_CHECKPOINT, files_of_runs(folder) - {NEW_CHECKPOINT}
+        write_whole(new, self._empty_checkpoint)  # a full disk stops here
         remove(folder, earlier - {SUMMARY, file.name})
         if self._mesh:
             write_whole(folder / MESH, self._mesh)
         new.replace(file)
         remove(folder, earlier & {SUMMARY})
 
-    def _make_room_again(self) -> None:
-        remove(
-            self._folder,
-            {n for n in written(self._folder) if n not in OF_PATH and not n.startswith("fields/")},
-        )
+    def _remove_end_of_run(self) -> None:
+        """Delete what the end of an interrupted run has written."""
+        files = files_of_runs(self._folder)
+        files = {name for name in files if not name.startswith("fields/")}
+        remove(self._folder, files - set(FILES_OF_PATH))
         if self._mesh and not (self._folder / MESH).exists():
             write_whole(self._folder / MESH, self._mesh)
 
     def _open(self) -> tuple[int, list[dict[str, str]]]:
-        begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
-        self._begun_with = {
-            key: value for key, value in begun.items() if key not in ("case", "version")
+        """Open the files; return the number of complete points and the rows of an earlier run."""
+        identity = checkpoint.identity_in(self._folder / checkpoint.NAME) or {}
+        self._origin = {
+            key: value for key, value in identity.items() if key not in ("case", "version")
         }
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
-        problem = self._scene.problem
-        halved = problem.mirror and not isinstance(
-            problem.mirror, Sector
-        )  # of which ParaView has one half
-        mirror = problem.mirror.rotated(problem.azimuth).plane if problem.mirror and halved else None
-        self._of_whole = mirror is None
+        problem, mirror = self._scene.problem, None
+        # ParaView has one half of a mirrored shell, and all of a shell of sectors
+        if problem.mirror and not isinstance(problem.mirror, Sector):
+            mirror = problem.mirror.rotated(problem.azimuth).plane
+        self._has_whole_shell = mirror is None
         self._R = case_sizes(problem.context.shell).R
-        about = About(problem.material.h, problem.material.nu, mirror, self._R)
-        drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
-        moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)
-        name = "" if not drawn else DRIVEN if moves else STILL
-        grids = [grid for room in SEEN for grid in room.grids(problem.loads)]
-        self._fields = FieldSeries(self._folder / "fields", about, name, self._table.kept, grids)
+        shell_data = ShellData(problem.material.h, problem.material.nu, mirror, self._R)
+        magnetic = problem.loads.magnetic
+        moves = problem.loads.contacts or (magnetic and magnetic.driven)
+        outlines_file = ""
+        if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
+            outlines_file = FILE_OF_POINT if moves else FILE_OF_ALL_POINTS
+        grids = [grid for observables in SEEN for grid in observables.grids(problem.loads)]
+        rows = self._table.complete_rows
+        self._fields = FieldSeries(self._folder / "fields", shell_data, outlines_file, rows, grids)
         sync_folder(self._folder)
-        return min(len(self._table.kept), self._fields.kept), self._table.kept
+        return min(len(rows), self._fields.complete_points), rows
 
     def write(self, row: Row, state: State, scene: Scene) -> None:
         """Write a point, unless an interrupted run has written it.
@@ -306,67 +329,69 @@ class RunFiles:
         """
         number = int(row["point"])
         if number < len(self._rows):
-            _same(row, self._rows[number])
-        if number < self.kept:
+            _check_equal(row, self._rows[number])
+        if number < self.complete_points:
             return
         if scene is not self._scene:
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
-        grids = [grid for room in SEEN for grid in room.on_grids(scene.sight, state)]
+        grids = [grid for observables in SEEN for grid in observables.on_grids(scene.sight, state)]
 
         def write() -> None:
             assert surface is not None
             problem = scene.problem
-            beside = problem.loads, state.mu, problem.material.h
-            every = (
-                whole(surface, mirror)
-                if mirror and (isinstance(mirror, Sector) or self._of_whole)
-                else surface
-            )
-            drawn = replace(every, outlines=outlines(*beside), solids=solids(*beside))
+            place = problem.loads, state.mu, problem.material.h
+            shell = surface
+            if mirror and (isinstance(mirror, Sector) or self._has_whole_shell):
+                shell = completed_by_symmetry(surface, mirror)
+            shell = replace(shell, outlines=outlines(*place), solids=solids(*place))
             self._table.write(row)
-            beside_it = {grid.name: grid_content(grid, self._R) for grid in grids}
-            self._fields.write(number, turned(drawn, problem.azimuth), row, beside_it)
+            grid_contents = {grid.name: grid_content(grid, self._R) for grid in grids}
+            self._fields.write(number, rotated_surface(shell, problem.azimuth), row, grid_contents)
 
-        by_first(self._comm, write)
+        access_disk(self._comm, write)
 
-    def summarise(self, content: dict[str, Any]) -> None:
+    def write_summary(self, content: dict[str, Any]) -> None:
         """Write summary.json."""
 
         def write() -> None:  # names the mesh file and the sources as they were at the start
-            data = json.loads(json.dumps({**content, **self._begun_with}))
-            data["says"] = plain(verdict(data, read_lines(self._folder / "path.csv")))
+            data = json.loads(json.dumps({**content, **self._origin}))
+            data["says"] = terminal_text(verdict(data, read_lines(self._folder / "path.csv")))
             write_whole(self._folder / SUMMARY, (json.dumps(data, indent=2) + "\n").encode())
 
-        by_first(self._comm, write)
+        access_disk(self._comm, write)
 
     def close(self, complete: bool) -> None:
-        """Close the files; at the end of a complete run, delete the checkpoint.
-
-        Write down which are the run's.
+        """Close the files, and write the manifest; at the end of a complete run, delete the
+        checkpoint.
         """
         assert self.journal
-        by_first(self._comm, lambda: self._table.close())
+        access_disk(self._comm, lambda: self._table.close())
         self.journal.close()
         if complete:
             self.journal.remove()
 
-        def listed() -> None:
-            (self._folder / LIST).unlink(missing_ok=True)  # `plot` may have made one meanwhile
-            note(self._folder)
+        def list_files() -> None:
+            (self._folder / MANIFEST).unlink(missing_ok=True)  # `plot` may have made one meanwhile
+            write_manifest(self._folder)
 
         with suppress(DiskError):  # without the list, summary.json says that they are
-            by_first(self._comm, listed)
+            access_disk(self._comm, list_files)
 
 
-def _same(row: Row, kept: dict[str, str]) -> None:
-    """Check that a recomputed point equals the one in path.csv."""
-    same = row["label"] == kept["label"] and all(
-        math.isclose(float(row[key]), float(kept[key]), rel_tol=1e-6, abs_tol=1e-9)
-        for key in COMPARED
+def _check_equal(row: Row, stored: dict[str, str]) -> None:
+    """Check that a recomputed point equals the one in path.csv; CaseError if not."""
+    is_equal = row["label"] == stored["label"] and all(
+        math.isclose(
+            float(row[key]),
+            float(stored[key]),
+            rel_tol=RELATIVE_TOLERANCE,
+            abs_tol=ABSOLUTE_TOLERANCE,
+        )
+        for key in COMPARED_COLUMNS
     )
-    if not same:
+    if not is_equal:
         raise CaseError(
-            f"--resume: point {row['point']} differs from path.csv; give another folder, or --overwrite in place of "
-            "--resume"
+            f"--resume: point {row['point']} differs from path.csv; give another folder, "
+            "or --overwrite in place of --resume"
         )

@@ -1,4 +1,4 @@
-"""After a run: derivatives of its results by numbers and fields."""
+"""Gradients after a run: derivatives of its results by numbers and fields."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -14,11 +14,11 @@ from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
-from magshell_fenicsx.output.fields.modes import columns_of, gradient_file
-from magshell_fenicsx.output.fields.surface import Surface, turned, whole
-from magshell_fenicsx.output.fields.vtu import About, vtu_content
+from magshell_fenicsx.output.fields.mode_fields import columns_of, gradient_file
+from magshell_fenicsx.output.fields.surface import Surface, completed_by_symmetry, rotated_surface
+from magshell_fenicsx.output.fields.vtu import ShellData, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
@@ -35,12 +35,12 @@ from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
-ROUNDING = 1e-10
+ROUNDING = 1e-10  # relative: a smaller component is zero
 Array = NDArray[np.float64]
 
 
 def refuse_unknown(scene: Scene) -> None:
-    """See before a run that its gradients can be asked for.
+    """Check before a run that its gradients can be computed.
 
     Raises
     ------
@@ -55,136 +55,176 @@ def refuse_unknown(scene: Scene) -> None:
 
 
 def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
-    """Keep the numbers, and with a folder write fields/gradients_*.vtu; collective.
+    """Compute the requested gradients of a run; collective.
+
+    They are added to `result.gradients`, and with a folder fields/gradients_*.vtu are written.
 
     Raises
     ------
     DiskError
         On every rank, if something cannot be written.
     """
-    scene, section = result.scene, result.scene.problem.gradients
-    for of in section.of if section else []:
-        assert section
+    section = result.scene.problem.gradients
+    if section is None:
+        return
+    for name in section.of:
         try:
-            kind, adjoint = _adjoint(result, of)
+            kind, adjoint = _adjoint(result, name)
         except (CaseError, FoldLost, Lost) as e:
-            say(f"warning: no gradient of {of}: {e}")
+            say(f"warning: no gradient of {name}: {e}")
             continue
-        slopes = _slopes(adjoint, of, section.by, say)
-        if not slopes:
-            continue
-        fields = {by: each for by, each in slopes.items() if isinstance(each, FieldGradient)}
-        numbers = {
-            by: float(each) for by, each in slopes.items() if not isinstance(each, FieldGradient)
-        }
-        scene = adjoint.scene  # that of the end, which may be of another model
-        told: dict[str, dict[str, Any]] = {
-            by: {"alike": _alike(scene, by, each)} for by, each in fields.items()
-        }
-        if fields:
-            drawn = _surface(scene, adjoint, fields)
-            for by, most in scene.comm.bcast(
-                drawn and {by: _most(drawn, by) for by in fields}
-            ).items():
-                told[by] |= most
-            if folder:
-                by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
-        result.gradients[of] = {
-            "value": adjoint.shown,
-            "kind": kind,
-            "numbers": numbers,
-            "fields": told,
-        }
-        for by, v in told.items():
-            alike, place = _words(v["alike"], v["most_per_area"], 6), _words(v["at"], 1.0, 3)
-            say(
-                f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})"
-            )
-        for by, slope in numbers.items():
-            say(f"d {of}/d {by}: {slope:.6g}")
+        gradients = _gradients(adjoint, name, section.by, say)
+        if gradients:
+            _report(result, name, kind, adjoint, gradients, folder, say)
 
 
-def _slopes(adjoint: Adjoint, of: str, names: Sequence[str], say: Say) -> dict[str, Gradient]:
-    """The derivatives of a result by all that it has one by; the others are named; collective."""
-    slopes = dict[str, Gradient]()
-    for by in names:
+def _report(
+    result: Result,
+    name: str,
+    kind: str,
+    adjoint: Adjoint,
+    gradients: Mapping[str, Gradient],
+    folder: Path | None,
+    say: Say,
+) -> None:
+    """Keep the gradients of the result `name`, by parameter; write and say them; collective."""
+    scene = adjoint.scene  # that of the end, which may be of another model
+    fields, numbers = dict[str, FieldGradient](), dict[str, float]()
+    for parameter, gradient in gradients.items():
+        if isinstance(gradient, FieldGradient):
+            fields[parameter] = gradient
+        else:
+            numbers[parameter] = float(gradient)
+    entries: dict[str, dict[str, Any]] = {
+        parameter: {"alike": _by_uniform_change(scene, parameter, gradient)}
+        for parameter, gradient in fields.items()
+    }
+    if fields:
+        surface = _surface(scene, adjoint, fields)
+        largest: dict[str, dict[str, Any]] = {}
+        if surface:
+            largest = {parameter: _largest_density(surface, parameter) for parameter in fields}
+        for parameter, entry in scene.comm.bcast(largest).items():
+            entries[parameter] |= entry
+        if folder:
+            write = partial(_write, gradient_file(folder, name), surface, scene)
+            access_disk(scene.comm, write)
+    result.gradients[name] = {
+        "value": adjoint.shown,
+        "kind": kind,
+        "numbers": numbers,
+        "fields": entries,
+    }
+    for parameter, entry in entries.items():
+        uniform = _words(entry["alike"], entry["most_per_area"], 6)
+        place = _words(entry["at"], 1.0, 3)
+        say(
+            f"d {name}/d {parameter}: {uniform} for a change that is the same everywhere, "
+            f"most per area at ({place})"
+        )
+    for parameter, slope in numbers.items():
+        say(f"d {name}/d {parameter}: {slope:.6g}")
+
+
+def _gradients(
+    adjoint: Adjoint, name: str, parameters: Sequence[str], say: Say
+) -> dict[str, Gradient]:
+    """Return the derivatives of a result by parameter; collective. A warning names the others."""
+    gradients = dict[str, Gradient]()
+    for parameter in parameters:
         try:
-            slopes[by] = derivative(adjoint, by)
+            gradients[parameter] = derivative(adjoint, parameter)
         except (CaseError, FoldLost, Lost) as e:
-            say(f"warning: no gradient of {of} by {by}: {e}")
-    return slopes
+            say(f"warning: no gradient of {name} by {parameter}: {e}")
+    return gradients
 
 
 def _words(values: Sequence[float], size: float, digits: int) -> str:
-    """Numbers beside a size: what is but rounding of it is 0."""
-    return ", ".join(f"{x if abs(x) > ROUNDING * size else 0.0:.{digits}g}" for x in values)
+    """Return numbers as text, zero where they are rounding beside a size."""
+    rounded = [value if abs(value) > ROUNDING * size else 0.0 for value in values]
+    return ", ".join(f"{value:.{digits}g}" for value in rounded)
 
 
-def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
-    assert drawn
-    write_whole(
-        file, vtu_content(drawn, About(scene.problem.material.h, scene.problem.material.nu))
-    )
+def _write(file: Path, surface: Surface | None, scene: Scene) -> None:
+    """Write the fields of a surface."""
+    assert surface
+    material = scene.problem.material
+    write_whole(file, vtu_content(surface, ShellData(material.h, material.nu)))
 
 
-def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
-    """What the derivatives of a result are contracted with, and of which kind it is."""
-    scene, history = result.scene, result.walked
-    if of in FOLDS:
-        return instabilities(scene, history.located, of, 1, history.begins)[0]
-    beyond = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
-    if result.stopped or beyond or history.end is None:
-        raise Lost(result.stopped or beyond or "the path has no end")
-    refuse_moving(scene, history.end, of)
-    return adjoint_at_end(scene, history, of)
+def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
+    """Return the kind of a result, and its adjoint: what its derivatives are contracted with.
+
+    Raises
+    ------
+    Lost
+        If the run has no such result.
+    """
+    scene, history = result.scene, result.path_history
+    if name in FOLDS:
+        return instabilities(scene, history.located, name, 1, history.begins)[0]
+    reason = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
+    if result.stopped or reason or history.end is None:
+        raise Lost(result.stopped or reason or "the path has no end")
+    refuse_moving(scene, history.end, name)
+    return adjoint_at_end(scene, history, name)
 
 
-def _alike(scene: Scene, by: str, gradient: FieldGradient) -> list[float]:
-    """By a field that changes alike everywhere, of vectors in the case's frame; of a meridian along
-    e_rho, e_z.
+def _by_uniform_change(scene: Scene, parameter: str, gradient: FieldGradient) -> list[float]:
+    """Return the derivative by a uniform change of a field.
+
+    Vectors are in the frame of the case; on a meridian along e_rho and e_z.
     """
     total = gradient.within(np.ones(len(gradient.forces), dtype=bool))
-    if by == "remanence":
+    if parameter == "remanence":
         total = total[[0, 2]] if scene.problem.meridian else total @ rotation(scene.problem.azimuth)
-    return [float(v) for v in total]
+    return [float(component) for component in total]
 
 
-def _most(drawn: Surface, by: str) -> dict[str, Any]:
-    """The largest size per area of a field, and where."""
-    sizes = np.linalg.norm(np.column_stack([drawn.fields[name] for name in columns_of(by)]), axis=1)
+def _largest_density(surface: Surface, parameter: str) -> dict[str, Any]:
+    """Return the largest size per area of a field's gradient, and where it is."""
+    columns = [surface.fields[name] for name in columns_of(parameter)]
+    sizes = np.linalg.norm(np.column_stack(columns), axis=1)
     place = int(np.argmax(sizes))
-    return {"most_per_area": float(sizes[place]), "at": [float(x) for x in drawn.r0[place]]}
+    return {
+        "most_per_area": float(sizes[place]),
+        "at": [float(coordinate) for coordinate in surface.r0[place]],
+    }
 
 
 def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]) -> Surface | None:
-    """The whole deformed shell with the densities as its fields, on rank 0; collective."""
-    gathering, model, drawn = (
-        gatherer(scene.model, scene.comm),
-        scene.model,
-        dict[str, Array | None](),
-    )
+    """Return the whole deformed shell with the gradients per area as fields, on rank 0;
+    collective.
+    """
+    model = scene.model
+    gathering, densities = gatherer(model, scene.comm), dict[str, Array | None]()
     width = model.V.dofmap.bs
-    for by, each in fields.items():
-        values = density(scene, each)
-        if by == "remanence":
-            drawn[by] = _at_nodes(scene, gathering, values[:, [0, 2]] if width == 2 else values)
+    for parameter, gradient in fields.items():
+        values = density(scene, gradient)
+        if parameter == "remanence":
+            vectors = values[:, [0, 2]] if width == 2 else values
+            densities[parameter] = _at_nodes(scene, gathering, vectors)
             continue
-        for i, name in enumerate(columns_of(by)):
+        for i, name in enumerate(columns_of(parameter)):
             vectors = np.zeros((len(values), width))
             vectors[:, -1] = values[:, i]
-            along = _at_nodes(scene, gathering, vectors)
-            drawn[name] = None if along is None else along[:, 2]
+            at_nodes = _at_nodes(scene, gathering, vectors)
+            densities[name] = None if at_nodes is None else at_nodes[:, 2]
     base = gathering.gather(adjoint.state.u)
     if base is None:
         return None
-    surface = replace(base, fields={name: v for name, v in drawn.items() if v is not None})
+    present = {name: density for name, density in densities.items() if density is not None}
+    surface = replace(base, fields=present)
     if model.multiplicity > 1:
         assert not model.axisymmetric
-        surface = whole(surface, model.mirror)
-    return turned(surface, scene.problem.azimuth)
+        surface = completed_by_symmetry(surface, model.mirror)
+    return rotated_surface(surface, scene.problem.azimuth)
 
 
 def _at_nodes(scene: Scene, gathering: Gatherer, values: Array) -> Array | None:
-    """Vectors at this rank's nodes as those at all nodes that are drawn, on rank 0; collective."""
-    gathered = gathering.gather(values.ravel()[: scene.model.system.size])
-    return gathered.u if gathered else None
+    """Return vectors at the nodes of pictures, on rank 0; collective.
+
+    `values` are those at this rank's nodes.
+    """
+    surface = gathering.gather(values.ravel()[: scene.model.system.size])
+    return surface.u if surface else None

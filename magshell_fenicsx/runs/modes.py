@@ -1,6 +1,4 @@
-"""After a run: null vectors at the instabilities, the modes that the case requests, natural
-frequencies.
-"""
+"""Modes after a run: null vectors at the instabilities, requested modes, natural frequencies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +11,7 @@ import numpy as np
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
-from magshell_fenicsx.output.fields.modes import (
+from magshell_fenicsx.output.fields.mode_fields import (
     NAME,
     frequency_table,
     hertz,
@@ -23,12 +21,12 @@ from magshell_fenicsx.output.fields.modes import (
     wave_of,
     write_mode,
 )
-from magshell_fenicsx.output.fields.ring import Waves, waves_around
+from magshell_fenicsx.output.fields.ring import WaveCount, waves_around
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About
+from magshell_fenicsx.output.fields.vtu import ShellData
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first
-from magshell_fenicsx.problem.wanted import FrequenciesSection, StabilitySection
+from magshell_fenicsx.output.store.folder import access_disk
+from magshell_fenicsx.problem.requests import FrequenciesSection, StabilitySection
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.shells.mass import Model
@@ -37,8 +35,9 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.touch import hardened, pressing, rigid
 
 Say = Callable[[str], None]
-ROUNDING = 1e-9  # a coordinate over R as small as this is zero
-SAME = 1e-3  # relative change of omega^2 by stiffer bodies that needs no warning
+ROUNDING = 1e-9  # over R: a smaller coordinate is zero
+MAX_CONTACT_CHANGE = 1e-3  # relative, of omega^2 by stiffer bodies, without a warning
+FURTHER_MODES = 2  # that are computed with stiffer bodies, to find each mode again
 
 
 def modes_after(result: Result, folder: Path, say: Say) -> None:
@@ -51,43 +50,56 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
     DiskError
         On every rank, if something cannot be written.
     """
-    wanted = result.scene.problem.stability
-    if result.singular or wanted:
-        writer = _Writer(result, folder, say)
+    section = result.scene.problem.stability
+    if result.singular or section:
+        writer = _ModeWriter(result, folder, say)
         writer.null_vectors()
-        if wanted:
-            writer.modes(wanted)
+        if section:
+            writer.modes(section)
 
 
 @dataclass(frozen=True)
-class _Writer:
+class _ModeWriter:
+    """Writer of the modes of a run; what sees the modes of a scene is made once."""
+
     result: Result
     folder: Path
     say: Say
-    _known: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
-    _seen: dict[int, tuple[Seen, ShellModes, Gatherer]] = field(default_factory=dict)
+    _model_modes: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
+    _whole_shell_modes: dict[int, tuple[Seen, ShellModes, Gatherer]] = field(default_factory=dict)
 
-    def _all_of(self, number: int) -> tuple[Seen, ShellModes, Gatherer]:
-        """The same of the model that sees all modes of the shell."""
-        scene = self.result.scene_of(number)
-        if id(scene) not in self._seen:
-            on = seen_on(scene.model)
-            self._seen[id(scene)] = on, ShellModes(on.model), gatherer(on.model, scene.comm)
-        return self._seen[id(scene)]
+    def _modes_of_whole_shell(self, number: int) -> tuple[Seen, ShellModes, Gatherer]:
+        """Return what sees all modes of the shell at a point, its modes, and their gatherer.
 
-    def _of(self, number: int) -> tuple[ShellModes, Gatherer]:
-        """The modes of the model of a point, and what gathers them."""
+        The model of the point may exclude modes.
+        """
         scene = self.result.scene_of(number)
-        if id(scene) not in self._known:
-            self._known[id(scene)] = ShellModes(scene.model), gatherer(scene.model, scene.comm)
-        return self._known[id(scene)]
+        if id(scene) not in self._whole_shell_modes:
+            whole_shell = seen_on(scene.model)
+            self._whole_shell_modes[id(scene)] = (
+                whole_shell,
+                ShellModes(whole_shell.model),
+                gatherer(whole_shell.model, scene.comm),
+            )
+        return self._whole_shell_modes[id(scene)]
+
+    def _modes_of(self, number: int) -> tuple[ShellModes, Gatherer]:
+        """Return the modes of the model of a point, and their gatherer."""
+        scene = self.result.scene_of(number)
+        if id(scene) not in self._model_modes:
+            self._model_modes[id(scene)] = (
+                ShellModes(scene.model),
+                gatherer(scene.model, scene.comm),
+            )
+        return self._model_modes[id(scene)]
 
     def null_vectors(self) -> None:
+        """Write the null vectors at the instabilities, and say how many waves they have."""
         for number, state in self.result.singular.items():
             row, scene = self.result.rows[number], self.result.scene_of(number)
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
             try:
-                vector = self._of(number)[0].null_vector(state, label)
+                vector = self._modes_of(number)[0].null_vector(state, label)
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
@@ -95,54 +107,60 @@ class _Writer:
             if surface is not None and scene.problem.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
                 exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
-                self.result.largest[number] = [float(x) for x in exact * scene.problem.length]
+                self.result.mode_places[number] = [float(x) for x in exact * scene.problem.length]
             if surface is not None and not label and (waves := waves_around(surface)):
-                self.say(_waves_said(number, waves))
+                self.say(_waves_message(number, waves))
 
-    def modes(self, wanted: StabilitySection) -> None:
+    def modes(self, section: StabilitySection) -> None:
+        """Write the modes of least stiffness that a section requests."""
         points = self.result.singular
-        if wanted.at == "end":
+        if section.at == "end":
             points = {self.result.end: self.result.last}
         by_point: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
-            on, shell, _ = self._all_of(number)
+            whole_shell, shell, _ = self._modes_of_whole_shell(number)
             try:
-                loose = self.result.scene_of(number).loose
-                lowest = shell.lowest(on.state(state), wanted.modes, loose=loose)
+                allows_rigid_motion = self.result.scene_of(number).loose
+                lowest = shell.lowest(
+                    whole_shell.state(state), section.modes, loose=allows_rigid_motion
+                )
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
-                by_point[number] = lowest[: max(wanted.modes, unstable)]
+                by_point[number] = lowest[: max(section.modes, unstable)]
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
-        by_first(
+        access_disk(
             self.result.scene.comm,
             partial(write_whole, self.folder / "stability.csv", mode_table(by_point)),
         )
         for number, modes in by_point.items():
-            for n, mode in enumerate(modes[: wanted.modes], 1):
-                file = mode_file(self.folder, number, str(n), mode.label)
-                on, _, gathering = self._all_of(number)
-                state, scene = on.state(points[number]), self.result.scene_of(number)
-                write_mode_of(scene, gathering, file, state, mode.label, mode.vector, on)
+            for rank, mode in enumerate(modes[: section.modes], 1):
+                file = mode_file(self.folder, number, str(rank), mode.label)
+                whole_shell, _, gathering = self._modes_of_whole_shell(number)
+                state, scene = whole_shell.state(points[number]), self.result.scene_of(number)
+                write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
             first = modes[0]
-            self.say(
-                f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip()
-            )
+            stiffness = f"{first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip()
+            self.say(f"lowest stiffness at point {number}: {stiffness}")
 
     def _write(
         self, number: int, name: str, state: State, label: str, vector: Vector
     ) -> Surface | None:
+        """Write the null vector of a point and return its surface on rank 0; collective."""
         file = mode_file(self.folder, number, name, label)
         return write_mode_of(
-            self.result.scene_of(number), self._of(number)[1], file, state, label, vector
+            self.result.scene_of(number), self._modes_of(number)[1], file, state, label, vector
         )
 
 
-def _waves_said(point: int, waves: Waves) -> str:
-    """How many waves a null vector has, with a warning where its mesh does not resolve them."""
+def _waves_message(point: int, waves: WaveCount) -> str:
+    """Return how many waves a null vector has; a warning where its mesh does not resolve them."""
     m, largest = waves.number, waves.largest
     if waves.resolved:
         return f"the null vector at point {point} has {m} waves around e3"
-    return f"warning: the null vector at point {point} has {m} waves around e3, and the mesh resolves {largest}"
+    return (
+        f"warning: the null vector at point {point} has {m} waves around e3, "
+        f"and the mesh resolves {largest}"
+    )
 
 
 def write_mode_of(
@@ -152,43 +170,56 @@ def write_mode_of(
     state: State,
     label: str,
     vector: Vector,
-    on: Seen | None = None,
+    whole_shell: Seen | None = None,
 ) -> Surface | None:
-    """Write a mode at a state, both of the model where it is seen, and return it on rank 0;
-    collective.
+    """Write a mode at a state, and return its surface on rank 0; collective.
+
+    Parameters
+    ----------
+    gatherer
+        Gatherer of the model that has the mode.
+    state, vector
+        State and mode of that model.
+    label
+        Label of the mode, see `mode_fields.mode_surface`.
+    whole_shell
+        That model, if it is not the scene's.
     """
-    model = on.model if on else scene.model
+    model = whole_shell.model if whole_shell else scene.model
     surface = mode_surface(model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
 
     def write() -> None:
         assert surface is not None
-        write_mode(file, surface, About(scene.problem.material.h, scene.problem.material.nu))
+        write_mode(file, surface, ShellData(scene.problem.material.h, scene.problem.material.nu))
 
-    by_first(scene.comm, write)
+    access_disk(scene.comm, write)
     return surface
 
 
-def wanted(section: FrequenciesSection | None, point: int) -> bool:
-    """Whether the state of a point must be kept for its frequencies; the start and the end are
-    known anyway.
+def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
+    """Whether the state of a point must be kept for its frequencies.
+
+    The states of the start and of the end are known anyway.
     """
-    at = section.at if section else ()
-    return at == "all" or (isinstance(at, list) and point in at)
+    requested_points = section.at if section else ()
+    return requested_points == "all" or (
+        isinstance(requested_points, list) and point in requested_points
+    )
 
 
-def own_wave(model: Model) -> str:
-    """The wave of the model's own modes."""
+def symmetric_wave(model: Model) -> str:
+    """Return the wave of modes with the symmetry of a model, see `mode_fields.wave_of`."""
     if model.axisymmetric:
         return "0"
     return "symmetric" if model.multiplicity > 1 else ""
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
-    """How much omega^2 of each mode changes, relative, if the bodies that touch are four times as
-    stiff; collective.
+    """Return how much omega^2 of each mode changes with stiffer bodies, relative; collective.
 
-    It is compared with the nearest one of the same label: a mode that is not there any more changes
-    too. nan, if the shell finds no such equilibrium near.
+    The bodies in contact are four times as stiff. A mode is compared with the nearest one of the
+    same label; the change of a mode that is not there any more is 1. nan, if the shell finds no
+    such equilibrium near.
     """
     bodies = pressing(scene, state)
     if not bodies:
@@ -196,35 +227,34 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     harder = hardened(scene, state, bodies)
     if harder is None:
         return [nan] * len(modes)
-    on = seen_on(scene.model)
-    others = ShellModes(on.model).vibrations(on.state(harder), len(modes) + 2)
-    return [
-        min(
-            (abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label),
-            default=1.0,
-        )
-        for mode in modes
-    ]
+    whole_shell = seen_on(scene.model)
+    shell_modes, state = ShellModes(whole_shell.model), whole_shell.state(harder)
+    stiffer_modes = shell_modes.vibrations(state, len(modes) + FURTHER_MODES)
+    changes = []
+    for mode in modes:
+        candidates = [other for other in stiffer_modes if other.label == mode.label]
+        differences = (abs(other.eigenvalue / mode.eigenvalue - 1) for other in candidates)
+        changes.append(min(differences, default=1.0))
+    return changes
 
 
-def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
-    """The warning for a mode that depends on the penalty of a contact."""
-    by = (
-        "no equilibrium near to compare with"
-        if isnan(change)
-        else f"omega2 changes by {change:.2g} of it"
-    )
+def _contact_warning(point: int, rank: int, mode: ShellMode, change: float) -> str:
+    """Return the warning for a mode that depends on the penalty of a contact."""
+    effect = f"omega2 changes by {change:.2g} of it"
+    if isnan(change):
+        effect = "no equilibrium near to compare with"
     return (
-        f"warning: frequency {n} of point {point} (omega2 {mode.eigenvalue:.6g}) depends on the stiffness of the "
-        f"bodies: four times as stiff, {by}"
+        f"warning: frequency {rank} of point {point} (omega2 {mode.eigenvalue:.6g}) depends on "
+        f"the stiffness of the bodies: four times as stiff, {effect}"
     )
 
 
 def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
-    """Keep the modes; with a folder write frequencies.csv, and fields/mode_*_f*.vtu of the first
-    and the last point.
+    """Compute the requested natural frequencies of a run; collective.
 
-    Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
+    The modes are kept in the result. With a folder frequencies.csv is written, and
+    fields/mode_*_f*.vtu of the first and the last point. Call it after the run, because it
+    overwrites the model's tangent.
 
     Raises
     ------
@@ -236,56 +266,88 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         return
     if scene.model.without_potential and scene.problem.loads.pressure:
         say(
-            "warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent"
+            "warning: a pressure at a free edge has no potential: frequencies are those of the "
+            "symmetric tangent"
         )
-    states = dict(sorted(result.kept.items()))
-    if section.at in ("ends", "end"):
-        start = {0: scene.unloaded()} if section.at == "ends" else {}
-        states = {**start, result.end: result.last}
-    elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
-        say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
-    own, unit = dict[int, str](), scene.problem.time_unit
-    of, seen = dict[int, tuple[Seen, ShellModes]](), dict[int, Seen]()
+    states = _states_of_frequencies(result, section, say)
+    symmetric_waves, time_unit = dict[int, str](), scene.problem.time_unit
+    modes_of_scene = dict[int, tuple[Seen, ShellModes]]()
+    whole_shells = dict[int, Seen]()
     for number, state in states.items():
         scene = result.scene_of(number)
-        if id(scene) not in of:
-            on = seen_on(scene.model)
-            of[id(scene)] = on, ShellModes(on.model)
-        on, shell = of[id(scene)]
-        seen[number], own[number] = on, own_wave(on.model)
+        if id(scene) not in modes_of_scene:
+            whole_shell = seen_on(scene.model)
+            modes_of_scene[id(scene)] = whole_shell, ShellModes(whole_shell.model)
+        whole_shell, shell_modes = modes_of_scene[id(scene)]
+        whole_shells[number] = whole_shell
+        symmetric_waves[number] = symmetric_wave(whole_shell.model)
         state = rigid(scene, state)
         try:
-            result.frequencies[number] = modes = shell.vibrations(
-                on.state(state), section.count, loose=scene.loose
+            modes = shell_modes.vibrations(
+                whole_shell.state(state), section.count, loose=scene.loose
             )
+            result.frequencies[number] = modes
             if scene.model.contacts:
-                result.contact_changes[number] = changes = contact_changes(scene, state, modes)
-                for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
-                    if not change <= SAME:
-                        say(_soft(number, n, mode, change))
+                changes = contact_changes(scene, state, modes)
+                result.contact_changes[number] = changes
+                for rank, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
+                    if not change <= MAX_CONTACT_CHANGE:
+                        say(_contact_warning(number, rank, mode, change))
         except ModesNotFound as e:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
-        rigid_modes = [mode for mode in modes if mode.eigenvalue == 0.0] if scene.loose else []
-        motions = sum(
-            2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes
-        )  # a wave has a twin
-        free = f"{motions} rigid motions, " if motions else ""
-        first = modes[min(len(rigid_modes), len(modes) - 1)]
-        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own[number])
-        in_hertz = "" if f is None else f", {f:.6g} Hz"
-        of_mode = f", m = {wave}" if wave.isdigit() else wave and f", {wave}"
-        say(
-            f"{free}lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}{of_mode}"
-        )
+        say(_lowest_frequency(number, scene, modes, symmetric_waves[number], time_unit))
     if folder is None:
         return
-    content = frequency_table(result.frequencies, own, unit, result.contact_changes)
-    by_first(scene.comm, partial(write_whole, folder / NAME, content))
+    content = frequency_table(
+        result.frequencies, symmetric_waves, time_unit, result.contact_changes
+    )
+    access_disk(scene.comm, partial(write_whole, folder / NAME, content))
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
         scene = result.scene_of(number)
-        on = seen[number]
-        gathering, state = gatherer(on.model, scene.comm), on.state(states[number])
-        for n, mode in enumerate(result.frequencies[number][: section.count], 1):
-            file = mode_file(folder, number, f"f{n}", mode.label)
-            write_mode_of(scene, gathering, file, state, mode.label, mode.vector, on)
+        whole_shell = whole_shells[number]
+        gathering = gatherer(whole_shell.model, scene.comm)
+        state = whole_shell.state(states[number])
+        for rank, mode in enumerate(result.frequencies[number][: section.count], 1):
+            file = mode_file(folder, number, f"f{rank}", mode.label)
+            write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
+
+
+def _states_of_frequencies(
+    result: Result, section: FrequenciesSection, say: Say
+) -> dict[int, State]:
+    """Return number -> state of the points whose frequencies are requested, ascending."""
+    states = dict(sorted(result.states_for_frequencies.items()))
+    if section.at in ("ends", "end"):
+        start = {0: result.scene.unloaded()} if section.at == "ends" else {}
+        return {**start, result.end: result.last}
+    if isinstance(section.at, list):
+        missing = sorted(set(section.at) - set(states))
+        if missing:
+            say(f"warning: frequencies.at: the path has no point {', '.join(map(str, missing))}")
+    return states
+
+
+def _lowest_frequency(
+    number: int,
+    scene: Scene,
+    modes: Sequence[ShellMode],
+    wave_of_symmetric: str,
+    time_unit: float | None,
+) -> str:
+    """Return words for the lowest frequency at a point, and for the rigid motions below it."""
+    rigid_modes = [mode for mode in modes if mode.eigenvalue == 0.0] if scene.loose else []
+    # a wave has a twin
+    motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
+    rigid_motions = f"{motions} rigid motions, " if motions else ""
+    first = modes[min(len(rigid_modes), len(modes) - 1)]
+    frequency = hertz(first.eigenvalue, time_unit)
+    in_hertz = "" if frequency is None else f", {frequency:.6g} Hz"
+    wave = wave_of(first.label, wave_of_symmetric)
+    wave_words = ""
+    if wave:
+        wave_words = f", m = {wave}" if wave.isdigit() else f", {wave}"
+    return (
+        f"{rigid_motions}lowest frequency at point {number}: "
+        f"omega2 {first.eigenvalue:.6g}{in_hertz}{wave_words}"
+    )

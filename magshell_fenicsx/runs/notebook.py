@@ -1,5 +1,4 @@
-"""A scene in a notebook: the deformed surface as arrays and for pyvista, and pictures without
-files.
+"""A scene in a notebook: the deformed surface as arrays and for pyvista, pictures without files.
 
 All functions are collective. Results that only rank 0 has are None on other ranks.
 """
@@ -14,13 +13,13 @@ from subprocess import DEVNULL, PIPE, Popen
 from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.surface import Surface, turned, whole
+from magshell_fenicsx.output.fields.surface import Surface, completed_by_symmetry, rotated_surface
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import PICTURES, figures
-from magshell_fenicsx.output.pictures.view import run_camera
-from magshell_fenicsx.output.store.known import pole_of
+from magshell_fenicsx.output.pictures.rendering import run_camera
+from magshell_fenicsx.output.store.stored_results import pole_of
 from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.record import Record
@@ -30,45 +29,44 @@ if TYPE_CHECKING:  # take long to import
     import pyvista
     from matplotlib.figure import Figure
 
-STARTING = 20.0  # s in which a virtual display is there
-_displays: list[Popen[bytes]] = []  # the pipes to those that were started
+DISPLAY_TIMEOUT = 20.0  # s in which a virtual display starts
+_displays: list[Popen[bytes]] = []  # the virtual displays that were started
 
 
 def surface(scene: Scene, record: Record) -> Surface | None:
-    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells`
-    and `fields`.
+    """Return the whole deformed mid-surface as NumPy arrays: `r0`, `u`, `n0`, `w`, `cells`,
+    `fields`.
 
-    The fields are membrane strains `E` and bending moments over D/R `M`, their principal values
-    `E_1`, `E_2`, `M_1`, `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`,
-    `tau`; see `Surface`.
+    Lengths are in R. The fields are membrane strains `E` and bending moments over D/R `M`, their
+    principal values `E_1`, `E_2`, `M_1`, `M_2`, and those of the magnetic field: `Br`, `Ba`,
+    `p_mag`, `f_mag`, `k`, `tau`; see `Surface`.
     """
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
     base = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return (
-        turned(whole(base, problem.mirror) if problem.mirror else base, problem.azimuth)
-        if base
-        else None
-    )
+    if base is None:
+        return None
+    shell = completed_by_symmetry(base, problem.mirror) if problem.mirror else base
+    return rotated_surface(shell, problem.azimuth)
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
-    """The deformed mid-surface in flat triangles, for pyvista, with w_over_h, u_over_h, ... at its
-    points.
+    """Return the deformed mid-surface in flat triangles, for pyvista.
 
-    `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
-    `plot(scalars="w_over_h")` shows it, after `off_screen()` also where there is no display.
+    Its points have w_over_h, u_over_h, .... `points` (n, 3) and `regular_faces` (m, 3) are the
+    nodes in R and the triangles as NumPy arrays; `plot(scalars="w_over_h")` shows it, after
+    `off_screen()` also where there is no display.
     """
-    drawn = surface(scene, record)
-    return _smooth(drawn, scene.problem.material.h) if drawn else None
+    shell = surface(scene, record)
+    return _smooth(shell, scene.problem.material.h) if shell else None
 
 
 def off_screen() -> None:
-    """Let pyvista draw without windows, also where there is no display; otherwise it ends the whole
-    program there.
+    """Let pyvista draw without windows, also where there is no display.
 
-    VTK needs a display even for pictures in files. Where `DISPLAY` names none, a virtual one is
-    started (Xvfb, Debian's package xvfb) that lasts as long as this process.
+    Otherwise it ends the whole program there: VTK needs a display even for pictures in files. Where
+    `DISPLAY` names none, a virtual one is started (Xvfb, Debian's package xvfb) that lasts as long
+    as this process.
 
     Raises
     ------
@@ -84,28 +82,29 @@ def off_screen() -> None:
         raise RuntimeError(
             "pyvista: finds no display, and there is no Xvfb to make one: install the package xvfb"
         )
-    read, number = os.pipe()
-    made = f"Xvfb -displayfd {number} -noreset -screen 0 1600x1200x24 -nolisten tcp & cat; kill $!"
-    with os.fdopen(read) as shown:
+    read_end, write_end = os.pipe()
+    command = (
+        f"Xvfb -displayfd {write_end} -noreset -screen 0 1600x1200x24 -nolisten tcp & cat; kill $!"
+    )
+    with os.fdopen(read_end) as stream:
         try:
-            # the shell waits for this process: a display that ended before VTK has left it would
-            # end the process too a ^C in the terminal is not for the display
-            quiet: dict[str, Any] = {
+            # The shell waits for this process: a display that ended before VTK has left it would
+            # end the process too. A ^C in the terminal is not for the display.
+            options: dict[str, Any] = {
                 "stdout": DEVNULL,
                 "stderr": DEVNULL,
                 "start_new_session": True,
             }
-            shell = Popen(["sh", "-c", made], stdin=PIPE, pass_fds=[number], **quiet)
+            shell = Popen(["sh", "-c", command], stdin=PIPE, pass_fds=[write_end], **options)
         finally:
-            os.close(number)
+            os.close(write_end)
         _displays.append(shell)
-        ready, _, _ = select([shown], [], [], STARTING)
-        said = (
-            shown.readline().strip() if ready else ""
-        )  # the whole line: Xvfb ends if it cannot write that
-    if not said.isdecimal():
+        readable, _, _ = select([stream], [], [], DISPLAY_TIMEOUT)
+        # the whole line: Xvfb ends if it cannot write that
+        name = stream.readline().strip() if readable else ""
+    if not name.isdecimal():
         raise RuntimeError("pyvista: finds no display, and Xvfb has made none")
-    os.environ["DISPLAY"] = f":{said}"
+    os.environ["DISPLAY"] = f":{name}"
 
 
 def picture(
@@ -113,23 +112,32 @@ def picture(
     record: Record,
     of: Literal["shell", "strains", "stretches", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
-    """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such
-    fields.
+    """Return one picture of a run, as in shell.png, strains.png, ...
+
+    None also if the scene has no such fields.
+
+    Parameters
+    ----------
+    of
+        Name of the picture.
+
+    Raises
+    ------
+    ValueError
+        If there is no such picture.
     """
     if of not in PICTURES:
         raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
-    drawn_surface = surface(scene, record)
-    if drawn_surface is None:
+    shell = surface(scene, record)
+    if shell is None:
         return None
     style = scene.problem.output
-    drawn = figures(
-        drawn_surface, scene.problem.material.h, style, run_camera(drawn_surface, style), [of]
-    )
-    return _in_line(drawn[of]) if drawn else None
+    pictures = figures(shell, scene.problem.material.h, style, run_camera(shell, style), [of])
+    return _in_line(pictures[of]) if pictures else None
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
-    """The curve of the path, as in curve.png; by default for the amplitude that varied last.
+    """Return the curve of the path, as in curve.png; by default for the amplitude that varied last.
 
     Raises
     ------
@@ -137,25 +145,25 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
         If nothing has varied, or the scene has no such amplitude.
     """
     records = list(records)
-    varied = amplitude or (records[-1].amplitude if records else "")
-    if not varied:
+    name = amplitude or (records[-1].amplitude if records else "")
+    if not name:
         raise ValueError(
             "curve: nothing has varied in these records: give those of follow or trace, all of them"
         )
-    drawn, place = rows(scene, records), pole_of(scene.problem.document.data)
-    axes = axes_of(varied, drawn[0])
-    if not all(axis.name in drawn[0] for axis in axes):
-        amplitudes = ", ".join(
-            dict.fromkeys(record.amplitude for record in records if record.amplitude)
-        )
+    table_rows = rows(scene, records)
+    pole = pole_of(scene.problem.document.data)
+    axes = axes_of(name, table_rows[0])
+    if not all(axis.name in table_rows[0] for axis in axes):
+        varied = dict.fromkeys(record.amplitude for record in records if record.amplitude)
         raise ValueError(
-            f"curve: {varied}: the scene has no such amplitude; these records vary {amplitudes or 'none'}"
+            f"curve: {name}: the scene has no such amplitude; "
+            f"these records vary {', '.join(varied) or 'none'}"
         )
-    return _in_line(curve_figure(drawn, varied, scene.problem.output, place))
+    return _in_line(curve_figure(table_rows, name, scene.problem.output, pole))
 
 
 def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
-    """Flat triangles with normals; curved triangles are divided."""
+    """Return flat triangles with normals; curved triangles are divided."""
     import pyvista
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
@@ -171,6 +179,6 @@ def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
 
 
 def _in_line(figure: "Figure") -> "Figure":
-    """The same figure, which a notebook then shows without pyplot."""
+    """Return the figure, which a notebook now shows without pyplot."""
     figure._repr_png_ = partial(png, figure)  # type: ignore[attr-defined]
     return figure

@@ -1,4 +1,4 @@
-"""Records of a history as rows of path.csv, and as columns."""
+"""Records of a path as rows of path.csv, and as columns."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -16,29 +16,26 @@ from magshell_fenicsx.simulate.scene import Scene
 if TYPE_CHECKING:
     import pandas
 
-CLOCK = ("time", "dissipated", "work")
+SUMMED_COLUMNS = ("time", "dissipated", "work")
 
 
 class RowMaker:
-    """Makes the rows of one history, in the order of its records."""
+    """Maker of the rows of one path, in the order of its records."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
-        self._clock, self._begun, self._step = (
-            dict.fromkeys(CLOCK, 0.0),
-            dict.fromkeys(CLOCK, 0.0),
-            0,
-        )
-        self._listed = scene.problem.listed  # alone, a field as the load is no field before it
+        self._sums = dict.fromkeys(SUMMED_COLUMNS, 0.0)
+        self._sums_before, self._step = dict(self._sums), 0
+        # a field that is the only load is no field before the loads
+        self._is_programme = scene.problem.listed
 
     def row(self, record: Record, wall_s: float) -> Row:
-        """The next row; `wall_s` is in seconds since the start of the history. Collective."""
+        """Return the next row; `wall_s` is in seconds since the start of the path. Collective."""
         scene = record.scene or self._scene
-        point = record.point
-        values = self._scene.journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
-        if record.label in ("start", "field") or (
-            self._listed and record.amplitude in ("lambda_m", "angle")
-        ):
+        point, journal = record.point, self._scene.journal
+        values = journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
+        is_field_step = self._is_programme and record.amplitude in ("lambda_m", "angle")
+        if record.label in ("start", "field") or is_field_step:
             self._field_end = values["w_over_h"]
         self._count += 1
         row: Row = {
@@ -63,69 +60,76 @@ class RowMaker:
         return {**row, **self._scene.sizes.values(row)}
 
     def _in_time(self, record: Record, values: Mapping[str, float]) -> dict[str, float]:
-        """The columns of a motion: time and sums go on from earlier steps."""
+        """Return the columns of a motion: time and sums go on from earlier steps."""
         if "time" not in self._scene.extra_columns:
             return {}
         if record.step != self._step:
-            self._begun, self._step = dict(self._clock), record.step
-        since = {name: record.clock.get(name, 0.0) for name in CLOCK}
-        self._clock = {name: self._begun[name] + since[name] for name in CLOCK}
-        stored = (record.scene or self._scene).stored(record.point.state, values["energy"])
-        own = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
-        return {**self._clock, **own, "stored": stored}
+            self._sums_before, self._step = dict(self._sums), record.step
+        since_begin = {name: record.clock.get(name, 0.0) for name in SUMMED_COLUMNS}
+        self._sums = {name: self._sums_before[name] + since_begin[name] for name in SUMMED_COLUMNS}
+        stored_energy = (record.scene or self._scene).stored(record.point.state, values["energy"])
+        of_record = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
+        return {**self._sums, **of_record, "stored": stored_energy}
 
 
 def imbalances(
     programme: Iterable[ProgrammeStep], rows: Sequence[Row], length: float
 ) -> Iterator[str]:
-    """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
+    """Yield warnings on steps in time that gain or lose more energy than their `balance`.
+
+    `length` is the system's.
+    """
     for step in programme:
-        over = step.load.motion.balance if step.load.motion else BALANCE
-        parts = [
+        max_imbalance = step.load.motion.balance if step.load.motion else BALANCE
+        step_imbalances = [
             _imbalance(row, length)
             for row in rows
             if row["step"] == step.number and row.get("imbalance")
         ]
-        if parts and abs(worst := max(parts, key=abs)) > over:
+        worst = max(step_imbalances, key=abs, default=0.0)
+        if abs(worst) > max_imbalance:
             yield (
-                f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
-                f"energies, more than balance: {over:g}; take a smaller step, tolerance or balance, or rho_inf: 1, "
-                "which loses none"
+                f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} "
+                f"{abs(worst):.2g} of the energies, more than balance: {max_imbalance:g}; "
+                "take a smaller step, tolerance or balance, or rho_inf: 1, which loses none"
             )
 
 
-def departures(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> Iterator[str]:
-    """Which motions have, or may have, a larger error than their tolerance, in words."""
+def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> Iterator[str]:
+    """Yield warnings on motions that have, or may have, a larger error than their tolerance."""
     for step in programme:
         load = step.load
-        how = load.motion or load.released_by
+        motion = load.motion or load.released_by
         rows = [
             row for row in all_rows if row["step"] == step.number and row["amplitude"] == "time"
         ]
-        if how is None or not rows:
+        if motion is None or not rows:
             continue
         error = max(float(row["error_over_h"]) for row in rows)
-        if how.errors == "motion" and error > how.tolerance:
+        if motion.errors == "motion" and error > motion.tolerance:
             yield (
-                f"step {step.number}: the estimated error of its motion is {error:.2g} h, more than tolerance: "
-                f"{how.tolerance:g}; even the shortest steps leave it"
+                f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
+                f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
-        adapted = load.motion and load.motion.step is None and load.motion.until != "instability"
-        if adapted and how.errors == "step" and any(int(row["negative_pivots"]) for row in rows):
+        has_own_steps = (
+            load.motion and load.motion.step is None and load.motion.until != "instability"
+        )
+        is_unstable = any(int(row["negative_pivots"]) for row in rows)
+        if has_own_steps and motion.errors == "step" and is_unstable:
             yield (
-                f"step {step.number}: it passes unstable states, which magnify the errors of its steps in time; "
-                "errors: motion keeps those of the motion below tolerance"
+                f"step {step.number}: it passes unstable states, which magnify the errors of its "
+                "steps in time; errors: motion keeps those of the motion below tolerance"
             )
 
 
 def _imbalance(row: Row, length: float) -> float:
-    """That of a row over its energies."""
+    """Return the energy imbalance of a row over its energies."""
     energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
     return float(row["imbalance"]) / (energies + (MIN_ENERGY_DISPLACEMENT * length) ** 2)
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
-    """The rows of some records, with the times nan."""
+    """Return the rows of some records, with the times nan."""
     maker = RowMaker(scene)
     return [maker.row(record, np.nan) for record in records]
 
@@ -138,7 +142,7 @@ class Table(dict[str, NDArray[np.generic]]):
         raise KeyError(f"{key!r}: columns have names, such as {names}; rows are in result.rows")
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """A frame of pandas, which the package does not need otherwise.
+        """Return a frame of pandas, which the package does not need otherwise.
 
         Raises
         ------
@@ -155,15 +159,14 @@ class Table(dict[str, NDArray[np.generic]]):
 
 
 def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
-    """The columns of rows, those of every run and extra ones."""
+    """Return the columns of rows, those of every run and extra ones."""
     return Table({name: np.array([row[name] for row in rows]) for name in (*COLUMNS, *extra)})
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> Table:
-    """The columns of path.csv except the time, each (records,); `columns(...).to_pandas()` is a
-    frame of pandas.
+    """Return the columns of path.csv except the time, each (records,). Collective.
 
-    Collective.
+    `columns(...).to_pandas()` is a frame of pandas.
     """
     by_name = table(rows(scene, records), scene.extra_columns)
     del by_name["wall_s"]

@@ -1,4 +1,4 @@
-"""The result of a run, and summary.json; what the snaps of a run amount to."""
+"""The result of a run, summary.json, and the numbers of its snaps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.output.fields.modes import hertz
+from magshell_fenicsx.output.fields.mode_fields import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
-from magshell_fenicsx.output.store.checkpoint import FILE
+from magshell_fenicsx.output.store.checkpoint import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # of the way of a snap: between them it jumps
+JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # parts of the way of a snap, between which it jumps
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -41,51 +41,56 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
     fold vanishes; `jump` from there until it has done nine tenths. `overshoot` is the largest
     deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
     """
-    at_rest = []
-    for i, fold in ((i, row) for i, row in enumerate(rows[:-1]) if row["label"] == "fold"):
-        if rows[i + 1]["amplitude"] != "time":
+    motions = []
+    for i, fold in enumerate(rows[:-1]):
+        if fold["label"] != "fold" or rows[i + 1]["amplitude"] != "time":
             continue
         moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
             continue
-        t, w, lost = (
+        t, w, dissipated = (
             np.array([float(row[key]) for row in moving])
             for key in ("time", "w_over_h", "dissipated")
         )
-        way = (w - w[0]) / (w[-1] - w[0])
+        part_of_way = (w - w[0]) / (w[-1] - w[0])
         # the last two rows are of one time
-        begun, half, done = (
-            _first_at(part, t[:-1], way[:-1]) - t[0] for part in (JUMP_BEGINS, 0.5, JUMP_ENDS)
+        departure, half_time, end_of_jump = (
+            _first_at(fraction, t[:-1], part_of_way[:-1]) - t[0]
+            for fraction in (JUMP_BEGINS, 0.5, JUMP_ENDS)
         )
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
-        times = {"time": half, "departure": begun, "jump": done - begun}
-        at_rest.append(
+        times = {"time": half_time, "departure": departure, "jump": end_of_jump - departure}
+        motions.append(
             {
                 **ends,
                 **times,
-                "overshoot": float(way.max() - 1),
-                "dissipated": float(lost[-1] - lost[0]),
+                "overshoot": float(part_of_way.max() - 1),
+                "dissipated": float(dissipated[-1] - dissipated[0]),
             }
         )
-    return at_rest
+    return motions
 
 
 def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
-    """Return the times of a snap of a case with units."""
+    """Return the times of a snap of a case with units, by key of summary.json."""
     return {
         f"snap_{key}_ms": 1e3 * snap[key] * sizes.size("time")
         for key in ("time", "departure", "jump")
     }
 
 
-def _first_at(part: float, times: Array, way: Array) -> float:
-    """Return the first time at which a part of a way is done, by cubic interpolation; the last if
-    it is not by then."""
-    if not (way >= part).any():  # a creeping shell is put to rest from afar
+def _first_at(fraction: float, times: Array, part_of_way: Array) -> float:
+    """Return the first time at which a fraction of a way is done, by cubic interpolation.
+
+    It is the last time if the fraction is not done by then.
+    """
+    if not (part_of_way >= fraction).any():  # a creeping shell is put to rest from afar
         return float(times[-1])
-    at = int(np.argmax(way >= part))
-    passed = scipy.interpolate.CubicSpline(times, way - part)
-    return float(scipy.optimize.brentq(passed, times[at - 1], times[at], xtol=1e-12 * times[at]))
+    index = int(np.argmax(part_of_way >= fraction))
+    difference = scipy.interpolate.CubicSpline(times, part_of_way - fraction)
+    return float(
+        scipy.optimize.brentq(difference, times[index - 1], times[index], xtol=1e-12 * times[index])
+    )
 
 
 @dataclass
@@ -94,12 +99,14 @@ class Result:
 
     Attributes
     ----------
-    rows
-        One mapping per accepted point, with the columns of path.csv.
+    scene
+        The scene at the beginning of the path.
     last
         Displacement and amplitudes at the last point of the path.
+    rows
+        One mapping per accepted point, with the columns of path.csv.
     singular
-        The same at the located instabilities, by row number.
+        Displacement and amplitudes at the located instabilities, by row number.
     stopped
         Why the run ended before its target; None if it reached it.
     remarks
@@ -110,37 +117,39 @@ class Result:
     sensitivities
         Sensitivities of the amplitude at the final fold, if the case requests them; see
         `simulate.sensitivity`.
+    output
+        Stopwatch of fields and pictures.
     adapted
         The mesh and its error estimate, if the case has a tolerance.
     branch_error
         The estimated relative error at the end of a branch in a larger model, if that has its own
         mesh.
-    walked
+    path_history
         The records that `value` is taken from.
+    barrier
+        The energy barrier over E h R^2 of a last step with `until: zero`; None without.
     end
         Number of the row of `last`.
-    kept
+    found
+        The states of the solutions that searches have found, by row number.
+    states_for_frequencies
         States at the points whose frequencies are requested, by row number; not of the start and
         the end.
     frequencies
         The natural modes, by row number; their `eigenvalue` is omega^2 rho R^2/E.
     contact_changes
-        Beside bodies how much their omega^2 depend on the bodies' stiffness; see
-        `frequencies.contact_changes`.
-    found
-        The states of the solutions that searches have found, by row number.
-    barrier
-        The energy barrier over E h R^2 of a last step with `until: zero`; None without.
+        With bodies, how much omega^2 of these modes depend on the bodies' stiffness; see
+        `modes.contact_changes`.
     gradients
-        By result, as in summary.json.
-    largest
+        Gradients by result, as in summary.json.
+    mode_places
         By row number of an instability the undeformed place where its mode moves most along the
         normal, in the shell's length; on rank 0, and not of a meridian, whose modes have rings.
-    latest
+    last_record
         The record of `last`; None before the first.
-    elsewhere
-        The scenes of the rows that have another than `scene`, as of a branch that its model
-        excludes.
+    scenes_of_rows
+        Row number -> scene, of rows that have another one than `scene`, as of a branch that its
+        model excludes.
     """
 
     scene: Scene
@@ -154,43 +163,43 @@ class Result:
     output: Stopwatch = field(default_factory=Stopwatch)
     adapted: "Adapted | None" = None
     branch_error: float | None = None
-    walked: History = field(default_factory=History)
+    path_history: History = field(default_factory=History)
     barrier: float | None = None
     end: int = 0
     found: dict[int, State] = field(default_factory=dict)
-    kept: dict[int, State] = field(default_factory=dict)
+    states_for_frequencies: dict[int, State] = field(default_factory=dict)
     frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
     contact_changes: dict[int, list[float]] = field(default_factory=dict)
     gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
-    largest: dict[int, list[float]] = field(default_factory=dict)
-    latest: Record | None = None
-    elsewhere: dict[int, Scene] = field(default_factory=dict)
+    mode_places: dict[int, list[float]] = field(default_factory=dict)
+    last_record: Record | None = None
+    scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
 
     def scene_of(self, row: int) -> Scene:
-        """The scene of a row."""
-        return self.elsewhere.get(row, self.scene)
+        """Return the scene of a row."""
+        return self.scenes_of_rows.get(row, self.scene)
 
     @property
     def history(self) -> Table:
-        """The columns of path.csv; `history.to_pandas()` is a frame of pandas."""
+        """Columns of path.csv; `history.to_pandas()` is a frame of pandas."""
         return table(self.rows, self.scene.extra_columns)
 
     @property
     def record(self) -> Record:
-        """The last point of the path, as `follow` gives it: for `picture`, `surface`, `gradient`,
-        and for its `u`.
+        """Last point of the path, as `follow` gives it: for `picture`, `surface`, `gradient`, and
+        its `u`.
         """
-        assert self.latest, "a run has a first point"
-        return self.latest
+        assert self.last_record, "a run has a first point"
+        return self.last_record
 
     @property
     def instabilities(self) -> list[Record]:
-        """The same of the located instabilities on the path."""
-        return list(self.walked.located)
+        """Located instabilities on the path, as `follow` gives them."""
+        return list(self.path_history.located)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
-        """The located instabilities."""
+        """Located instabilities, as in summary.json."""
         return [
             {
                 **self.scene.sizes.values({key: row[key] for key in _with_units(row)}),
@@ -209,63 +218,69 @@ class Result:
         ]
 
     def _mode_at(self, number: int) -> dict[str, list[float]]:
-        """Where a mode is largest, over R or in m, and in the unit of the report."""
-        if number not in self.largest:
+        """Return where a mode is largest, over R or in m, and in the unit of the report."""
+        if number not in self.mode_places:
             return {}
-        place, shell = self.largest[number], self.scene.problem.context.shell
-        shown = place_in_units(place, shell.geometry, in_metres=shell.with_units)
+        place, shell = self.mode_places[number], self.scene.problem.context.shell
+        in_report_units = place_in_units(place, shell.geometry, in_metres=shell.with_units)
         return {
             "mode_at": place,
-            **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit},
+            **{f"mode_at_{unit}": values for unit, values in in_report_units.items() if unit},
         }
 
     @property
     def knockdown(self) -> float | None:
-        """k_d: p/p_c at the first instability under pressure; None if there is none, or at held
-        volume.
+        """k_d: p/p_c at the first instability under pressure.
+
+        None if there is none, or at held volume.
         """
-        at_volume = {
-            step.number for step in self.scene.problem.programme if step.name in step.load.hold
-        }
-        points = (
-            row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure"
-        )
-        return next(
-            (
-                float(p["p_over_pc"])
-                for p in points
-                if not p["branch"] and p.get("step") not in at_volume
-            ),
-            None,
-        )
+        steps = self.scene.problem.programme
+        at_held_volume = {step.number for step in steps if step.name in step.load.hold}
+        for row in self._instabilities_under("pressure"):
+            if row.get("step") not in at_held_volume:
+                return float(row["p_over_pc"])
+        return None
+
+    def _instabilities_under(self, name: str) -> list[Row]:
+        """Return the rows of instabilities on the path itself, under an amplitude."""
+        located = [row for row in self.rows if row["label"] in LOCATED]
+        return [row for row in located if row["amplitude"] == name and not row["branch"]]
 
     @property
     def critical_field(self) -> float | None:
         """λ_m at the first instability under the field; None if there is none."""
-        points = (
-            row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "lambda_m"
-        )
-        return next((float(row["lambda_m"]) for row in points if not row["branch"]), None)
+        rows = self._instabilities_under("lambda_m")
+        return float(rows[0]["lambda_m"]) if rows else None
 
     @property
     def value(self) -> float | None:
-        """The scalar result that mesh.tolerance refers to; None if the run has none."""
+        """Scalar result that mesh.tolerance refers to; None if the run has none."""
         try:
-            return self.walked.ending(self.scene, self.stopped).value
+            return self.path_history.ending(self.scene, self.stopped).value
         except NoResult:
             return None
 
 
 def summary(result: Result, total_s: float) -> dict[str, Any]:
-    """The content of summary.json."""
-    scene, asked = result.scene, result.adapted.asked if result.adapted else result.scene.problem
+    """Return the content of summary.json; `total_s` is the time of the run in seconds."""
+    scene = result.scene
+    requested = result.adapted.asked if result.adapted else scene.problem
     material, model, newton = scene.problem.material, scene.model, scene.newton
-    R_over_h, time_unit = 1 / material.h, scene.problem.time_unit
-    snapped, sizes = snaps(result.rows), scene.sizes
+    R_over_h = 1 / material.h
+    snaps_of_run = snaps(result.rows)
+    snap_times, tolerance = dict[str, float](), dict[str, Any]()
+    if snaps_of_run and scene.sizes.unit("time"):
+        snap_times = _in_milliseconds(snaps_of_run[0], scene.sizes)
+    if result.adapted:
+        tolerance = {"tolerance": result.adapted.account(result.value, result.branch_error)}
+    observed = dict[str, Any]()
+    for observables in SEEN:
+        observed |= observables.summary(result.scene_of(result.end).sight, result.last)
+    excluded = (int(row["excluded_pivots"]) for row in result.rows)
     return {
-        "case": asked.document.data,
-        FILE: asked.document.name,
-        **asked.document.outside,
+        "case": requested.document.data,
+        CASE_FILE: requested.document.name,
+        **requested.document.outside,
         "sources": code_version(),
         "dimensionless": {
             "radius_to_thickness": R_over_h,
@@ -293,41 +308,15 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "knockdown": result.knockdown,
         "critical_field": result.critical_field,
         "barrier": result.barrier,
-        "snaps": snapped,
-        **(_in_milliseconds(snapped[0], sizes) if snapped and sizes.unit("time") else {}),
-        **{
-            key: said
-            for room in SEEN
-            for key, said in room.summary(result.scene_of(result.end).sight, result.last).items()
-        },
-        "frequencies": [
-            {
-                "point": number,
-                "omega2": [mode.eigenvalue for mode in modes],
-                **(
-                    {"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]}
-                    if time_unit
-                    else {}
-                ),
-                **(
-                    {"contact_change": result.contact_changes[number]}
-                    if number in result.contact_changes
-                    else {}
-                ),
-            }
-            for number, modes in result.frequencies.items()
-        ],
+        "snaps": snaps_of_run,
+        **snap_times,
+        **observed,
+        "frequencies": [_frequencies_of(result, number) for number in result.frequencies],
         "solutions": solutions(result),
-        "most_excluded_pivots": max(
-            (int(row["excluded_pivots"]) for row in result.rows), default=0
-        ),
+        "most_excluded_pivots": max(excluded, default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
-        **(
-            {"tolerance": result.adapted.account(result.value, result.branch_error)}
-            if result.adapted
-            else {}
-        ),
+        **tolerance,
         "timing": {
             "jit_s": model.kernels.seconds,
             "setup_s": scene.setup_s,
@@ -346,20 +335,34 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     }
 
 
-def solutions(result: Result) -> list[dict[str, Any]]:
-    """What searches have found; the residual is over the sum of the sizes of all terms' forces.
+def _frequencies_of(result: Result, number: int) -> dict[str, Any]:
+    """Return the natural frequencies of a point, as in summary.json."""
+    modes, time_unit = result.frequencies[number], result.scene.problem.time_unit
+    entry: dict[str, Any] = {
+        "point": number,
+        "omega2": [mode.eigenvalue for mode in modes],
+    }
+    if time_unit:
+        entry["hertz"] = [hertz(mode.eigenvalue, time_unit) for mode in modes]
+    if number in result.contact_changes:
+        entry["contact_change"] = result.contact_changes[number]
+    return entry
 
-    Collective.
+
+def solutions(result: Result) -> list[dict[str, Any]]:
+    """Return the solutions that searches have found, as in summary.json. Collective.
+
+    The residual is over the sum of the sizes of all terms' forces.
     """
     entries = []
     for number, state in result.found.items():
         row, system = result.rows[number], result.scene_of(number).model.system
         residual = system.residual(state.u, state.mu)
         forces = (
-            factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name)
-            for t in system.terms
+            factor_of(term.amplitude, state.mu) * system.forces(state.u, state.mu, term.name)
+            for term in system.terms
         )
-        sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
+        sizes = [np.sqrt(dot(system.comm, vector, vector)) for vector in (residual, *forces)]
         keys = (
             "p_over_pc",
             "w_over_h",
@@ -383,32 +386,32 @@ def solutions(result: Result) -> list[dict[str, Any]]:
 
 
 def _with_units(row: Row) -> set[str]:
-    """The columns of a limit point that may have units."""
+    """Return the columns of a limit point that may have units."""
     return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
 
 
 def in_units(result: Result) -> dict[str, float]:
-    """The numbers of a case with units, with these in their names; none of a case without."""
-    of, shell = result.scene.sizes.by_unit, result.scene.problem.context.shell
-    sizes = {}
-    if "p_c" in of:
-        sizes["classical_pressure_Pa"] = of["p_c"]
+    """Return the numbers of a case with units, with these in their names; none without units."""
+    unit_sizes, shell = result.scene.sizes.by_unit, result.scene.problem.context.shell
+    numbers = {}
+    if "p_c" in unit_sizes:
+        numbers["classical_pressure_Pa"] = unit_sizes["p_c"]
         if result.knockdown is not None:
-            sizes["buckling_pressure_Pa"] = result.knockdown * of["p_c"]
-    if "λ_m" in of and result.critical_field is not None:
+            numbers["buckling_pressure_Pa"] = result.knockdown * unit_sizes["p_c"]
+    if "λ_m" in unit_sizes and result.critical_field is not None:
         ending = "percent" if result.scene.sizes.field == "%" else "mT"
-        sizes[f"critical_field_{ending}"] = result.critical_field * of["λ_m"]
-    if "2πD/R" in of:
-        sizes["unit_force_N"] = of["2πD/R"]
-        sizes["bending_stiffness_N_m"] = of["2πD/R"] * shell.reference / (2 * np.pi)
-        sizes["unit_energy_mJ"] = of["E h R²"]
+        numbers[f"critical_field_{ending}"] = result.critical_field * unit_sizes["λ_m"]
+    if "2πD/R" in unit_sizes:
+        numbers["unit_force_N"] = unit_sizes["2πD/R"]
+        numbers["bending_stiffness_N_m"] = unit_sizes["2πD/R"] * shell.reference / (2 * np.pi)
+        numbers["unit_energy_mJ"] = unit_sizes["E h R²"]
         if result.barrier is not None:
-            sizes["barrier_mJ"] = result.barrier * of["E h R²"]
-    return sizes
+            numbers["barrier_mJ"] = result.barrier * unit_sizes["E h R²"]
+    return numbers
 
 
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
-    """The dimensions of the shell that the case gives, in SI or in the case's own units."""
+    """Return the dimensions of the shell that the case gives, in SI or in the case's own units."""
     if isinstance(shell, ShellSection):
         lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
     else:

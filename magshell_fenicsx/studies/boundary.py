@@ -24,7 +24,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
@@ -193,13 +193,13 @@ def boundary(
     begun_at, source = on_first_rank(comm, lambda: start_from(start, source))
     for setting in settings if start else ():
         override(source, setting)
-    folder, name = given_folder(out), Path(file).name
+    folder, name = user_folder(out), Path(file).name
     once: Say = say if comm.rank == 0 else lambda line: None
     with FOLDER.held(folder, comm, name), heard(comm, once) as once:
         say = once if comm.rank == 0 else say
         journal = partial(Journal, folder / "points", _identity(source, span, made, begun_at.text))
         value = _value(source, span, made, outside=not start)
-        begin = by_first(
+        begin = access_disk(
             comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at)
         )
         name_of_mode = begin["mode"]
@@ -207,7 +207,7 @@ def boundary(
             once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             again = begun_at.anywhere()
-            begin = by_first(
+            begin = access_disk(
                 comm, lambda: _begin(source, span, value, made, journal("whole"), say, again)
             )
         if not begin["label"]:
@@ -227,12 +227,12 @@ def boundary(
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
         compute(senses, followed, comm, say)
-        outcomes = by_first(
+        outcomes = access_disk(
             comm,
             lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses},
         )
         done = _put_together(outcomes, begin, span, name, settings)
-        by_first(comm, lambda: _write(done, folder))
+        access_disk(comm, lambda: _write(done, folder))
     for line in done.content["said"]:
         once(line)
     return done

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.simulate.numbers import BESIDE
@@ -103,7 +103,7 @@ def boundary_map(
     for setting in settings:
         if setting.partition("=")[0].strip() == axis.name:
             raise CaseError(f"--set {setting}: this key is swept by --over")
-    folder, once = given_folder(out), say if comm.rank == 0 else (lambda line: None)
+    folder, once = user_folder(out), say if comm.rank == 0 else (lambda line: None)
     rows, without, lines = list[dict[str, Any]](), dict[str, str](), dict[str, StabilityBoundary]()
     with FOLDER.held(folder, comm, Path(file).name):
         for number, value in enumerate(axis.values, 1):
@@ -136,7 +136,7 @@ def boundary_map(
             )
         content = _content(file, settings, lines, without, axis)
         done = StabilityBoundary(rows, content)
-        by_first(comm, lambda: _write(done, folder))
+        access_disk(comm, lambda: _write(done, folder))
     for line in content["said"]:
         once(line)
     return done

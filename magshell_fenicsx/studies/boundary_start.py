@@ -9,7 +9,7 @@ from typing import Any
 
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.known import case_in
+from magshell_fenicsx.output.store.stored_results import case_in
 from magshell_fenicsx.output.store.table import LOCATED, read_rows
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record

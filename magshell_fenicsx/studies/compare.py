@@ -12,10 +12,10 @@ from mpi4py import MPI
 from pydantic import TypeAdapter
 
 from magshell_fenicsx.input.source import CaseError, read_source
-from magshell_fenicsx.output.store.checkpoint import FILE, NAME, begun_with
+from magshell_fenicsx.output.store.checkpoint import CASE_FILE, NAME, identity_in
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
-from magshell_fenicsx.output.store.known import read_summary
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
+from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import read_lines, write_csv
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import measure
@@ -138,7 +138,7 @@ def _case_in(folder: Path) -> str:
     """The name of the case file whose run is in a folder; empty without."""
     with suppress(OSError, Damaged):
         return str(
-            (begun_with(folder / NAME) or read_object(folder / "summary.json")).get(FILE, "")
+            (identity_in(folder / NAME) or read_object(folder / "summary.json")).get(CASE_FILE, "")
         )
     return ""
 
@@ -304,7 +304,7 @@ def compare(
     NothingLeft
         If a run left no results.
     """
-    file, folder, scalar = Path(file), given_folder(out), parse_scalar(result) if result else None
+    file, folder, scalar = Path(file), user_folder(out), parse_scalar(result) if result else None
     for model in MODELS:
         case = made(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     varied = case.programme[-1].name if case.programme else ""
@@ -340,7 +340,7 @@ def compare(
         differing = differences(shell, solid)
         at = max(places([run for model in MODELS for run in runs[model]]), default=None)
         content = {"case": file.name, **_content(runs, at, differing, scalar)}
-        by_first(MPI.COMM_SELF, lambda: _write(content, differing, folder))
+        access_disk(MPI.COMM_SELF, lambda: _write(content, differing, folder))
         errors: Errors = {
             model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]]
             for model in MODELS

@@ -22,7 +22,7 @@ from pydantic import TypeAdapter
 
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_object, write_whole
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
@@ -112,7 +112,7 @@ class Design:
         self.tried.clear()
 
     def _new(self, x: Array, vectors: Path) -> Evaluation:
-        by_first(self.comm, lambda: self.variables.write(x, vectors))
+        access_disk(self.comm, lambda: self.variables.write(x, vectors))
         case, wanted = self.variables.case_of(x, vectors), self.wanted
         evaluation = evaluate(
             case, x, self.variables, wanted.results, wanted.targets, self.comm, self._scene
@@ -144,7 +144,7 @@ class Design:
             "point": name,
         }
         self.rows.append(row)
-        by_first(self.comm, self._write)
+        access_disk(self.comm, self._write)
         values = ", ".join(
             f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items()
         )
@@ -211,13 +211,13 @@ def design(
         optimum found.
     """
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
-    case, folder = made(source), given_folder(out)
+    case, folder = made(source), user_folder(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:
         vary, wanted = variables(source, case, case.design, made), wanted_of(case, case.design)
         with FOLDER.held(folder, comm, Path(file).name):
-            if resume and not by_first(comm, lambda: any((folder / "points").glob("*.json"))):
+            if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
             with heard(comm, say) as told:
                 return _designed(Design(vary, wanted, folder, comm, told), Path(file), comm)
@@ -237,7 +237,7 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
         made.say(
             f"angles rounded to {steps} steps of a turn: {wanted.words(before)} -> {wanted.words(best)}"
         )
-    by_first(comm, partial(_write_best, made, x, file))
+    access_disk(comm, partial(_write_best, made, x, file))
     content: dict[str, Any] = {
         "case": file.name,
         "objective": section.objective.model_dump(exclude_none=True),
@@ -254,13 +254,13 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     goal = section.objective
     asked = {goal.reach: goal.value} if goal.reach and goal.value is not None else {}
     drawn = partial(draw_design, made.rows, wanted.results, vary, x, folder / "design.png", asked)
-    by_first(comm, drawn)
-    by_first(comm, lambda: write_object(folder / "summary.json", content))
+    access_disk(comm, drawn)
+    access_disk(comm, lambda: write_object(folder / "summary.json", content))
     content["verified"] = verified(made, best, comm)
     targets: Sequence[Callable[[Array], Array] | None] = [*wanted.targets.values()] or [None]
     for target in targets:
-        by_first(comm, partial(_draw_reached, drawn, folder / "verified", target))
-    by_first(comm, lambda: write_object(folder / "summary.json", content))
+        access_disk(comm, partial(_draw_reached, drawn, folder / "verified", target))
+    access_disk(comm, lambda: write_object(folder / "summary.json", content))
     if missed := wanted.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
     return content
@@ -393,7 +393,7 @@ def _value(result: Result, name: str) -> float | None:
         return None
     row = result.rows[-1]
     try:
-        omega2 = vibration_at_end(result.scene, result.walked, name)
+        omega2 = vibration_at_end(result.scene, result.path_history, name)
     except Lost:
         return None
     return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2

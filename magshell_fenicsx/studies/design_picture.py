@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import read_point
-from magshell_fenicsx.output.pictures.picture import rims
+from magshell_fenicsx.output.pictures.picture import edge_lines
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design_blocks import Between
@@ -60,7 +60,7 @@ def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reac
     at = at[np.argsort(surface.r0[at, 0], kind="stable")]
     wanted, edges = (
         target(surface.r0[at]) if target else None,
-        rims(replace(surface, u=0 * surface.u)),
+        edge_lines(replace(surface, u=0 * surface.u)),
     )
     return Reached(wanted, (surface.r0 + surface.u)[at], surface.r0[at], edges)
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, fold_a
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
@@ -130,10 +130,10 @@ def ensemble(
 
     variants = on_first_rank(comm, drawn)
     every = {sample.key: sample for variant in variants for sample in variant}
-    folder, name = given_folder(out), Path(file).name
+    folder, name = user_folder(out), Path(file).name
     parts = [Path(place) for place in merge]
     if resume or merge:
-        by_first(comm, lambda: _refuse_strange(parts or [folder], every, merge=bool(merge)))
+        access_disk(comm, lambda: _refuse_strange(parts or [folder], every, merge=bool(merge)))
     tables = (
         f"summary{ending}.json",
         f"samples{ending}.csv",
@@ -142,11 +142,11 @@ def ensemble(
     )
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
-        by_first(comm, lambda: _copy(every, parts, folder))
+        access_disk(comm, lambda: _copy(every, parts, folder))
     missing = (
         []
         if merge
-        else by_first(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
+        else access_disk(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
     )
     if comm.rank == 0:
         ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
@@ -178,9 +178,9 @@ def ensemble(
         "result": result,
         "deleted": delete_weakest,
         "sources": code_version(),
-        **by_first(comm, lambda: statistics(rows, seed)),
+        **access_disk(comm, lambda: statistics(rows, seed)),
     }
-    by_first(comm, lambda: _write(rows, content, folder, ending))
+    access_disk(comm, lambda: _write(rows, content, folder, ending))
     return Ensemble(rows, content)
 
 

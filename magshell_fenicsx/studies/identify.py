@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
@@ -120,7 +120,7 @@ def identify(
         If the path of the case is lost.
     """
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
-    case, folder, name = made(source), given_folder(out), Path(file).name
+    case, folder, name = made(source), user_folder(out), Path(file).name
     section: IdentifySection | None = case.identify
     if section is None:
         raise CaseError(f"{file}: identify: is missing: it says which parameters are looked for")
@@ -153,7 +153,7 @@ def identify(
             done.content.update(case=name, data=Path(data).name, settings=list(settings))
             for each in programmes:
                 each.compute(predictor, done.fit, say)
-            by_first(comm, lambda: _write(done, drawn, folder, predictor, programmes))
+            access_disk(comm, lambda: _write(done, drawn, folder, predictor, programmes))
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
     for line in done.content["said"]:

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from magshell_fenicsx.input.source import CaseError, Source, override
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.simulate.gradients.instabilities import Lost
@@ -92,7 +92,7 @@ class Predictor:
         if seen is None:
             vectors = file.with_suffix(".csv")
             if self.field:
-                by_first(self.comm, lambda: self.write(x, vectors))
+                access_disk(self.comm, lambda: self.write(x, vectors))
             seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
             self.count += 1
             on_first_rank(

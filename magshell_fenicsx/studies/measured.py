@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.output.store.known import PHASES
+from magshell_fenicsx.output.store.stored_results import PHASES
 from magshell_fenicsx.output.store.table import read_csv
 from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.studies.runner import keep, kept

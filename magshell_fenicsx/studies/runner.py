@@ -25,9 +25,9 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import (
     DiskError,
-    held_folder,
+    locked_folder,
     prepare_folder,
-    refuse_others,
+    refuse_other_tables,
 )
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.platform import terminal
@@ -81,7 +81,7 @@ class Folder:
         """
 
         def make(folder: Path) -> None:
-            refuse_others(folder, self.tables, self.keys, self.what, case)
+            refuse_other_tables(folder, self.tables, self.keys, self.what, case)
             for made in (folder, folder / self.points):
                 made.mkdir(parents=True, exist_ok=True)
             if self.first:
@@ -92,7 +92,7 @@ class Folder:
     @contextmanager
     def held(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
         """The same for one job alone, which holds it inside `with`; collective."""
-        with held_folder(out, comm, make=True):
+        with locked_folder(out, comm, make=True):
             self.prepare(out, comm, case)
             yield
 

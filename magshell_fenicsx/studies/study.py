@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version, machine_fingerprint
 from magshell_fenicsx.platform.processes import mpirun_path
@@ -103,7 +103,7 @@ def study(
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
     points = make_points(swept_source(Path(file), axes, settings), axes, made)
-    folder, machine = given_folder(out), machine_fingerprint()
+    folder, machine = user_folder(out), machine_fingerprint()
     with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
@@ -141,7 +141,7 @@ def study(
             "machine": machine,
         }
         done = Study(rows, against)
-        by_first(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), content, folder))
+        access_disk(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), content, folder))
     say(reference_sentence(against))
     return done
 

@@ -21,7 +21,7 @@ from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
-from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import COLUMNS, write_csv
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
@@ -146,14 +146,14 @@ def sweep(
     source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
     asked = on_first_rank(comm, lambda: make_points(source, axes, made))
     share = share_of(part, len(asked))
-    folder = FOLDER.prepare(given_folder(out), comm)
-    points = by_first(comm, lambda: with_earlier(folder, source, axes, asked, made))
+    folder = FOLDER.prepare(user_folder(out), comm)
+    points = access_disk(comm, lambda: with_earlier(folder, source, axes, asked, made))
     before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     first = {
         point.key: number for number, point in reversed(list(enumerate(points)))
     }  # equal points are one
-    missing = by_first(
+    missing = access_disk(
         comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar))
     )
     if part:
@@ -185,7 +185,7 @@ def sweep(
     if comm.rank == 0 and len(done) < len(points):
         say(f"{len(points) - len(done)} of {len(points)} points are left to other parts")
     if done:
-        by_first(comm, lambda: _write(axes, done, scalar, folder))
+        access_disk(comm, lambda: _write(axes, done, scalar, folder))
     mine = {id(point) for i, point in enumerate(asked) if not part or i in share}
     own = [(point, outcome) for point, outcome in done if id(point) in mine]
     values = [outcome.value(scalar) for _, outcome in own] if scalar else []

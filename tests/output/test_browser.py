@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.output.pictures.curve import AROUND
-from magshell_fenicsx.output.pictures.lines import FINE, smooth, splined
+from magshell_fenicsx.output.pictures.curve import INSET_MARGIN
+from magshell_fenicsx.output.pictures.lines import SEGMENTS_PER_INTERVAL, smooth, spline_curve
 from magshell_fenicsx.output.report.interactive import plotly
 from magshell_fenicsx.output.report.report import write_report
 
@@ -191,9 +191,11 @@ def test_the_curve_is_that_of_the_picture(page: Page, report: Any) -> None:
     )
     assert found == pytest.approx(smooth(x, y, located, level), abs=1e-12)
     found = np.array(page.value(f"magshell.joined({texts}, {t})"))
-    assert found == pytest.approx(splined(x, y, t), abs=1e-12)
+    assert found == pytest.approx(spline_curve(x, y, t), abs=1e-12)
     assert found[1] == pytest.approx(
-        CubicSpline(t, y)(np.interp(np.arange(4 * FINE + 1) / FINE, range(5), t))
+        CubicSpline(t, y)(
+            np.interp(np.arange(4 * SEGMENTS_PER_INTERVAL + 1) / SEGMENTS_PER_INTERVAL, range(5), t)
+        )
     )
     assert page.value("magshell.about.steps[0].lines[0].in_time") is True
 
@@ -253,7 +255,9 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
         )
         if drawn:
             low, high = np.array([[w, load(w)] for w in ((1 - gap) * (middle - 1), middle - 1)])
-            around = np.array([low - AROUND * (high - low), high + AROUND * (high - low)])
+            around = np.array(
+                [low - INSET_MARGIN * (high - low), high + INSET_MARGIN * (high - low)]
+            )
             assert np.array(ranges) == pytest.approx(around.T)
             boxes = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().right)"
             assert max(page.value(boxes)) <= 1200
@@ -289,8 +293,8 @@ def test_a_curve_ends_level_at_a_fold() -> None:
 def test_a_vibration_keeps_its_form() -> None:
     """Four points a period, where straight lines would lose three tenths: within a twentieth."""
     t = np.arange(17) * 0.25 + 0.125
-    drawn = splined(t.tolist(), np.sin(2 * np.pi * t).tolist(), t.tolist())
-    inner = drawn[:, 2 * FINE : -2 * FINE]
+    drawn = spline_curve(t.tolist(), np.sin(2 * np.pi * t).tolist(), t.tolist())
+    inner = drawn[:, 2 * SEGMENTS_PER_INTERVAL : -2 * SEGMENTS_PER_INTERVAL]
     assert np.abs(inner[1] - np.sin(2 * np.pi * inner[0])).max() < 0.05
     assert (
         np.abs(np.interp(inner[0], t, np.sin(2 * np.pi * t)) - np.sin(2 * np.pi * inner[0])).max()

@@ -19,7 +19,7 @@ from magshell_fenicsx.output.fields.surface import (
     Surface,
     resolved_pressure,
 )
-from magshell_fenicsx.output.pictures.colours import contact, pressure_said
+from magshell_fenicsx.output.pictures.colours import contact, pressure_note
 from magshell_fenicsx.simulate.follow import follow
 
 
@@ -41,7 +41,7 @@ def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
     assert np.isnan(surface.fields[PRESSURE]).any()
     assert not (surface.fields[PRESSURE] > 0).any()
     assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
-    assert "narrower than a cell" in pressure_said(surface)
+    assert "narrower than a cell" in pressure_note(surface)
 
 
 @pytest.mark.slow
@@ -82,6 +82,6 @@ def test_nothing_touches() -> None:
     fields = {PRESSURE: np.zeros(3), "gap_over_h": np.full(3, 2.0)}
     surface = Surface(points, points, points, np.array([[0, 1, 2]]), fields)
     assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
-    assert pressure_said(surface) == "Nothing touches."
+    assert pressure_note(surface) == "Nothing touches."
     pressed = replace(surface, fields=fields | {PRESSURE: np.array([1.0, 2.0, np.nan])})
     assert [layer.limits for layer in contact(pressed)][1] == (0.0, 2.0)

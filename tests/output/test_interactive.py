@@ -22,9 +22,9 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.colours import couple
 from magshell_fenicsx.output.pictures.plot import plot
-from magshell_fenicsx.output.report.interactive import chosen_frames, plotly, thinned
-from magshell_fenicsx.output.report.report import opened, report_of, write_report
-from magshell_fenicsx.output.store.checkpoint import identity, refuse_other
+from magshell_fenicsx.output.report.interactive import chosen_frames, plotly, simplify
+from magshell_fenicsx.output.report.report import open_in_browser, report_of, write_report
+from magshell_fenicsx.output.store.checkpoint import identity, refuse_other_case
 
 needs_plotly = pytest.mark.skipif(plotly() is None, reason="Plotly is not installed")
 
@@ -94,12 +94,12 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
     """Places to 1e-4 R, colours to a 256th of their range."""
     about, data = read(folder)
     surface, _ = read_point(folder / "fields", about["points"][about["frames"][-1]])
-    mesh = thinned(surface, 20_000)
+    mesh = simplify(surface, 20_000)
     r = array(data, about["r0"]) + array(data, about["u"][-1])
-    assert r == pytest.approx(mesh.at(surface.r0 + surface.u), abs=1e-4)
+    assert r == pytest.approx(mesh.at_vertices(surface.r0 + surface.u), abs=1e-4)
     triangles = array(data, about["triangles"]).reshape(-1, 3)
     assert triangles.max() == mesh.count - 1
-    a, b, c = (mesh.at(surface.r0)[triangles[:, k]] for k in range(3))
+    a, b, c = (mesh.at_vertices(surface.r0)[triangles[:, k]] for k in range(3))
     assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a) >= 0).all()  # all outwards
     fields = {field["name"]: field for field in about["fields"]}
     assert {"w_over_h", "E_1", "E_2", "M_1", "M_2", "couple", "p_mag"} <= fields.keys()
@@ -108,7 +108,9 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
         field = fields[name]
         steps = array(data, field["at"][-1]) / 255
         reach = field["high"] - field["low"]
-        assert field["low"] + reach * steps == pytest.approx(mesh.at(values), abs=reach / 500)
+        assert field["low"] + reach * steps == pytest.approx(
+            mesh.at_vertices(values), abs=reach / 500
+        )
     M = fields["M_1"]
     zero = -M["low"] / (M["high"] - M["low"])
     _, colour = min(M["colours"], key=lambda stop: abs(stop[0] - zero))
@@ -161,8 +163,8 @@ def test_large_meshes_are_thinned() -> None:
             np.column_stack([low + 1, low + 201, low + 200]),
         ]
     )
-    mesh = thinned(Surface(r, 0 * r, r, cells, {}), 5000)
-    a, b, c = np.moveaxis(mesh.at(r)[mesh.triangles], 1, 0)
+    mesh = simplify(Surface(r, 0 * r, r, cells, {}), 5000)
+    a, b, c = np.moveaxis(mesh.at_vertices(r)[mesh.triangles], 1, 0)
     assert 2000 < mesh.count <= 5000
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(1, rel=0.05)
 
@@ -181,9 +183,9 @@ def test_view(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     asked = list[str]()
     monkeypatch.setattr(webbrowser, "open", lambda url: bool(asked.append(url)) or len(asked) == 1)
     file = report_of(folder)
-    assert opened(file)
+    assert open_in_browser(file)
     assert asked == [file.as_uri()]
-    assert not opened(file)
+    assert not open_in_browser(file)
     with pytest.raises(CaseError, match=r"holds no report\.html, and no summary\.json"):
         report_of(tmp_path)
 
@@ -210,6 +212,6 @@ def test_pictures_are_no_part_of_what_is_resumed(tmp_path: Path) -> None:
         document_of(ms.Case.from_source(plain | more))
         for more in ({}, {"output": {"dpi": 90}}, {"mesh": {"degree": 3}})
     )
-    refuse_other(identity(first), other, tmp_path)
+    refuse_other_case(identity(first), other, tmp_path)
     with pytest.raises(CaseError, match="another run"):
-        refuse_other(identity(first), finer, tmp_path)
+        refuse_other_case(identity(first), finer, tmp_path)

@@ -8,11 +8,11 @@ import pytest
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.output.fields.surface import SHELL, SurfaceGatherer
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, read_point
+from magshell_fenicsx.output.fields.vtu import FieldSeries, ShellData, read_point
 from magshell_fenicsx.output.pictures.colours import shell
 from magshell_fenicsx.output.pictures.picture import Background
-from magshell_fenicsx.output.pictures.view import Camera
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.output.pictures.rendering import Camera
+from magshell_fenicsx.problem.requests import OutputSection
 
 
 def plate(x: float, **boundary: str) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def test_names_of_shells(tmp_path: Path) -> None:
     surface, mirror = SurfaceGatherer(scene.model).gather(scene.unloaded().u), scene.problem.mirror
     assert surface is not None
     assert mirror is not None
-    FieldSeries(tmp_path, About(scene.problem.material.h, 0.3, mirror.plane)).write(0, surface)
+    FieldSeries(tmp_path, ShellData(scene.problem.material.h, 0.3, mirror.plane)).write(0, surface)
     read, about = read_point(tmp_path, 0)
     assert read.shells == ("left", "right")
     number, x = np.rint(read.fields[SHELL]), read.r0[:, 0]

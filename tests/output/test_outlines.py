@@ -10,14 +10,14 @@ from conftest import CASES
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.outlines import (
-    DRIVEN,
-    STILL,
+    FILE_OF_ALL_POINTS,
+    FILE_OF_POINT,
     outlines,
     read_outlines,
     solids,
     vtp_content,
 )
-from magshell_fenicsx.shape.solids import cylinder, globe
+from magshell_fenicsx.shape.drawn_bodies import cylinder, globe
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
 STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"
@@ -46,8 +46,8 @@ def test_outlines(tmp_path: Path) -> None:
     assert north / np.linalg.norm(north) == pytest.approx(
         [1, 0, 0], abs=1e-12
     )  # it was e3 before the quarter turn
-    (tmp_path / STILL).write_bytes(vtp_content(still))
-    (tmp_path / DRIVEN.format(3)).write_bytes(vtp_content(lying, [magnet]))
+    (tmp_path / FILE_OF_ALL_POINTS).write_bytes(vtp_content(still))
+    (tmp_path / FILE_OF_POINT.format(3)).write_bytes(vtp_content(lying, [magnet]))
     for number, lines in ((2, still), (3, lying)):
         for found, line in zip(read_outlines(tmp_path, number)[0], lines, strict=True):
             np.testing.assert_allclose(found, line, atol=1e-6)
@@ -55,7 +55,7 @@ def test_outlines(tmp_path: Path) -> None:
     assert same.name == magnet.name
     assert same.points == pytest.approx(magnet.points, abs=1e-6)
     assert (same.triangles == magnet.triangles).all()
-    shown = pyvista.read(tmp_path / DRIVEN.format(3))
+    shown = pyvista.read(tmp_path / FILE_OF_POINT.format(3))
     assert (shown.n_lines, shown.n_faces_strict) == (len(lying), len(magnet.triangles))
     assert list(shown.field_data["names"]) == [magnet.name]
     assert read_outlines(tmp_path / "none", 0) == ((), ())

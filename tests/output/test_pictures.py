@@ -18,41 +18,41 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface, completed
-from magshell_fenicsx.output.fields.tessellation import tessellated
+from magshell_fenicsx.output.fields.tessellation import tessellate
 from magshell_fenicsx.output.fields.vtu import (
-    About,
     FieldSeries,
+    ShellData,
     point_file,
     read_vtu,
     write_whole_shells,
 )
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.colours import Coloured, loads, moments, strains
+from magshell_fenicsx.output.pictures.colours import ColouredField, loads, moments, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
-from magshell_fenicsx.output.pictures.layout import png, written
+from magshell_fenicsx.output.pictures.layout import figure_files, png
 from magshell_fenicsx.output.pictures.picture import (
     PICTURES,
     Background,
-    apart,
-    drawn_arrows,
+    edge_lines,
+    field_arrows,
     figures,
-    rims,
-    spread,
+    lines_away_from,
+    spread_points,
 )
-from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
-from magshell_fenicsx.output.pictures.view import (
+from magshell_fenicsx.output.pictures.rendering import (
     LAMP,
     RELIEF,
     RIM,
     Camera,
-    InView,
+    RenderedSurface,
     Window,
     axes_on_screen,
-    towards,
+    viewing_direction,
 )
-from magshell_fenicsx.output.store.known import pole_of
+from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
+from magshell_fenicsx.output.store.stored_results import pole_of
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, PathTable, Row
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 Array = NDArray[np.float64]
 STYLE = OutputSection()
@@ -87,12 +87,12 @@ def test_axes_on_the_screen() -> None:
 def test_a_place_is_seen_from_its_side() -> None:
     for azimuth in (0.0, 2.0, -1.0):
         place = np.array([np.cos(azimuth), np.sin(azimuth), 0.5])
-        assert towards(place) @ place > 3 * np.linalg.norm(place)
+        assert viewing_direction(place) @ place > 3 * np.linalg.norm(place)
 
 
-def seen(surface: Surface, width: int = 300) -> InView:
+def seen(surface: Surface, width: int = 300) -> RenderedSurface:
     camera = Camera(ABOVE)
-    return InView.of(surface, camera, Window.around(camera(surface.r0), width))
+    return RenderedSurface.from_surface(surface, camera, Window.around(camera(surface.r0), width))
 
 
 def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
@@ -176,18 +176,18 @@ def test_edges_are_drawn_in_front_of_the_shell_itself() -> None:
     """Those of one triangle alone: no diagonal, no ridge with double nodes; the rim of the upper of
     two squares.
     """
-    edges = rims(plate(0.0)).reshape(4, -1, 3)[:, :-1]
+    edges = edge_lines(plate(0.0)).reshape(4, -1, 3)[:, :-1]
     assert (np.abs(edges[..., :2]).max(axis=-1) == 1).all()
-    on_ridge = np.abs(rims(slopes(0.5))[:, 0]) < 1e-9
+    on_ridge = np.abs(edge_lines(slopes(0.5))[:, 0]) < 1e-9
     assert on_ridge.sum() == 4  # the ends of the other edges
     panel = Background(two_squares(), Camera(ABOVE), 300).panel(plain(), STYLE)
     x, y = np.concatenate([line for line, _ in panel.lines]).T
     assert (np.abs(y[np.abs(x - 0.5) < 1e-6]) <= 0.6).sum() > 10
 
 
-def plain() -> Coloured:
+def plain() -> ColouredField:
     """No colours."""
-    return Coloured("", np.zeros(8), (0.0, 1.0), "", "")
+    return ColouredField("", np.zeros(8), (0.0, 1.0), "", "")
 
 
 def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
@@ -201,9 +201,9 @@ def test_the_deformed_shell_hides_the_outline_of_the_undeformed_one() -> None:
     assert np.nanmin(x) == pytest.approx(-1, abs=0.02)
     assert np.nanmax(x) < -0.25
     line = np.column_stack([np.linspace(0, 1, 101), np.zeros(101)])
-    (left,) = apart([line], [np.array([[0.2, 0.0], [0.25, 0.0]])], 0.04, 0.1)
+    (left,) = lines_away_from([line], [np.array([[0.2, 0.0], [0.25, 0.0]])], 0.04, 0.1)
     assert np.nanmin(left[:, 0]) < 0.01
-    assert apart([line[:5]], [np.array([[9.0, 0.0]])], 0.04, 0.1) == []
+    assert lines_away_from([line[:5]], [np.array([[9.0, 0.0]])], 0.04, 0.1) == []
 
 
 def test_what_is_in_front_hides_what_is_behind() -> None:
@@ -234,8 +234,8 @@ def test_curved_cells_are_smooth() -> None:
     )  # VTK: corners, edges
     bent = nodes + np.column_stack([0 * nodes[:, 0], 0 * nodes[:, 0], nodes[:, 0] ** 2 / 4])
     surface = Surface(bent, 0 * bent, np.tile([0.0, 0, 1], (6, 1)), np.arange(6)[None], {})
-    pieces = tessellated(surface)
-    r, n = pieces.at(bent), pieces.normals(bent)
+    pieces = tessellate(surface)
+    r, n = pieces.at_points(bent), pieces.normals(bent)
     assert r[:, 2] == pytest.approx(r[:, 0] ** 2 / 4)
     slope = np.column_stack([-r[:, 0] / 2, 0 * r[:, 0], 1 + 0 * r[:, 0]])
     assert np.abs(np.einsum("ij,ij->i", n, slope)) == pytest.approx(np.linalg.norm(slope, axis=1))
@@ -254,8 +254,8 @@ def test_a_body_has_its_outer_faces_only() -> None:
     ours = [first + np.array([k, 0, 0]) for k in (0, 1)]
     cells = [[int(np.flatnonzero((r == p).all(axis=1))[0]) for p in cube] for cube in ours]
     body = Surface(r, 0 * r, np.tile([0.0, 0, 1], (len(r), 1)), np.array(cells), {})
-    pieces = tessellated(body, 20)
-    a, b, c = np.moveaxis(pieces.at(r)[pieces.triangles], 1, 0)
+    pieces = tessellate(body, 20)
+    a, b, c = np.moveaxis(pieces.at_points(r)[pieces.triangles], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     assert len(pieces.nodes) == 10
     assert area.sum() / 2 == pytest.approx(10)
@@ -285,7 +285,7 @@ def test_sizes_and_formats() -> None:
     """Millimetres at so many pixels per inch; svg and pdf are valid, with text as text."""
     style = OutputSection(width=60, dpi=150, font_size=7, formats=["svg", "pdf"])
     figure = figures(plate(0.1), 0.01, style, Camera(ABOVE), ["shell"])["shell"]
-    files = dict(written(figure, style, "shell"))
+    files = dict(figure_files(figure, style, "shell"))
     assert list(files) == ["shell.png", "shell.svg", "shell.pdf"]
     assert matplotlib.image.imread(io.BytesIO(files["shell.png"])).shape[1] == pytest.approx(
         60 / 25.4 * 150, abs=2
@@ -320,7 +320,7 @@ def test_opposite_fields_are_opposite_arrows() -> None:
     """Side by side: their feet are beside the same place, their vectors opposite."""
     surface = plate(0.0)
     surface.fields.update({"Br": np.tile([1.0, 0, 0], (4, 1)), "Ba": np.tile([-2.0, 0, 0], (4, 1))})
-    first, second = drawn_arrows(surface, Camera(ABOVE), lambda r: np.ones(len(r), bool))
+    first, second = field_arrows(surface, Camera(ABOVE), lambda r: np.ones(len(r), bool))
     assert first.vectors == pytest.approx(-second.vectors)
     middle = (first.feet + second.feet) / 2
     places = Camera(ABOVE)(SQUARE)
@@ -412,7 +412,7 @@ def test_numbers_of_a_short_bar_do_not_touch() -> None:
 
 def test_arrows_are_apart() -> None:
     r = np.random.default_rng(0).random((500, 3))
-    chosen = r[spread(r, 0.3)]
+    chosen = r[spread_points(r, 0.3)]
     distance = np.linalg.norm(chosen[:, None] - chosen, axis=2)
     assert distance[~np.eye(len(chosen), dtype=bool)].min() >= 0.3
     assert np.linalg.norm(r[:, None] - chosen, axis=2).min(axis=1).max() < 0.3
@@ -558,7 +558,7 @@ def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
         {"E": T + np.swapaxes(T, 1, 2), "k": np.arange(4.0), "Br": T[0, [0, 1, 2, 0]]}
     )
     mirror = np.array([0.6, 0.8, 0.0])
-    series = FieldSeries(tmp_path, About(0.01, 0.3, mirror))
+    series = FieldSeries(tmp_path, ShellData(0.01, 0.3, mirror))
     series.write(0, surface)
     same, about = read_vtu(tmp_path / point_file(0))
     assert (about.h, about.nu, about.mirror.tolist()) == (0.01, 0.3, mirror.tolist())  # type: ignore[union-attr]
@@ -595,7 +595,7 @@ def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path)
         row | {"amplitude": "pressure" if i else "", "p_over_pc": 0.2 * i}
         for i, row in enumerate(rows)
     ]
-    series = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03))
+    series = FieldSeries(tmp_path / "fields", ShellData(0.01, 0.3, mirror, 0.03))
     table = PathTable(tmp_path / "path.csv")
     for i, row in enumerate(rows):
         series.write(i, surface, row)
@@ -603,8 +603,8 @@ def test_paraviews_time_is_the_load_and_the_whole_shell_is_there(tmp_path: Path)
     table.close()
     reader = pyvista.get_reader(tmp_path / "fields/path.pvd")
     assert reader.time_values == [0.0, 0.2, 0.4]
-    again = FieldSeries(tmp_path / "fields", About(0.01, 0.3, mirror, 0.03), rows=rows[:2])
-    assert again.kept == 2
+    again = FieldSeries(tmp_path / "fields", ShellData(0.01, 0.3, mirror, 0.03), rows=rows[:2])
+    assert again.complete_points == 2
     again.write(2, surface, {**rows[2], "p_over_pc": 0.1})
     assert pyvista.get_reader(tmp_path / "fields/path.pvd").time_values == [0.0, 1.0, 2.0]
     assert write_whole_shells(tmp_path) == [

@@ -15,10 +15,11 @@ from PIL import Image
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
-from magshell_fenicsx.output.pictures.lines import drawn_parts
+from magshell_fenicsx.output.pictures.curve_additions import _free_corner, add_shapes, runs_figure
+from magshell_fenicsx.output.pictures.lines import curve_steps
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.pictures.plot import (
-    Drawn,
+    PicturedRun,
     draw,
     draw_animation,
     in_true_time,
@@ -26,9 +27,8 @@ from magshell_fenicsx.output.pictures.plot import (
     plot_runs,
 )
 from magshell_fenicsx.output.pictures.readings import readings_figure
-from magshell_fenicsx.output.pictures.several import _free, add_shapes, runs_figure
 from magshell_fenicsx.output.store.table import read_rows
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +248,7 @@ def test_what_sensors_read_is_a_curve(run: Path) -> None:
 
 def test_a_displacement_by_rounding_is_no_curve(run: Path) -> None:
     """A step in which nothing moves, and one in which it does a little, before the path."""
-    (path,) = worth_drawing(drawn_parts(read_rows(run / "path.csv"), "pressure"))
+    (path,) = worth_drawing(curve_steps(read_rows(run / "path.csv"), "pressure"))
     still, little = (
         replace(
             path, rows=[{**row, "volume_change": size * i**2} for i, row in enumerate(path.rows)]
@@ -265,10 +265,10 @@ def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
     """Each beside its point, within the axes, and not on each other."""
     again = copied(run, tmp_path, "*.png")
     last = len(read_rows(again / "path.csv")) - 1
-    drawn = Drawn(again)
+    drawn = PicturedRun(again)
     figure = curve_figure(drawn.rows, "pressure", drawn.style)
-    parts = worth_drawing(drawn_parts(drawn.rows, "pressure"))
-    shown = [(drawn.rows[i], drawn.at(drawn.rows[i])[0]) for i in (2, last)]
+    parts = worth_drawing(curve_steps(drawn.rows, "pressure"))
+    shown = [(drawn.rows[i], drawn.surface_at(drawn.rows[i])[0]) for i in (2, last)]
     add_shapes(figure, parts, shown, drawn.style, drawn.camera)
     figure.draw_without_rendering()
     boxes = [each.offsetbox.get_window_extent() for each in figure.axes[0].artists]
@@ -295,7 +295,7 @@ def test_a_shell_beside_a_curve_covers_nothing(size: tuple[float, float]) -> Non
     curve = axes.transAxes.inverted().transform(axes.transData.transform(np.column_stack([x, y])))
     boxes = list[NDArray[np.float64]]()
     for i in (0, 100, 200, 300, 399):
-        low = _free(axes, np.array([x[i], y[i]]), np.array(size), boxes)
+        low = _free_corner(axes, np.array([x[i], y[i]]), np.array(size), boxes)
         boxes.append(np.array([low, low + size]))
     for i, (low, high) in enumerate(boxes):
         assert (low >= 0).all()

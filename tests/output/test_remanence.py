@@ -7,8 +7,8 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.pictures.picture import figures
-from magshell_fenicsx.output.pictures.view import Camera
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.output.pictures.rendering import Camera
+from magshell_fenicsx.problem.requests import OutputSection
 
 ABOVE = np.array([0.0, -1, 1])
 

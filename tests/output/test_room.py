@@ -13,20 +13,20 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.outlines import outlines
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.beside import far_said
+from magshell_fenicsx.output.pictures.bodies_and_magnets import far_bodies_note
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.colours import contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel
 from magshell_fenicsx.output.pictures.picture import figures
-from magshell_fenicsx.output.pictures.view import (
+from magshell_fenicsx.output.pictures.rendering import (
     Camera,
     Window,
     deflected_place,
     near_outlines,
     run_camera,
-    towards,
+    viewing_direction,
 )
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 Array = NDArray[np.float64]
 ABOVE = Camera(np.array([0.0, -1e-6, 1.0]))
@@ -98,8 +98,8 @@ def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
     lines = tuple(line + np.array([farther, 0, 0]) for line in lines)
     surface = Surface(r0, lift, flat.n0, flat.cells, {}, lines)
     assert len(near_outlines(surface)) == (len(lines) if drawn else 0)
-    assert bool(far_said(surface)) != drawn
-    usual = towards(deflected_place(surface))
+    assert bool(far_bodies_note(surface)) != drawn
+    usual = viewing_direction(deflected_place(surface))
     camera = run_camera(surface, OutputSection())
     assert np.allclose(camera.direction, usual) != drawn
 

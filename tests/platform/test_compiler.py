@@ -265,7 +265,7 @@ def test_pictures_have_their_code_before_anything_is_solved(
     def without_compiler() -> None:
         raise NoCompiler("there is none")
 
-    monkeypatch.setattr("magshell_fenicsx.output.pictures.view.library", without_compiler)
+    monkeypatch.setattr("magshell_fenicsx.output.pictures.rendering.library", without_compiler)
     with pytest.raises(NoCompiler, match="there is none"):
         ms.run(CASES / "clamped_plate.yaml", tmp_path / "out")
     assert not (tmp_path / "out/path.csv").exists()

@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.terminal import LAUNCHER_VARIABLES, live_line
 from magshell_fenicsx.quantities.registry import Sizes
-from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
+from magshell_fenicsx.runs.status import PathEnd, RunProgress, time_left
 
 QUICK = (CASES / "pole_indentation.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
 
@@ -216,13 +216,13 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     row = {"lambda_m": 0.0, "w_over_h": 0.0}
-    progress.accepted({**row, "label": "start"}, known=True)
+    progress.accepted({**row, "label": "start"}, is_known=True)
     progress.beginning(1)
-    progress.accepted({**row, "label": "field", "lambda_m": 0.00092}, known=True)
+    progress.accepted({**row, "label": "field", "lambda_m": 0.00092}, is_known=True)
     progress.trying(here, 0.02)  # type: ignore[arg-type]
     progress.beginning(2)
     for w, known in ((8.0, True), (12.0, False), (14.0, False)):
-        progress.accepted({**row, "label": "step", "w_over_h": w}, known=known)
+        progress.accepted({**row, "label": "step", "w_over_h": w}, is_known=known)
         progress.trying(here, 0.02)  # type: ignore[arg-type]
     assert told == [
         "2 points  lambda_m 0.00092 -> 0.00184  0:50  du/h 1",
@@ -247,7 +247,9 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     progress.beginning(1)
     for label in ("step", "fold"):
-        progress.accepted({"label": label, "amplitude": "pressure", "p_over_pc": 0.3}, known=False)
+        progress.accepted(
+            {"label": label, "amplitude": "pressure", "p_over_pc": 0.3}, is_known=False
+        )
         progress.trying(here, 0.02)  # type: ignore[arg-type]
     assert told == [
         "1 point  p/pc 0.3 -> the first instability  0:00  du/h 1",
@@ -258,11 +260,11 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
 def test_where_a_path_leads() -> None:
     """To a value, through a number of steps, or nobody knows how far."""
     row = {"p_over_pc": 0.25, "w_over_h": 5.0}
-    assert Aim("w_over_h", 21.0).part({"w_over_h": 1.0}, row, 7) == 0.2
-    assert Aim("w_over_h", words="28 steps", steps=28).part(row, row, 7) == 0.25
-    assert Aim("p_over_pc", words="the first instability").part(row, row, 7) is None
+    assert PathEnd("w_over_h", 21.0).part({"w_over_h": 1.0}, row, 7) == 0.2
+    assert PathEnd("w_over_h", words="28 steps", steps=28).part(row, row, 7) == 0.25
+    assert PathEnd("p_over_pc", words="the first instability").part(row, row, 7) is None
     assert (
-        Aim("p_over_pc", words="the first instability").text(row)
+        PathEnd("p_over_pc", words="the first instability").text(row)
         == "p/pc 0.25 -> the first instability"
     )
     assert time_left((0.0, 10.0), (0.25, 20.0)) == 30.0

@@ -18,7 +18,7 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
+from magshell_fenicsx.output.store.folder import DiskError, access_disk, prepare_folder
 from magshell_fenicsx.platform.processes import on_first_rank, raise_on_all_ranks
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.public import Scene
@@ -51,7 +51,7 @@ def raised(kind: type[Exception], said: str) -> Iterator[None]:
 def what_rank_0_gets() -> None:
     found = on_first_rank(COMM, lambda: COMM.rank + 7)
     assert found == 7
-    assert by_first(COMM, lambda: {"rank": COMM.rank}) == {"rank": 0}
+    assert access_disk(COMM, lambda: {"rank": COMM.rank}) == {"rank": 0}
 
 
 def any_error() -> None:
@@ -61,7 +61,7 @@ def any_error() -> None:
         AlreadyComplete({"a bug": 1}),
         MeshError("a bug"),
     ):
-        for share in (on_first_rank, by_first):
+        for share in (on_first_rank, access_disk):
             with raised(type(error), str(error)):
                 share(COMM, failing(error))
     with raised(ValueError, "a bug"):
@@ -70,9 +70,9 @@ def any_error() -> None:
 
 def files() -> None:
     with raised(DiskError, "there cannot be written: No space"):
-        by_first(COMM, failing(OSError(28, "No space", "there")))
+        access_disk(COMM, failing(OSError(28, "No space", "there")))
     with raised(DiskError, "there cannot be read: No space"):
-        by_first(COMM, failing(OSError(28, "No space", "there")), "cannot be read")
+        access_disk(COMM, failing(OSError(28, "No space", "there")), "cannot be read")
 
 
 def what_cannot_be_sent() -> None:

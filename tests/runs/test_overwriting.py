@@ -54,7 +54,9 @@ def test_the_same_case_in_another_file(out: Path, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_of_another_file_is_kept_too(tmp_path: Path) -> None:
-    (tmp_path / "checkpoint").write_bytes(checkpoint.begun(ms.Case.load(FILE).problem().document))
+    (tmp_path / "checkpoint").write_bytes(
+        checkpoint.empty_content(ms.Case.load(FILE).problem().document)
+    )
     with pytest.raises(ms.CaseError, match=r"has a run of dimple_buckling\.yaml"):
         ms.run(other(tmp_path, "symmetry: half\n"), tmp_path)
     assert (tmp_path / "checkpoint").exists()

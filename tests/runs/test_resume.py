@@ -10,7 +10,7 @@ from conftest import CASES
 from interrupted import check_fields, check_same_path, kill, start, wait_for_rows, whole_lines
 from mpi4py import MPI
 
-from magshell_fenicsx.output.store.folder import held_folder
+from magshell_fenicsx.output.store.folder import locked_folder
 from magshell_fenicsx.output.store.table import read_rows
 
 INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_buckling.yaml"
@@ -144,7 +144,7 @@ def test_one_run_at_a_time(tmp_path: Path) -> None:
     """A run that still writes to the folder, such as ranks that outlive mpirun, is not joined by
     another.
     """
-    with held_folder(tmp_path, MPI.COMM_SELF, make=False):
+    with locked_folder(tmp_path, MPI.COMM_SELF, make=False):
         second = magshell("run", *LONG, "--out", tmp_path)
     assert second.returncode == 2
     assert second.stderr == f"--out {tmp_path}: cannot be written: another run is writing to it\n"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.modes import mode_surface, wave_number
+from magshell_fenicsx.output.fields.mode_fields import mode_surface, wave_number
 from magshell_fenicsx.output.fields.ring import waves_around
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.public import run

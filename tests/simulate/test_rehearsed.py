@@ -16,7 +16,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.continuation.transient import Integrator
-from magshell_fenicsx.runs.rows import departures
+from magshell_fenicsx.runs.rows import motion_errors
 from magshell_fenicsx.runs.rows import rows as table_of
 from magshell_fenicsx.shells.mass import mass
 from magshell_fenicsx.shells.modes import ShellModes
@@ -135,13 +135,13 @@ def test_a_ramp_passes_a_fold() -> None:
     """
     scene, begin, rows = ramp(1e-2, errors="step")
     times = [row.clock["time"] for row in rows]
-    (said,) = departures(scene.problem.programme, table_of(scene, rows))
+    (said,) = motion_errors(scene.problem.programme, table_of(scene, rows))
     assert said.startswith("step 1: it passes unstable states")
     reference = exact(scene, begin.point.state.u, DRAG, lambda t: TOP * t / END, times)
     assert np.abs(reference[-1]).max() > 2
     for tolerance in TOLERANCES:
         scene, _, rows = ramp(tolerance, errors="motion")
-        assert not list(departures(scene.problem.programme, table_of(scene, rows)))
+        assert not list(motion_errors(scene.problem.programme, table_of(scene, rows)))
         error = errors(rows, reference)
         assert error.max() < tolerance
         assert 0.5 < max(row.point.error for row in rows) / error.max() < 2

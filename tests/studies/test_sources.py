@@ -21,9 +21,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.output.store.stored_results import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
-from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.platform import environment
 from magshell_fenicsx.platform.processes import Usage
 from magshell_fenicsx.public import run
@@ -131,7 +131,7 @@ def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
     others.
     """
     this, file = document_of(Case.load(BUCKLING)), tmp_path / "checkpoint"
-    file.write_bytes(checkpoint.begun(this))
+    file.write_bytes(checkpoint.empty_content(this))
     checkpoint.check_resumable(file, this)
     known = checkpoint.identity(this)
     edited()

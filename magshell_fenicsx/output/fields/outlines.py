@@ -1,5 +1,6 @@
-"""Bodies and sources beside a shell: their outlines and faces where amplitudes have driven them, as
-.vtp files.
+"""Bodies and field sources beside a shell, as .vtp files: their outlines and faces.
+
+They are where the amplitudes have driven them.
 """
 
 import re
@@ -13,60 +14,66 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.moving_source import carried
-from magshell_fenicsx.shape.solids import Solid
+from magshell_fenicsx.parts.magnetism.moving_source import combined_motion
+from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
 ARRAY = re.compile(r'Name="(\w+)" [^>]*>([^<]*)</DataArray>')  # in the files of `vtp_content`
-STILL, DRIVEN = "outlines.vtp", "outlines_{:04d}.vtp"  # of all points, or of each
-DIGITS = 7  # of the corners of faces
+FILE_OF_ALL_POINTS = "outlines.vtp"  # where nothing moves
+FILE_OF_POINT = "outlines_{:04d}.vtp"
+DIGITS = 7  # decimals of the corners of faces, over R
 
 
 def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
-    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven
-    sources and bodies.
+    """Return places (n, 3) over R along lines of bodies and sources, in the model's frame.
+
+    Parameters
+    ----------
+    loads
+        Bodies and magnetic fields.
+    mu
+        Amplitudes, which drive bodies and sources.
+    h
+        Thickness over R.
     """
     lines_in_space = list[Array]()
-    for each, Q, t, _ in _placed(loads, mu, h):
-        lines_in_space += [line @ Q.T + t for line in getattr(each, "lines", ())]
+    for drawn_object, Q, t, _ in _placed_objects(loads, mu, h):
+        lines_in_space += [line @ Q.T + t for line in getattr(drawn_object, "lines", ())]
     return tuple(lines_in_space)
 
 
 def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]:
-    """Their faces, of those that have any."""
+    """Return the faces of bodies and sources, see `outlines`."""
     solids_in_space = list[Solid]()
-    for each, Q, t, name in _placed(loads, mu, h):
-        if solid := getattr(each, "solid", None):
-            solids_in_space.append(replace(solid.moved(Q, t), name=solid.name or name))
+    for drawn_object, Q, t, name in _placed_objects(loads, mu, h):
+        if solid := getattr(drawn_object, "solid", None):
+            solids_in_space.append(replace(solid.transformed(Q, t), name=solid.name or name))
     return tuple(solids_in_space)
 
 
-def _placed(
+def _placed_objects(
     loads: Loads, mu: Mapping[str, float], h: float
 ) -> Iterator[tuple[Any, Array, Array, str]]:
-    """Bodies and sources, their way since all amplitudes were zero, x -> Q x + t, and the names of
-    bodies.
+    """Yield bodies and sources with their rigid motion x -> Q x + t and their names.
+
+    The motion is from the place where all amplitudes are zero. Sources have no name.
     """
     for contact in loads.contacts:
-        yield (
-            contact.distance,
-            np.eye(3),
-            mu.get(contact.amplitude, 0.0) * h * contact.direction,
-            contact.body,
-        )
+        translation = mu.get(contact.amplitude, 0.0) * h * contact.direction
+        yield contact.distance, np.eye(3), translation, contact.body
     if loads.magnetic is None:
         return
     for part in getattr(loads.magnetic.in_space, "parts", ()):
         yield part, np.eye(3), np.zeros(3), ""
-    for driven in loads.magnetic.driven:
-        yield driven.of, *carried(driven.motions, mu), ""
+    for moving_source in loads.magnetic.driven:
+        yield moving_source.of, *combined_motion(moving_source.motions, mu), ""
 
 
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
-    """The content of a .vtp file; VTK's own writer takes as long as a step of a path.
+    """Return the content of a .vtp file; VTK's own writer takes as long as a step of a path.
 
-    `pole` is positive on the half of a magnet with its north pole, `names` are those of the bodies
-    and magnets.
+    The array `pole` is positive on the half of a magnet with its north pole; `names` are those of
+    the bodies and magnets.
     """
     sizes = [len(line) for line in lines]
     starts = np.cumsum([sum(sizes), *(len(solid.points) for solid in faces)])
@@ -74,48 +81,67 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     triangles = [solid.triangles + start for solid, start in zip(faces, starts, strict=False)]
     poles = [
         np.zeros(sum(sizes)),
-        *(np.zeros(len(s.points)) if s.poles is None else s.poles for s in faces),
+        *(_poles_of(solid) for solid in faces),
     ]
-    numbers = np.array([[len(solid.points), len(solid.triangles)] for solid in faces]).reshape(
-        -1, 2
-    )
+    counts = [[len(solid.points), len(solid.triangles)] for solid in faces]
+    numbers = np.array(counts).reshape(-1, 2)
     names = "".join(f"{solid.name}\0" for solid in faces).encode()
-    about = [
+    field_data = [
         _array("sizes", "Int64", numbers, f'NumberOfTuples="{len(faces)}"'),
         _array("names", "String", np.frombuffer(names, np.uint8), f'NumberOfTuples="{len(faces)}"'),
     ]
-    count = sum(len(each) for each in triangles)
+    count = sum(len(triangles_of_solid) for triangles_of_solid in triangles)
+    corners_of_triangles = np.concatenate([np.zeros((0, 3), int), *triangles])
+    pole = _array("pole", "Float64", np.round(np.concatenate(poles), DIGITS))
+    points = _array("Points", "Float64", np.concatenate([*lines, *corners]))
+    polys = _cells(corners_of_triangles, 3 * np.arange(1, count + 1))
     return (
-        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1" byte_order="LittleEndian"><PolyData>\n'
-        f"<FieldData>{''.join(about) if faces else ''}</FieldData>\n"
-        f'<Piece NumberOfPoints="{starts[-1]}" NumberOfLines="{len(lines)}" NumberOfPolys="{count}">\n'
-        f"<PointData>{_array('pole', 'Float64', np.round(np.concatenate(poles), DIGITS))}</PointData>\n"
-        f"<Points>{_array('Points', 'Float64', np.concatenate([*lines, *corners]))}</Points>\n"
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="PolyData" version="0.1" byte_order="LittleEndian"><PolyData>\n'
+        f"<FieldData>{''.join(field_data) if faces else ''}</FieldData>\n"
+        f'<Piece NumberOfPoints="{starts[-1]}" NumberOfLines="{len(lines)}" '
+        f'NumberOfPolys="{count}">\n'
+        f"<PointData>{pole}</PointData>\n"
+        f"<Points>{points}</Points>\n"
         f"<Lines>{_cells(np.arange(sum(sizes)), np.cumsum(sizes))}</Lines>\n"
-        f"<Polys>{_cells(np.concatenate([np.zeros((0, 3), int), *triangles]), 3 * np.arange(1, count + 1))}</Polys>\n"
+        f"<Polys>{polys}</Polys>\n"
         "</Piece></PolyData></VTKFile>\n"
     ).encode()
 
 
+def _poles_of(solid: Solid) -> Array:
+    """Return the signs of the magnetic poles at the corners of a solid; zero without a magnet."""
+    return np.zeros(len(solid.points)) if solid.poles is None else solid.poles
+
+
 def _cells(numbers: NDArray[np.int64], ends: NDArray[np.int64]) -> str:
+    """Return the XML of cells with node numbers, which end at `ends`."""
     return _array("connectivity", "Int64", numbers.ravel()) + _array("offsets", "Int64", ends)
 
 
-def _array(name: str, kind: str, values: NDArray[Any], more: str = "") -> str:
+def _array(name: str, kind: str, values: NDArray[Any], attributes: str = "") -> str:
+    """Return the XML of an array of a VTK type, with further attributes."""
     width = values.shape[1] if values.ndim > 1 else 1
     text = " ".join(map(repr, values.ravel().tolist()))
+    space = " " if attributes else ""
     return (
-        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" {more}{" " if more else ""}'
+        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" {attributes}{space}'
         f'format="ascii">{text}</DataArray>'
     )
 
 
 def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
-    """Lines and faces beside the fields of a point; none without any, no faces in the file of an
-    earlier version.
+    """Return the lines and faces of bodies and sources at a point of a path.
+
+    Empty without a file; no faces in the file of an earlier version.
+
+    Raises
+    ------
+    Damaged
+        If the file cannot be read.
     """
-    file = folder / DRIVEN.format(number)
-    file = file if file.exists() else folder / STILL
+    file = folder / FILE_OF_POINT.format(number)
+    file = file if file.exists() else folder / FILE_OF_ALL_POINTS
     if not file.exists():
         return (), ()
     try:
@@ -125,30 +151,33 @@ def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[S
 
 
 def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
-    first, _, polys = text.partition("<Polys>")
-    parts = {name: each.split() for name, each in ARRAY.findall(first)}
-    ends = np.array(parts["offsets"], dtype=int)
-    points = np.array(parts["Points"], dtype=float).reshape(-1, 3)
+    """Return lines and faces from the content of a .vtp file of `vtp_content`."""
+    before_faces, _, polys = text.partition("<Polys>")
+    arrays = {name: text_of_array.split() for name, text_of_array in ARRAY.findall(before_faces)}
+    ends = np.array(arrays["offsets"], dtype=int)
+    points = np.array(arrays["Points"], dtype=float).reshape(-1, 3)
     on_lines = int(ends[-1]) if len(ends) else 0
     lines = tuple(np.split(points[:on_lines], ends[:-1])) if len(ends) else ()
-    if "sizes" not in parts:
+    if "sizes" not in arrays:
         return lines, ()
-    sizes = np.array(parts["sizes"], dtype=int).reshape(-1, 2)
-    names = bytes(int(code) for code in parts["names"]).decode().split("\0")
-    triangles = np.array(dict(ARRAY.findall(polys))["connectivity"].split(), dtype=int).reshape(
-        -1, 3
-    )
-    poles, solids, start, first_one = (
-        np.array(parts["pole"], dtype=float),
-        list[Solid](),
-        on_lines,
-        0,
-    )
-    for name, (n, m) in zip(names, sizes, strict=False):
-        own = poles[start : start + n]
-        numbers = triangles[first_one : first_one + m] - start
-        if numbers.size and not 0 <= numbers.min() <= numbers.max() < n:
+    sizes = np.array(arrays["sizes"], dtype=int).reshape(-1, 2)
+    names = bytes(int(code) for code in arrays["names"]).decode().split("\0")
+    connectivity = dict(ARRAY.findall(polys))["connectivity"].split()
+    triangles = np.array(connectivity, dtype=int).reshape(-1, 3)
+    poles, solids = np.array(arrays["pole"], dtype=float), list[Solid]()
+    start, first_triangle = on_lines, 0
+    for name, (point_count, triangle_count) in zip(names, sizes, strict=False):
+        pole_values = poles[start : start + point_count]
+        numbers = triangles[first_triangle : first_triangle + triangle_count] - start
+        if numbers.size and not 0 <= numbers.min() <= numbers.max() < point_count:
             raise IndexError(name)
-        solids.append(Solid(points[start : start + n], numbers, name, own if own.any() else None))
-        start, first_one = start + n, first_one + m
+        solids.append(
+            Solid(
+                points[start : start + point_count],
+                numbers,
+                name,
+                pole_values if pole_values.any() else None,
+            )
+        )
+        start, first_triangle = start + point_count, first_triangle + triangle_count
     return lines, tuple(solids)

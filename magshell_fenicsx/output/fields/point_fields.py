@@ -1,5 +1,7 @@
-"""Fields at the points of a surface: strains, stresses, densities of energy, and what interprets
-them.
+"""Fields at the points of a surface: strains, stresses, magnetic loads, gaps to bodies.
+
+Input: jets of the placement and the displacement at points (cells, points per cell). Output: arrays
+by name, as `surface.Surface` has them. The theory is in docs/theory.md.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,12 +29,18 @@ Array = NDArray[np.float64]
 def magnetic_loads(
     g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
 ) -> tuple[dict[str, Array], "Torque"]:
-    """The loads p_mag and k at points r0 (..., 3), and the torque as a function of u.
+    """Return the magnetic loads p_mag and k, and the torque as a function of the displacement.
 
     f_mag is added if the remanence and the thickness are uniform.
 
     Parameters
     ----------
+    g
+        Bases and curvature at the points.
+    field
+        The magnetisation and the applied field.
+    r0
+        (..., 3) places of the points.
     h
         Thickness over R; an array (...) if it varies.
     """
@@ -43,9 +51,8 @@ def magnetic_loads(
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if rotates:
         loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
-    if not callable(pattern) and isinstance(
-        h, float
-    ):  # the formula of f_mag assumes uniform vectors and thickness
+    if not callable(pattern) and isinstance(h, float):
+        # the formula of f_mag assumes uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
         if rotates:
             loads["f_mag"] = (loads["f_mag"] - in_plane_force(g, Ba, pattern, h)) / 2
@@ -54,7 +61,7 @@ def magnetic_loads(
 
 @dataclass(frozen=True)
 class SurfaceGeometry:
-    """Undeformed bases and curvature at points: a1, a2 (..., 2, 3), n0 (..., 3), b0_ij (..., 2, 2)."""
+    """Bases a1, a2 (..., 2, 3), normal n0 (..., 3), curvature b0_ij (..., 2, 2); undeformed."""
 
     a: Array
     n0: Array
@@ -62,27 +69,30 @@ class SurfaceGeometry:
 
     @property
     def dual(self) -> Array:
-        """a0^1, a0^2, (..., 2, 3)."""
+        """Dual basis a0^1, a0^2, (..., 2, 3)."""
         metric = np.einsum("...ai,...bi->...ab", self.a, self.a)
         return np.asarray(np.einsum("...ab,...bi->...ai", np.linalg.inv(metric), self.a))
 
 
 def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array) -> Array:
-    """p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
+    """Return p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
     b = np.einsum("...ab,...ai,...bj->...ij", g.b0, g.dual, g.dual)
     return np.asarray(-h * np.einsum("...ij,...i,j->...", b, Br, Ba))
 
 
 def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
-    """f_mag (..., 3) for uniform Br and Ba.
+    """Return f_mag (..., 3) for uniform Br and Ba.
 
     f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this
     equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
-    along, normal_Ba = np.einsum("...ai,...i->...a", dual, Br), np.einsum("...i,i->...", g.n0, Ba)
+    tangential_Br, normal_Ba = (
+        np.einsum("...ai,...i->...a", dual, Br),
+        np.einsum("...i,i->...", g.n0, Ba),
+    )
     trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)
-    covariant = np.einsum("...ca,...a->...c", g.b0, along) * normal_Ba[..., None]
+    covariant = np.einsum("...ca,...a->...c", g.b0, tangential_Br) * normal_Ba[..., None]
     covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum(
         "...ci,i->...c", g.a, Ba
     )
@@ -90,52 +100,61 @@ def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
 
 
 def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
-    """k = (n0 (x) n0):B0, (...)."""
+    """Return k = (n0 (x) n0):B0, (...)."""
     return np.asarray(-np.einsum("...i,...i->...", g.n0, Br) * np.einsum("...i,i->...", g.n0, Ba))
 
 
 @dataclass(frozen=True)
 class Torque:
-    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (...,
-    2).
+    """Magnetic torque tau at points, as a function of the derivatives of the displacement.
 
-    For a remanence that does not stretch, that and half of (n0 . Ba)(a0^a . Br); `dual` and
-    `transposed` are then the dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3).
+    Attributes
+    ----------
+    n0
+        (..., 3) normals.
+    coefficients
+        (..., 2): -(n0 . Br)(a0^a . Ba). For a remanence that does not stretch, that and half of
+        (n0 . Ba)(a0^a . Br).
+    dual, transposed
+        Dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3), for a remanence that does not
+        stretch.
     """
 
     n0: Array
-    along: Array
+    coefficients: Array
     dual: Array | None = None
     transposed: Array | None = None
 
     def __call__(self, du: Array) -> Array:
-        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and
-        u,_2 (..., 2, 3).
+        """Return tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3).
+
+        `du` are the derivatives u,_1 and u,_2 (..., 2, 3).
         """
-        turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
-        torque = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
+        rotation = np.matmul(self.coefficients[..., None, :], du)[..., 0, :]
+        torque = rotation - np.sum(rotation * self.n0, axis=-1, keepdims=True) * self.n0
         if self.dual is not None and self.transposed is not None:
             torque = torque + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
         return np.asarray(torque)
 
 
 def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
-    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or
-    is convected.
+    """Return the torque as a function of the displacement's derivatives.
+
+    The remanence rotates with the surface if `rotates`; otherwise it is convected.
     """
-    along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum(
+    coefficients = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum(
         "...ai,i->...a", g.dual, Ba
     )
     if not rotates:
-        return Torque(g.n0, along)
+        return Torque(g.n0, coefficients)
     in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
-    half = (g.n0 @ Ba / 2)[..., None]
-    along = along + half * np.einsum("...ai,...i->...a", g.dual, Br)
-    return Torque(g.n0, along, g.dual, half * in_surface)
+    half_normal_Ba = (g.n0 @ Ba / 2)[..., None]
+    coefficients = coefficients + half_normal_Ba * np.einsum("...ai,...i->...a", g.dual, Br)
+    return Torque(g.n0, coefficients, g.dual, half_normal_Ba * in_surface)
 
 
 class Stresses:
-    """Strains and moments at points (cells, points per cell).
+    """Membrane strains and bending moments at points (cells, points per cell).
 
     Parameters
     ----------
@@ -143,6 +162,8 @@ class Stresses:
         (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
     thickness
         (cells, points) factor of h; None for 1.
+    natural
+        The natural shape; None for the drawn one.
     made_of
         (cells, 4) `parameters.OwnMaterial` of each cell; None for that of `material`.
     """
@@ -160,14 +181,18 @@ class Stresses:
         self._law = material.law_in(made_of).at(
             r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
         )
-        self._natural, self._unit = (
-            natural and natural.at(r0[0], self.frame.n0),
-            material.bending_stiffness,
-        )
+        self._natural = natural and natural.at(r0[0], self.frame.n0)
+        self._unit = material.bending_stiffness
 
-    def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes
-        mu.
+    def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
+        """Return strains and moments of a displacement.
+
+        Parameters
+        ----------
+        u
+            (6, cells, points, 3) jet of the displacement over R.
+        mu
+            Amplitudes of the state.
 
         Returns
         -------
@@ -192,7 +217,7 @@ class Stresses:
 
 
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
-    """E_1, E_2, M_1, M_2 (...): the principal values of E and M (..., 3), the larger first."""
+    """Return E_1, E_2, M_1, M_2 (...): the principal values of E and M (..., 3), descending."""
     return {
         f"{name}_{number}": values
         for name in ("E", "M")
@@ -201,33 +226,47 @@ def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
-    """Of a material that thins, from E_1 and E_2 (...): its stretches and its true stresses over E.
+    """Return stretches and true stresses over E of a material whose thickness follows its area.
+
+    Parameters
+    ----------
+    fields
+        E_1 and E_2 (...), the principal strains.
+    law
+        The law of elasticity; without such a material the result is empty, and values are nan where
+        the thickness is constant.
 
     Returns
     -------
     stretch_1, stretch_2, stretch_3
-        In the surface, the larger first, and of the thickness.
+        In the surface, descending, and of the thickness.
     sigma_1, sigma_2
         Force per deformed area of the middle layer, in the same directions.
     """
     if not law.some_thin:
         return {}
     E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
-    square = 1 + 2 * E
+    squared_stretch = 1 + 2 * E
     S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
-    stretches = [*np.sqrt(np.moveaxis(square, -1, 0)), 1 / np.sqrt(np.prod(square, axis=-1))]
-    stretched = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
-    stretched |= {"sigma_1": square[..., 0] * S1, "sigma_2": square[..., 1] * S2}
-    return {name: np.where(law.thins, values, np.nan) for name, values in stretched.items()}
+    stretches = [
+        *np.sqrt(np.moveaxis(squared_stretch, -1, 0)),
+        1 / np.sqrt(np.prod(squared_stretch, axis=-1)),
+    ]
+    stretch_fields = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
+    stretch_fields |= {
+        "sigma_1": squared_stretch[..., 0] * S1,
+        "sigma_2": squared_stretch[..., 1] * S2,
+    }
+    return {name: np.where(law.thins, values, np.nan) for name, values in stretch_fields.items()}
 
 
 def in_space(S: Array, t: Array) -> Array:
-    """Components (..., 3) in frames t (..., 2, 3) as tensors (..., 3, 3)."""
+    """Return tensors (..., 3, 3) from components (..., 3) in frames t (..., 2, 3)."""
     return np.asarray(np.swapaxes(t, -1, -2) @ S[..., [[0, 1], [1, 2]]] @ t)
 
 
 def in_frame(S: Array, t: Array) -> Array:
-    """Components (..., 3) in frames t (..., 2, 3) of symmetric tensors (..., 3, 3)."""
+    """Return components (..., 3) in frames t (..., 2, 3) of symmetric tensors (..., 3, 3)."""
     return np.asarray((t @ S @ np.swapaxes(t, -1, -2))[..., [0, 0, 1], [0, 1, 1]])
 
 
@@ -243,13 +282,13 @@ class PointFields:
     thickness
         (cells, points) factor of h; None for 1.
     contacts
-        Bodies that press.
+        Rigid bodies in contact with the shell.
     remanence
-        What is magnetised if there is no field.
+        The magnetisation of a shell without an applied field.
     natural
-        The natural shape, whose volume stays.
+        The natural shape; its volume is the deformed one of a material that thins.
     made_of
-        As of `Stresses`.
+        (cells, 4) `parameters.OwnMaterial` of each cell; None for that of `material`.
 
     Attributes
     ----------
@@ -259,7 +298,7 @@ class PointFields:
     n0
         (cells, points, 3) undeformed normals.
     weight
-        (cells, points) area; the weight of a cell in the mean over the cells that share a point.
+        (cells, points) area: the weight of a cell in the mean over the cells that share a point.
     Br, susceptibility
         (cells, points, 3) the undeformed remanence, (cells, points, 1) the susceptibility; (cells,
         points, 0) without.
@@ -286,14 +325,14 @@ class PointFields:
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
-        self._carried, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
+        self._magnetisation, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
         self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
         if field and field.soft:
             self.susceptibility = field.soft.at(inside(r0[0]), self.n0)[..., None]
         if field and field.soft and field.soft.alone:
-            self._carried, field = None, None
-        if self._carried:
-            pattern = self._carried.remanent
+            self._magnetisation, field = None, None
+        if self._magnetisation:
+            pattern = self._magnetisation.remanent
             self.Br = (
                 pattern(inside(r0[0]), self.n0)
                 if callable(pattern)
@@ -305,12 +344,18 @@ class PointFields:
 
     @property
     def jet(self) -> Array:
-        """(6, cells, points, 3) of the placement."""
+        """Jet (6, cells, points, 3) of the placement."""
         return self._frame.jet
 
-    def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """The fields of a displacement with the jet u (3 or 6, cells, points, 3) over R, at the
-        amplitudes mu.
+    def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
+        """Return the fields of a displacement.
+
+        Parameters
+        ----------
+        u
+            (3 or 6, cells, points, 3) jet of the displacement over R.
+        mu
+            Amplitudes of the state.
 
         Returns
         -------
@@ -318,28 +363,30 @@ class PointFields:
             (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux
             density at the deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         J
-            (..., 3) the polarisation mu_0 M that the field induces in what is soft, in the same
-            unit.
+            (..., 3) the polarisation mu_0 M that the field induces in soft magnetic material, in
+            the same unit.
         tau
             (..., 3) torque, for a uniform field.
         gap_over_h
             (...) the least gap to a body.
         """
         frame, fields = self._frame, dict[str, Array]()
-        if self._carried:
-            moves = self._carried.law == "deformation"
+        if self._magnetisation:
+            is_convected = self._magnetisation.law == "deformation"
             fields["Br"] = (
                 frame.convected(self.Br, u, thins=self._thins)
-                if moves
+                if is_convected
                 else frame.rotated(self.Br, u)
             )
         if self._field:
             fields["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
-            m = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
-            n = m / np.linalg.norm(m, axis=-1, keepdims=True)
+            deformed_area_vector = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
+            deformed_normal = deformed_area_vector / np.linalg.norm(
+                deformed_area_vector, axis=-1, keepdims=True
+            )
             fields["J"] = self._field.soft.polarisation(
-                inside(frame.jet[0]), self.n0, n, fields["Ba"]
+                inside(frame.jet[0]), self.n0, deformed_normal, fields["Ba"]
             )
         if self._torque:
             fields["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
@@ -348,7 +395,7 @@ class PointFields:
         return fields
 
     def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
-        """The deformed thickness over the undeformed one; see `parts.gap`."""
+        """Return the deformed thickness over the undeformed one; see `parts.gap`."""
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
         if self._natural is not None:
@@ -359,17 +406,19 @@ class PointFields:
         return np.asarray(1 + self._thins * (stretch - 1))
 
     def _gap(self, u: Array, mu: Mapping[str, float]) -> Array:
+        """Return the least gap (cells, points) to a body over h; u as of `values_of`."""
         h, r = self._h, self._frame.jet[0] + u[0]
-        factor = 1.0 if self._thickness is None else self._thickness
-        factor = factor * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
-        factor = np.broadcast_to(factor, r.shape[:-1]).ravel()
+        thickness = 1.0 if self._thickness is None else self._thickness
+        thickness = thickness * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
+        thickness = np.broadcast_to(thickness, r.shape[:-1]).ravel()
         gaps = [
-            c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0]
-            for c in self._contacts
+            contact.gap(r.reshape(-1, 3), h * mu.get(contact.amplitude, 0.0), h / 2 * thickness)[0]
+            for contact in self._contacts
         ]
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:
+        """Return bases, normals and curvature of the placement."""
         r0 = self._frame.jet
         b11, b12, b22 = np.einsum("d...i,...i->d...", r0[3:], self.n0)
         b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)

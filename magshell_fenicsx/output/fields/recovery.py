@@ -1,5 +1,8 @@
-"""Strains, moments and stresses recovered at nodes, and the parts of a surface within which they
-are smooth.
+"""Recovery of strains, moments and stresses at nodes, in the smooth parts of a surface.
+
+A polynomial is fitted to samples in the patch of cells around each vertex, as in the
+superconvergent patch recovery of Zienkiewicz and Zhu. The parts of a surface within which
+prescribed fields and the normal are continuous are recovered apart.
 """
 
 from collections.abc import Mapping
@@ -12,12 +15,13 @@ from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.output.fields.point_fields import in_frame, in_space, principal_fields
 
 Array = NDArray[np.float64]
-ROUNDING = {"E": 1e-13, "M": 1e-8}  # smaller strains and moments are zero, up to rounding
+ROUNDING = {"E": 1e-13, "M": 1e-8}  # strains, moments over D/R: smaller ones are zero
 
 
 def relative_jump(values: Array, continuous: Array, weight: Array, zero: float = 0.0) -> float:
-    """The weighted rms of the difference between the cells' values and continuous ones, over the
-    rms of the values.
+    """Return the jump of values between cells: weighted rms of the difference to continuous values.
+
+    The difference is over the rms of the values.
 
     Parameters
     ----------
@@ -26,11 +30,12 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
     weight
         (cells, points)
     zero
-        Of values no larger than this there is none.
+        Size of values up to which the jump is zero.
 
     Examples
     --------
-    >>> round(relative_jump(np.array([[3.0, 5.0], [3.0, 5.0]]), np.full((2, 2), 4.0), np.ones((2, 2))), 3)
+    >>> values = np.array([[3.0, 5.0], [3.0, 5.0]])
+    >>> round(relative_jump(values, np.full((2, 2), 4.0), np.ones((2, 2))), 3)
     0.243
     """
 
@@ -43,19 +48,19 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
 
 
 Numbers = NDArray[np.int64]
-SECOND = (
-    0.03  # weight of the second ring of cells around a vertex at an edge, where the first has few
-)
-ENOUGH = 1.2  # samples over coefficients of a polynomial, at least
-RIDGE = 1e-10  # keeps fits regular whose samples lie on few lines
+# weight of the second ring of cells around a vertex at an edge, where the first ring has few
+SECOND_RING_WEIGHT = 0.03
+MIN_SAMPLES_PER_COEFFICIENT = 1.2  # of a polynomial
+RIDGE = 1e-10  # regularises fits whose samples lie on few lines
 
 
 class Recovery:
-    """Fits a polynomial around each vertex, and blends those of a cell's vertices with barycentric
-    weights.
+    """Piecewise polynomial through samples: one polynomial around each vertex, blended in the
+    cells.
 
-    So the result is continuous where cells share vertices, and polynomials are reproduced. Around a
-    vertex at an edge the second ring of cells has a small weight.
+    The blend weights are the barycentric coordinates of a cell. So the result is continuous where
+    cells share vertices, and polynomials are reproduced. Around a vertex at an edge the second ring
+    of cells has a small weight.
 
     Parameters
     ----------
@@ -68,7 +73,7 @@ class Recovery:
     frames
         (v, d, k) axes of the polynomial's d coordinates around each vertex.
     degree
-        Of the polynomials.
+        Degree of the polynomials.
     """
 
     def __init__(
@@ -81,113 +86,143 @@ class Recovery:
         degree: int,
     ) -> None:
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
-        self._count = len(_powers(cells.shape[1] - 1, degree))
+        self._coefficient_count = len(_powers(cells.shape[1] - 1, degree))
         self._size = np.ones(len(vertices))
-        near, share = _patches(cells, len(vertices))
-        many = np.diff(near.indptr)
-        of_row = np.repeat(
-            many * weight.shape[1], self._count
-        )  # a row for each coefficient of each vertex
-        starts = np.concatenate([[0], np.cumsum(of_row)])
+        samples_per_cell = weight.shape[1]
+        patches, cell_weights = _patches(cells, len(vertices))
+        cells_per_vertex = np.diff(patches.indptr)
+        # a row for each coefficient of each vertex
+        row_lengths = np.repeat(cells_per_vertex * samples_per_cell, self._coefficient_count)
+        starts = np.concatenate([[0], np.cumsum(row_lengths)])
         columns, values = np.zeros(starts[-1], np.int32), np.zeros(starts[-1])
-        for number in np.unique(many):
-            at = np.flatnonzero(many == number)
-            each = near.indptr[at][:, None] + np.arange(number)
-            fit = self._fit(
-                at, samples[near.indices[each]], weight[near.indices[each]] * share[each][..., None]
+        for number in np.unique(cells_per_vertex):
+            vertices_alike = np.flatnonzero(cells_per_vertex == number)
+            in_patch = patches.indptr[vertices_alike][:, None] + np.arange(number)
+            cells_around = patches.indices[in_patch]
+            sample_weights = weight[cells_around] * cell_weights[in_patch][..., None]
+            fit_matrices = self._fit_matrices(vertices_alike, samples[cells_around], sample_weights)
+            sample_numbers = cells_around[..., None] * samples_per_cell
+            sample_numbers = sample_numbers + np.arange(samples_per_cell)
+            count = self._coefficient_count
+            entries = starts[vertices_alike * count][:, None]
+            entries = entries + np.arange(count * sample_numbers[0].size)
+            columns[entries] = np.tile(sample_numbers.reshape(len(vertices_alike), -1), count)
+            values[entries[:, : fit_matrices[0].size]] = fit_matrices.reshape(
+                len(vertices_alike), -1
             )
-            sample = near.indices[each][..., None] * weight.shape[1] + np.arange(weight.shape[1])
-            places = starts[at * self._count][:, None] + np.arange(self._count * sample[0].size)
-            columns[places] = np.tile(sample.reshape(len(at), -1), self._count)
-            values[places[:, : fit[0].size]] = fit.reshape(len(at), -1)
-        shape = len(vertices) * self._count, weight.size
+        shape = len(vertices) * self._coefficient_count, weight.size
         self._coefficients = scipy.sparse.csr_matrix((values, columns, starts), shape)
 
     def coefficients(self, values: Array) -> Array:
-        """Those of all polynomials, of values (m, q, ...) at the samples."""
+        """Return the coefficients of all polynomials from values (m, q, ...) at the samples."""
         return np.asarray(self._coefficients @ values.reshape(self._coefficients.shape[1], -1))
 
-    def at(self, cell: Numbers, places: Array, barycentric: Array) -> "scipy.sparse.csr_matrix":
-        """From coefficients to values at places (n, k) in cells (n,) with barycentric coordinates
-        (n, d + 1).
+    def evaluation_matrix(
+        self, cell: Numbers, places: Array, barycentric: Array
+    ) -> "scipy.sparse.csr_matrix":
+        """Return the sparse matrix from coefficients to values at places.
+
+        Parameters
+        ----------
+        cell
+            (n,) numbers of the cells.
+        places
+            (n, k) places in them.
+        barycentric
+            (n, d + 1) their barycentric coordinates.
         """
         vertex = self._cells[cell]
-        y = np.einsum(
+        local = np.einsum(
             "nvdk,nvk->nvd", self._frames[vertex], places[:, None] - self._vertices[vertex]
         )
         values = (
-            _monomials(y / self._size[vertex][..., None], self._degree) * barycentric[..., None]
+            _monomials(local / self._size[vertex][..., None], self._degree) * barycentric[..., None]
         )
-        columns = vertex[..., None] * self._count + np.arange(self._count)
+        columns = vertex[..., None] * self._coefficient_count + np.arange(self._coefficient_count)
         starts = np.arange(len(cell) + 1) * columns[0].size
         return scipy.sparse.csr_matrix(
             (values.ravel(), columns.ravel(), starts),
-            (len(cell), len(self._vertices) * self._count),
+            (len(cell), len(self._vertices) * self._coefficient_count),
         )
 
-    def _fit(self, at: Numbers, samples: Array, weight: Array) -> Array:
-        """From the samples (n, cells, q, k) around vertices to coefficients: (n, coefficients,
-        samples).
+    def _fit_matrices(self, vertex: Numbers, samples: Array, weight: Array) -> Array:
+        """Return the least-squares fits around vertices, and set the sizes of their patches.
+
+        Parameters
+        ----------
+        vertex
+            (n,) numbers of vertices with equally many cells.
+        samples, weight
+            (n, cells, q, k) places and (n, cells, q) weights of the samples around them.
+
+        Returns
+        -------
+        Matrices (n, coefficients, samples) from values to coefficients.
         """
-        n = len(at)
-        relative = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[at][:, None]
-        y = relative @ np.swapaxes(self._frames[at], 1, 2)
-        self._size[at] = np.abs(y).max(axis=(1, 2))
+        n = len(vertex)
+        relative = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[vertex][:, None]
+        local = relative @ np.swapaxes(self._frames[vertex], 1, 2)
+        self._size[vertex] = np.abs(local).max(axis=(1, 2))
         degree = self._degree
-        while degree and ENOUGH * len(_powers(y.shape[-1], degree)) > y.shape[1]:
+        while (
+            degree
+            and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(local.shape[-1], degree)) > local.shape[1]
+        ):
             degree -= 1
-        P = _monomials(y / self._size[at][:, None, None], degree)
+        monomials = _monomials(local / self._size[vertex][:, None, None], degree)
         weight = weight.reshape(n, -1)
         root = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
-        ridge = np.broadcast_to(RIDGE * np.eye(P.shape[-1]), (n, P.shape[-1], P.shape[-1]))
-        Q, triangle = np.linalg.qr(
-            np.concatenate([root * P, ridge], axis=1)
-        )  # of a small condition
-        return np.asarray(np.linalg.solve(triangle, np.swapaxes(Q[:, : P.shape[1]] * root, 1, 2)))
+        ridge = np.broadcast_to(
+            RIDGE * np.eye(monomials.shape[-1]), (n, monomials.shape[-1], monomials.shape[-1])
+        )
+        # a factorisation by reflections keeps the condition small
+        Q, triangle = np.linalg.qr(np.concatenate([root * monomials, ridge], axis=1))
+        return np.asarray(
+            np.linalg.solve(triangle, np.swapaxes(Q[:, : monomials.shape[1]] * root, 1, 2))
+        )
 
 
 def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Array]:
-    """The cells around each vertex as a sparse pattern, and the weight of each in its order."""
+    """Return the cells around each vertex as a sparse pattern, and their weights in its order."""
     m, corners = cells.shape
-    sharing = scipy.sparse.csr_matrix(
+    first_ring = scipy.sparse.csr_matrix(
         (np.ones(cells.size), (cells.ravel(), np.repeat(np.arange(m), corners))), (count, m)
     )
     sides = np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)])
-    sides, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
-    border = np.zeros(count)
-    border[sides[times == 1]] = 1.0
-    farther = scipy.sparse.diags(border) @ (sharing @ (sharing.T @ sharing))
-    farther.data[:] = SECOND
-    both = (sharing + farther).tocsr()
-    return both, np.where(both.data > SECOND, 1.0, SECOND)
+    sides, cells_per_side = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+    is_at_edge = np.zeros(count)
+    is_at_edge[sides[cells_per_side == 1]] = 1.0
+    second_ring = scipy.sparse.diags(is_at_edge) @ (first_ring @ (first_ring.T @ first_ring))
+    second_ring.data[:] = SECOND_RING_WEIGHT
+    patches = (first_ring + second_ring).tocsr()
+    return patches, np.where(patches.data > SECOND_RING_WEIGHT, 1.0, SECOND_RING_WEIGHT)
 
 
 def _powers(dimensions: int, degree: int) -> list[tuple[int, ...]]:
-    """Exponents of all monomials, those of low degree first."""
+    """Return the exponents of all monomials, ascending in degree."""
     if dimensions == 1:
         return [(n,) for n in range(degree + 1)]
     return [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
 
 
 def _monomials(y: Array, degree: int) -> Array:
-    """Values (..., coefficients) at y (..., d)."""
-    along = [np.stack([x**n for n in range(degree + 1)], axis=-1) for x in np.moveaxis(y, -1, 0)]
-    return np.stack(
-        [
-            np.prod([a[..., n] for a, n in zip(along, powers, strict=True)], axis=0)
-            for powers in _powers(len(along), degree)
-        ],
-        axis=-1,
-    )
+    """Return the values (..., coefficients) of all monomials at y (..., d)."""
+    exponents = range(degree + 1)
+    powers = [np.stack([x**n for n in exponents], axis=-1) for x in np.moveaxis(y, -1, 0)]
+    monomials = []
+    for numbers in _powers(len(powers), degree):
+        factors = [power[..., n] for power, n in zip(powers, numbers, strict=True)]
+        monomials.append(np.prod(factors, axis=0))
+    return np.stack(monomials, axis=-1)
 
 
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # the components of a symmetric tensor
-WHOLE = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-TWICE = np.sqrt([1.0, 2, 2, 1, 2, 1])  # so that the sum of squares is that of all nine
+SYMMETRIC_COMPONENTS = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # indices of a symmetric tensor
+COMPONENT_NUMBERS = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]  # (3, 3) numbers of its six components
+COMPONENT_WEIGHTS = np.sqrt([1.0, 2, 2, 1, 2, 1])  # the sum of six squares is that of all nine
 
 
 class RecoveredShell:
-    """Takes tensors from samples to nodes.
+    """Recover tensors at nodes from samples in the cells of a shell.
 
     Parameters
     ----------
@@ -202,7 +237,7 @@ class RecoveredShell:
     table
         (q, s) values of the nodes' shape functions at the samples.
     degree
-        Of the displacement, and of the polynomials that are fitted.
+        Degree of the displacement, and of the polynomials that are fitted.
     """
 
     def __init__(
@@ -220,28 +255,38 @@ class RecoveredShell:
         corners = corners.reshape(-1, 3)
         place, normal = np.zeros((2, len(vertices), 3))
         place[corners] = nodes[:, :3]
-        np.add.at(normal, corners, normals[:, :3])
-        self._recovery = Recovery(corners, samples, weight, place, frames(normal), degree)
-        _, first = np.unique(numbers, return_index=True)
-        cell, node = np.divmod(first, numbers.shape[1])
+        np.add.evaluation_matrix(normal, corners, normals[:, :3])
+        self._recovery = Recovery(corners, samples, weight, place, frames_across(normal), degree)
+        _, first_entry = np.unique(numbers, return_index=True)
+        cell, node = np.divmod(first_entry, numbers.shape[1])
         barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node]
-        self._to_nodes = self._recovery.at(cell, nodes[cell, node], barycentric)
+        self._to_nodes = self._recovery.evaluation_matrix(cell, nodes[cell, node], barycentric)
         self._numbers, self._weight, self._table = numbers, weight, table
 
     def fields(
         self, tensors: Mapping[str, Array], n0: Array
     ) -> tuple[dict[str, Array], dict[str, float]]:
-        """E, M, ... at the nodes with normals n0 (n, 3), their principal values, by how much
-        samples differ.
+        """Return recovered tensors with their principal values, and the jumps of the samples.
 
         Parameters
         ----------
         tensors
-            Name -> (m, q, 6) at the samples, see `six`.
+            Name -> (m, q, 6) weighted components at the samples, see `components_in_space`.
+        n0
+            (n, 3) normals at the nodes.
+
+        Returns
+        -------
+        fields
+            Name -> (n, 3, 3) E, M, ..., and (n,) E_1, E_2, ....
+        jumps
+            Name -> `relative_jump` of the samples and the recovered field.
         """
-        fit = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
+        coefficients = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
         at_nodes = dict(
-            zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True)
+            zip(
+                tensors, np.split(self._to_nodes @ coefficients, len(tensors), axis=-1), strict=True
+            )
         )
         jumps = {
             name: relative_jump(
@@ -249,35 +294,43 @@ class RecoveredShell:
             )
             for name, zero in ROUNDING.items()
         }
-        t = frames(n0)
+        t = frames_across(n0)
         components = {
-            name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in at_nodes.items()
+            name: in_frame((values / COMPONENT_WEIGHTS)[..., COMPONENT_NUMBERS], t)
+            for name, values in at_nodes.items()
         }
-        smooth = {name: in_space(S, t) for name, S in components.items()}
-        return smooth | principal_fields(components), jumps
+        recovered = {name: in_space(S, t) for name, S in components.items()}
+        return recovered | principal_fields(components), jumps
 
 
-def six(frame: TangentFrame) -> Array:
-    """(..., 6, 3) from S_11, S_12, S_22 in a frame to the components of a tensor in space, times
-    `TWICE`.
+def components_in_space(frame: TangentFrame) -> Array:
+    """Return the map from S_11, S_12, S_22 in a frame to six weighted components in space.
+
+    Returns
+    -------
+    (..., 6, 3); the components are `SYMMETRIC_COMPONENTS` times `COMPONENT_WEIGHTS`.
     """
-    return np.asarray(frame.in_space[..., *UPPER, :] * TWICE[:, None])
+    return np.asarray(frame.in_space[..., *SYMMETRIC_COMPONENTS, :] * COMPONENT_WEIGHTS[:, None])
 
 
-def frames(normals: Array) -> Array:
-    """Two unit vectors (n, 2, 3) across each of some vectors (n, 3)."""
+def frames_across(normals: Array) -> Array:
+    """Return two orthogonal unit vectors (n, 2, 3) across each of the vectors (n, 3)."""
     n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     t1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
     return np.stack([t1, np.cross(n, t1)], axis=1)
 
 
-JUMP = 1e-3  # of a given field over its largest value
-KINK = 0.5  # jump of the normal, some 30 degrees: less is a facet
+FIELD_JUMP = 1e-3  # jump of a prescribed field over its largest value, that splits the surface
+KINK = 0.5  # jump of the unit normal that splits the surface, some 30 degrees: less is a facet
 
 
-def smooth_parts(corners: Numbers, sides: Numbers, given: list[Array], normals: Array) -> Numbers:
-    """The number of the part to which each cell belongs.
+def smooth_parts(
+    corners: Numbers, sides: Numbers, prescribed_fields: list[Array], normals: Array
+) -> Numbers:
+    """Return the number of the smooth part to which each cell belongs.
+
+    Parts are connected over sides where neither a prescribed field nor the normal jumps.
 
     Parameters
     ----------
@@ -285,44 +338,52 @@ def smooth_parts(corners: Numbers, sides: Numbers, given: list[Array], normals: 
         (m, s) numbers of the nodes of the cells.
     sides
         (e, j) which of these nodes are on each side.
-    given
-        (m, s, ...) fields at the nodes.
+    prescribed_fields
+        Fields (m, s, ...) at the nodes.
     normals
         (m, s, 3)
     """
     count = len(corners)
-    on = corners[:, sides].reshape(-1, sides.shape[1])  # nodes of all sides, cell after cell
-    order = np.argsort(on, axis=1)
-    key = np.take_along_axis(on, order, axis=1)
-    _, first, which, times = np.unique(
+    nodes_of_sides = corners[:, sides].reshape(-1, sides.shape[1])  # cell after cell
+    order = np.argsort(nodes_of_sides, axis=1)
+    key = np.take_along_axis(nodes_of_sides, order, axis=1)
+    _, first_with_key, key_numbers, sides_with_key = np.unique(
         key, axis=0, return_index=True, return_inverse=True, return_counts=True
     )
-    which = which.ravel()
-    twins = np.flatnonzero((times[which] == 2) & (first[which] != np.arange(len(on))))
-    pair = np.column_stack([first[which[twins]], twins])
+    key_numbers = key_numbers.ravel()
+    second_sides = np.flatnonzero(
+        (sides_with_key[key_numbers] == 2)
+        & (first_with_key[key_numbers] != np.arange(len(nodes_of_sides)))
+    )
+    shared_sides = np.column_stack([first_with_key[key_numbers[second_sides]], second_sides])
 
     def jumps(field: Array) -> Array:
-        """The largest jump of a field at the nodes of each shared side."""
-        values = field.reshape(count, corners.shape[1], -1)[:, sides].reshape(*on.shape, -1)
-        one, other = np.take_along_axis(values, order[..., None], axis=1)[pair.T]
-        return np.asarray(np.abs(one - other).max(axis=(1, 2)))
+        """Return the largest jump of a field at the nodes of each shared side."""
+        values = field.reshape(count, corners.shape[1], -1)[:, sides].reshape(
+            *nodes_of_sides.shape, -1
+        )
+        values_here, values_there = np.take_along_axis(values, order[..., None], axis=1)[
+            shared_sides.T
+        ]
+        return np.asarray(np.abs(values_here - values_there).max(axis=(1, 2)))
 
     kink = jumps(normals)
-    apart = kink > KINK
-    for field in given:
+    is_split = kink > KINK
+    for field in prescribed_fields:
         largest = np.abs(field).max() or 1.0
-        apart |= jumps(field) > largest * (
-            JUMP + 2 * kink
-        )  # a field along the normal turns with facets
-    a, b = (pair[~apart] // len(sides)).T
-    together = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+        # a field along the normal turns with facets
+        is_split |= jumps(field) > largest * (FIELD_JUMP + 2 * kink)
+    first_cells, second_cells = (shared_sides[~is_split] // len(sides)).T
+    adjacency = scipy.sparse.coo_matrix(
+        (np.ones(len(first_cells)), (first_cells, second_cells)), (count, count)
+    )
     return np.asarray(
-        scipy.sparse.csgraph.connected_components(together, directed=False)[1], np.int64
+        scipy.sparse.csgraph.connected_components(adjacency, directed=False)[1], np.int64
     )
 
 
 def split(numbers: Numbers, parts: Numbers) -> Numbers:
-    """The nodes (m, s) of cells, renumbered so that each part has its own.
+    """Return the nodes (m, s) of cells, renumbered so that parts share none.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The waves of a mode around e3, counted on a ring: where a plane of one height cuts the surface.
+"""Wave number of a mode around e3, counted on a ring: the surface at one height.
 
 The mode between nodes is that of its elements, so the count does not depend on where nodes lie.
 """
@@ -10,30 +10,28 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.tessellation import Numbers, Tessellation, tessellated
+from magshell_fenicsx.output.fields.tessellation import Numbers, Tessellation, tessellate
 
 Array = NDArray[np.float64]
-FLAT = 0.02  # height over R below which a surface has no rings
-ASIDE = (
-    1e-6,
-    0.01,
-)  # over R: how far below the top, or above the bottom, a ring is cut; the latter at uneven rims
-SAME_PLACE = 1e-9  # over R: distance of ends of pieces of the ring that are one
-GAP = np.pi / 4  # largest gap of a ring that is closed
-MOST_WAVES = 80
-REST = 0.1  # largest part of the mode's square on the ring that waves of one number leave
+MIN_HEIGHT = 0.02  # over R: flatter surfaces have no rings
+# over R: how far below the top, or above the bottom, a ring is cut; the second at uneven rims
+OFFSETS_OF_RING = (1e-6, 0.01)
+ENDPOINT_TOLERANCE = 1e-9  # over R: distance of ends of lines that are one point of the ring
+MAX_GAP = np.pi / 4  # rad, between points of a closed ring
+MAX_WAVES = 80
+MAX_REMAINDER = 0.1  # of the mode's square on the ring, that waves of one number leave
 NODES_PER_WAVE = 4  # at least, of waves that a mesh resolves
-MOST_TRIANGLES = 1_000_000
+MAX_TRIANGLES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Waves:
-    """The waves of a mode around e3, at least two.
+class WaveCount:
+    """Number of waves of a mode around e3, at least two.
 
     Attributes
     ----------
     number
-        Of the waves.
+        Number of waves.
     largest
         The largest number of waves that the mesh resolves on the ring.
     """
@@ -43,18 +41,18 @@ class Waves:
 
     @property
     def resolved(self) -> bool:
-        """Whether the mesh resolves them."""
+        """Whether the mesh resolves the waves."""
         return self.number <= self.largest
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Points of a closed ring around e3, by ascending azimuth.
+    """Points of a closed ring around e3, ascending in azimuth.
 
     Attributes
     ----------
     theta, w
-        (n,) azimuth, and the mode's normal component.
+        (n,) azimuth in rad, and the mode's normal component.
     spacing
         Largest distance of nodes around the ring, rad.
     """
@@ -63,32 +61,31 @@ class Ring:
     w: Array
     spacing: float
 
-    def waves(self) -> Waves | None:
-        """Count the waves; None if no single number of them, at least two, makes up the mode."""
-        ahead = np.diff(self.theta, append=self.theta[0] + 2 * np.pi)
-        share = np.sqrt(
-            (ahead + np.roll(ahead, 1)) / 2
-        )  # of the ring: small elements have many points
-        values = share * self.w
-        left = []
-        for m in range(MOST_WAVES + 1):
-            basis = share[:, None] * np.column_stack(
-                [np.cos(m * self.theta), np.sin(m * self.theta)]
-            )
-            left.append(float(np.sum((values - basis @ np.linalg.lstsq(basis, values)[0]) ** 2)))
-        best = int(np.argmin(left))
-        if best < 2 or left[best] >= REST * float(values @ values):
+    def waves(self) -> WaveCount | None:
+        """Return the wave count; None if no single number of at least two waves fits the mode."""
+        angle_to_next = np.diff(self.theta, append=self.theta[0] + 2 * np.pi)
+        # weights by the length of arc: small elements have many points
+        arc_weights = np.sqrt((angle_to_next + np.roll(angle_to_next, 1)) / 2)
+        values = arc_weights * self.w
+        remainders = []
+        for m in range(MAX_WAVES + 1):
+            wave = np.column_stack([np.cos(m * self.theta), np.sin(m * self.theta)])
+            basis = arc_weights[:, None] * wave
+            coefficients = np.linalg.lstsq(basis, values)[0]
+            remainders.append(float(np.sum((values - basis @ coefficients) ** 2)))
+        best = int(np.argmin(remainders))
+        if best < 2 or remainders[best] >= MAX_REMAINDER * float(values @ values):
             return None
-        return Waves(best, int(2 * np.pi / (NODES_PER_WAVE * self.spacing)))
+        return WaveCount(best, int(2 * np.pi / (NODES_PER_WAVE * self.spacing)))
 
 
-def waves_around(surface: Surface) -> Waves | None:
-    """Count the waves of a mode around e3, on the ring where it is largest.
+def waves_around(surface: Surface) -> WaveCount | None:
+    """Return the wave count of a mode around e3, on the ring where the mode is largest.
 
     Parameters
     ----------
     surface
-        With the field "mode_w" of `modes.mode_surface`.
+        A surface with the field "mode_w" of `mode_fields.mode_surface`.
 
     Returns
     -------
@@ -96,59 +93,65 @@ def waves_around(surface: Surface) -> Waves | None:
     is not closed around e3.
     """
     height = surface.r0[:, 2]
-    if np.ptp(height) < FLAT:
+    if np.ptp(height) < MIN_HEIGHT:
         return None
     crest = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
     inwards = np.sign((height.max() + height.min()) / 2 - crest[2]) or 1.0
-    pieces = tessellated(surface, MOST_TRIANGLES)
-    for aside in ASIDE:
-        if ring := _ring(surface, pieces, crest, float(crest[2] + aside * inwards)):
+    tessellation = tessellate(surface, MAX_TRIANGLES)
+    for offset in OFFSETS_OF_RING:
+        if ring := _ring(surface, tessellation, crest, float(crest[2] + offset * inwards)):
             return ring.waves()
     return None
 
 
-def _ring(surface: Surface, pieces: Tessellation, crest: Array, height: float) -> Ring | None:
-    """The ring at a height that passes a place; None if it is not closed around e3."""
-    r, w = pieces.at(surface.r0), pieces.at(surface.fields["mode_w"])
-    is_above = r[pieces.triangles, 2] > height
-    cut = np.flatnonzero(is_above.any(axis=1) & ~is_above.all(axis=1))
-    if not len(cut):
+def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: float) -> Ring | None:
+    """Return the ring at a height that passes a place (3,); None if it is not closed around e3."""
+    r, mode_w = tessellation.at_points(surface.r0), tessellation.at_points(surface.fields["mode_w"])
+    is_above = r[tessellation.triangles, 2] > height
+    cut_triangles = np.flatnonzero(is_above.any(axis=1) & ~is_above.all(axis=1))
+    if not len(cut_triangles):
         return None
-    ends, w_at_ends = _cuts(pieces.triangles[cut], is_above[cut], np.column_stack([r, w]), height)
+    triangles = tessellation.triangles[cut_triangles]
+    values = np.column_stack([r, mode_w])
+    ends, w_at_ends = _cuts(triangles, is_above[cut_triangles], values, height)
     on_ring = _connected(ends, crest)
     theta = np.arctan2(ends[on_ring, :, 1], ends[on_ring, :, 0])
     order = np.argsort(theta, axis=None)
     ascending = theta.ravel()[order]
-    if np.diff(ascending, append=ascending[0] + 2 * np.pi).max() > GAP:
+    if np.diff(ascending, append=ascending[0] + 2 * np.pi).max() > MAX_GAP:
         return None
-    per_piece = len(pieces.triangles) // len(pieces.nodes)
-    of_nodes = surface.r0[pieces.nodes[cut[on_ring] // per_piece]]
-    return Ring(
-        ascending, w_at_ends[on_ring].ravel()[order], _extent(of_nodes, theta[:, 0]) / pieces.degree
-    )
+    triangles_per_cell = len(tessellation.triangles) // len(tessellation.nodes)
+    cells_on_ring = cut_triangles[on_ring] // triangles_per_cell
+    nodes_of_cells = surface.r0[tessellation.nodes[cells_on_ring]]
+    spacing = _extent(nodes_of_cells, theta[:, 0]) / tessellation.degree
+    return Ring(ascending, w_at_ends[on_ring].ravel()[order], spacing)
 
 
 def _cuts(
     triangles: NDArray[np.int32], is_above: NDArray[np.bool_], values: Array, height: float
 ) -> tuple[Array, Array]:
-    """Both ends (t, 2, 2) of the line on which each triangle is cut, x and y, and w (t, 2) there.
+    """Return the lines in which a plane cuts triangles: x and y (t, 2, 2) of both ends, and w (t,
+    2).
 
     `values` (n, 4) are x, y, z, w at points.
     """
-    alone = np.argmax(
-        is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1
-    )  # the corner on its side of the plane
-    corners = values[np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)]
+    # the corner that is alone on its side of the plane
+    single_corner = np.argmax(is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1)
+    order = (single_corner[:, None] + np.arange(3)) % 3
+    corners = values[np.take_along_axis(triangles, order, axis=1)]
     tip, base = corners[:, :1], corners[:, 1:]
-    part = (height - tip[..., 2]) / (base[..., 2] - tip[..., 2])
-    ends = tip + part[..., None] * (base - tip)
+    fraction = (height - tip[..., 2]) / (base[..., 2] - tip[..., 2])
+    ends = tip + fraction[..., None] * (base - tip)
     return ends[..., :2], ends[..., 3]
 
 
 def _connected(ends: Array, place: Array) -> Numbers:
-    """Which lines, with ends (t, 2, 2), are connected with that which is nearest to a place."""
+    """Return the numbers of the lines that are connected with the line nearest to a place.
+
+    `ends` (t, 2, 2) are the ends of the lines.
+    """
     points = ends.reshape(-1, 2)
-    pairs = scipy.spatial.cKDTree(points).query_pairs(SAME_PLACE, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(points).query_pairs(ENDPOINT_TOLERANCE, output_type="ndarray")
     links = np.concatenate([pairs, np.arange(len(points)).reshape(-1, 2)])
     graph = scipy.sparse.coo_array(
         (np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points))
@@ -159,6 +162,6 @@ def _connected(ends: Array, place: Array) -> Numbers:
 
 
 def _extent(nodes: Array, theta: Array) -> float:
-    """The largest extent around e3 of pieces with nodes (t, k, 3), each near an azimuth (t,)."""
+    """Return the largest angle about e3 that cells span; nodes (t, k, 3), each near theta (t,)."""
     azimuth = np.arctan2(nodes[..., 1], nodes[..., 0]) - theta[:, None]
     return float(np.ptp((azimuth + np.pi) % (2 * np.pi) - np.pi, axis=1).max())

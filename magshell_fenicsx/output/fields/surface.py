@@ -1,4 +1,8 @@
-"""The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
+"""The deformed mid-surface gathered on rank 0, for pictures and for ParaView.
+
+A `Surface` has the nodes of the whole shell or body and fields at them. `SurfaceGatherer` makes it
+from a state of a shell; half shells and sectors are completed by symmetry.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +22,12 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.law import Law, OfShells
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
-from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
+from magshell_fenicsx.output.fields.recovery import (
+    RecoveredShell,
+    components_in_space,
+    smooth_parts,
+    split,
+)
 from magshell_fenicsx.shape.drawn_bodies import Solid
 
 if TYPE_CHECKING:  # one of them is built
@@ -27,38 +36,28 @@ if TYPE_CHECKING:  # one of them is built
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
-SAMPLED, OF_MANY = (
-    6,
-    4,
-)  # degree of the rule whose points are samples of strains and moments, at least; of many
-MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
+# least degree of the quadrature rule whose points are samples of strains and moments
+SAMPLE_DEGREE, SAMPLE_DEGREE_OF_LARGE_MESHES = 6, 4
+LARGE_MESH = 20_000  # cells, whose recovery would take a quarter of a gigabyte with more samples
 GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
 # of bodies and of parts of the shell, over E h/R; nan where cells are too wide
 PRESSURE = "contact_pressure"
-RESOLVED, RESOLVED_PRESSURE, GAP_OPEN = (
-    "evenly_pressed",
-    "pressure_of_even",
-    "open",
-)  # see `add_contact`
+# see `add_contact`
+RESOLVED, RESOLVED_PRESSURE, GAP_OPEN = "evenly_pressed", "pressure_of_even", "open"
 LARGEST_CLOSED_GAP = 1e-2  # over h
 SHELL = "shell"  # the number of the shell, where there are several
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
-BOTH_WAYS = {
-    "Br",
-    "Ba",
-    "J",
-}  # a half shell's fields may be symmetric or antisymmetric to its plane
-ON_PLANE = 1e-9  # over R
-NEAREST, FLAT = (
-    12,
-    1e-2,
-)  # nodes of a linear fit, and directions without any extent that it leaves out
+# fields of a half shell that may be symmetric or antisymmetric to its plane
+FIELDS_OF_EITHER_PARITY = {"Br", "Ba", "J"}
+SAME_PLACE_TOLERANCE = 1e-9  # over R: distance of nodes from each other, or from a plane
+NODES_OF_FIT = 12  # nearest nodes of a linear fit
+EXTENT_TOLERANCE = 1e-2  # relative extent of the nodes of a fit; smaller ones are left out
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Nodes of the whole mid-surface or of a whole solid; lengths are over R.
+    """Nodes of the whole mid-surface or of a whole solid, with fields; lengths are over R.
 
     Attributes
     ----------
@@ -69,18 +68,17 @@ class Surface:
         order.
     fields
         Name -> (n,), (n, 3) or (n, 3, 3): E, M as tensors in space, tangent to the undeformed
-        surface, and E_total where there is a natural shape (see `stresses.Stresses`); E_1, E_2,
+        surface, and E_total where there is a natural shape (see `point_fields.Stresses`); E_1, E_2,
         M_1, M_2, their principal values, the larger first; those of `point_fields.PointFields`;
         w0_over_h where there are imperfections, of a solid that alone.
     outlines
         Places (n, 3) along lines: the sources of the applied field, and bodies.
     jump
-        By how much the cells' own bending moments differ from the smooth field M, over their size
-        (see `jump`). None of a solid.
+        Jump of the bending moments M between cells, see `recovery.relative_jump`. None of a solid.
     strain_jump
-        The same of the strains E.
+        Jump of the strains E.
     solids
-        The faces of those.
+        The faces of sources and bodies.
     shells
         The names of several shells, in the order of their numbers in the field `shell`; nodes of
         two are double.
@@ -109,8 +107,7 @@ class Surface:
 
 
 class SurfaceGatherer:
-    """Gathers displacements and fields of one shell; constant fields are computed and gathered
-    once.
+    """Gather displacements and fields of one shell; constant fields are computed and gathered once.
 
     Strains and moments are recovered from samples inside the cells, in each smooth part of the
     surface; all else is the mean of the cells that share a node.
@@ -125,194 +122,222 @@ class SurfaceGatherer:
         self._element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
-        self._places = self._element.points
+        self._reference_nodes = self._element.points
         cells = domain.topology.index_map(2)
-        sampled = SAMPLED if cells.size_global < MANY else OF_MANY
-        self._inner, self._rule = basix.make_quadrature(
-            basix.CellType.triangle, max(sampled, degree)
+        sample_degree = (
+            SAMPLE_DEGREE if cells.size_global < LARGE_MESH else SAMPLE_DEGREE_OF_LARGE_MESHES
         )
-        self._owned = cells.size_local
-        V = fem.functionspace(
-            domain, basix.ufl.wrap_element(self._element)
-        )  # numbers each shared node once
-        local = V.dofmap.list[: self._owned]
-        numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(
-            local.shape
+        self._reference_samples, self._sample_weights = basix.make_quadrature(
+            basix.CellType.triangle, max(sample_degree, degree)
         )
+        self._owned_cells = cells.size_local
+        # this space numbers each shared node once
+        V = fem.functionspace(domain, basix.ufl.wrap_element(self._element))
+        local_nodes = V.dofmap.list[: self._owned_cells]
+        numbers = V.dofmap.index_map.local_to_global(local_nodes.ravel().astype(np.int32))
+        numbers = numbers.reshape(local_nodes.shape)
         self._recovered: RecoveredShell | None = None
         undeformed = model.system.at_state(State(model.zero(), {}))
-        undeformed.evaluate(lambda: self._take_placement({}, self._gathered(numbers)))
+        undeformed.evaluate(lambda: self._set_placement({}, self._gather_cells(numbers)))
 
-    def _take_placement(
+    def _set_placement(
         self, mu: Mapping[str, float], numbers: NDArray[np.int64] | None = None
     ) -> None:
-        """What depends on the placement, at amplitudes of imperfections that grow; at first given
-        the nodes.
+        """Set what depends on the placement, at the amplitudes of growing imperfections.
+
+        The first call has the node `numbers` (cells, nodes of a cell) of all cells.
         """
         model, loads = self._model, self._model.loads
-        r, inner = self._jet(model.r0, self._places), self._jet(model.r0, self._inner)
-        thick, thick_inside = (self._thickness(at) for at in (self._places, self._inner))
-        others = loads.contacts, loads.remanence, loads.natural
+        r = self._jet(model.r0, self._reference_nodes)
+        r_at_samples = self._jet(model.r0, self._reference_samples)
+        thickness_at_nodes = self._thickness(self._reference_nodes)
+        thickness_at_samples = self._thickness(self._reference_samples)
+        made_of = self._cell_materials()
         self._fields = PointFields(
-            r, model.material, loads.magnetic, thick, *others, self._made_of()
+            r,
+            model.material,
+            loads.magnetic,
+            thickness_at_nodes,
+            loads.contacts,
+            loads.remanence,
+            loads.natural,
+            made_of,
         )
         self._stresses = Stresses(
-            inner, model.material, thick_inside, loads.natural, self._made_of()
+            r_at_samples, model.material, thickness_at_samples, loads.natural, made_of
         )
-        self._six = six(self._stresses.frame)
+        self._to_space = components_in_space(self._stresses.frame)
         if numbers is not None:
-            self._number(numbers, r[0], inner[0])
-        self._mean = self._weighted_mean()
-        deviation = model.midsurface.deviation(self._places, grown(loads.growing, mu))
+            self._split_nodes(numbers, r[0], r_at_samples[0])
+        self._averaging_matrix = self._weighted_mean()
+        deviation = model.midsurface.deviation(
+            self._reference_nodes, deviations_at(loads.growing, mu)
+        )
         if deviation is not None:
-            self._fields.constant[W0] = np.asarray(deviation[: self._owned] / model.material.h)
+            self._fields.constant[W0] = np.asarray(
+                deviation[: self._owned_cells] / model.material.h
+            )
         if self._model.midsurface.shells:
-            self._fields.constant[SHELL] = self._shell_of()
+            self._fields.constant[SHELL] = self._shell_numbers()
         n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=-1)[..., None]
         self._constant = {
             name: self._averaged(values) for name, values in self._fields.constant.items()
         }
 
-    def _number(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
-        """Take the nodes of all cells, split between smooth parts, and the recovery on them."""
+    def _split_nodes(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
+        """Set the nodes of all cells, split between smooth parts, and the recovery on them;
+        collective.
+
+        Parameters
+        ----------
+        numbers
+            (cells, nodes of a cell) node numbers.
+        r, inner
+            Placement (cells, points, 3) at the nodes, and at the samples.
+        """
         loads, fields = self._model.loads, self._fields
-        given = [
-            fields.Br,
-            fields.susceptibility,
-            *(loads.natural.at(inside(r), fields.n0) if loads.natural else ()),
-        ]
-        thickness = self._thickness(self._places)
-        given += [self._shell_of()] if self._model.midsurface.shells else []
-        if isinstance(self._model.material.law, OfShells) and (own := self._made_of()) is not None:
-            given.append(np.repeat(own[:, None, 3], r.shape[1], axis=1))
-        given = [
-            self._gathered(f)
-            for f in (*given, *(() if thickness is None else (thickness,)))
-            if f.size
-        ]
+        prescribed = [fields.Br, fields.susceptibility]
+        if loads.natural:
+            prescribed += loads.natural.at(inside(r), fields.n0)
+        thickness = self._thickness(self._reference_nodes)
+        if self._model.midsurface.shells:
+            prescribed.append(self._shell_numbers())
+        materials = self._cell_materials()
+        if isinstance(self._model.material.law, OfShells) and materials is not None:
+            prescribed.append(np.repeat(materials[:, None, 3], r.shape[1], axis=1))
+        if thickness is not None:
+            prescribed.append(thickness)
+        prescribed = [self._gather_cells(field) for field in prescribed if field.size]
+        sample_area = self._stresses.frame.area * self._sample_weights
         r, n0, inner, weight = (
-            self._gathered(f) for f in (r, fields.n0, inner, self._stresses.frame.area * self._rule)
+            self._gather_cells(values) for values in (r, fields.n0, inner, sample_area)
         )
         self._numbers = numbers
         if self.comm.rank:
             return
         sides = np.array(self._element.entity_closure_dofs[1])
-        self._numbers = split(numbers, smooth_parts(numbers, sides, given, n0))
-        self._cells = self._numbers[
-            :, np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
-        ]
-        table = self._element.tabulate(0, self._inner)[0, :, :, 0]
+        self._numbers = split(numbers, smooth_parts(numbers, sides, prescribed, n0))
+        to_vtk = np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
+        self._cells = self._numbers[:, to_vtk]
+        table = self._element.tabulate(0, self._reference_samples)[0, :, :, 0]
         self._recovered = RecoveredShell(
-            self._numbers, self._places, r, n0, inner, weight, table, self._model.degree
+            self._numbers, self._reference_nodes, r, n0, inner, weight, table, self._model.degree
         )
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other
-        ranks.
+        """Return the displaced surface with its fields at the amplitudes mu; collective.
+
+        On rank 0; None on other ranks.
         """
         state = State(u, dict(mu or {}))
-        return self._model.system.at_state(state).evaluate(lambda: self._drawn(state))
+        return self._model.system.at_state(state).evaluate(lambda: self._surface_at(state))
 
-    def _drawn(self, state: State) -> Surface | None:
-        """The surface at the displacement and the placement that are set."""
+    def _surface_at(self, state: State) -> Surface | None:
+        """Return the surface at the displacement and the placement that are set, on rank 0."""
         if self._model.growing:
-            self._take_placement(state.mu)
-        jet = self._jet(self._model.u, self._places, 1)
-        values = self._fields.of(jet, state.mu)
+            self._set_placement(state.mu)
+        jet = self._jet(self._model.u, self._reference_nodes, 1)
+        values = self._fields.values_of(jet, state.mu)
         if state.mu:
-            nodes_of_cell = len(self._places)
+            nodes_of_cell = len(self._reference_nodes)
             add_contact(
                 values,
                 self._model,
                 state,
-                lambda of_cells: np.repeat(of_cells[: self._owned, None], nodes_of_cell, axis=1),
+                lambda of_cells: np.repeat(
+                    of_cells[: self._owned_cells, None], nodes_of_cell, axis=1
+                ),
             )
-        averaged = {name: self._averaged(each) for name, each in values.items()}
+        averaged = {
+            name: self._averaged(values_at_cells) for name, values_at_cells in values.items()
+        }
         nodes, law = self._averaged(jet[0]), self._law_at_nodes()
-        stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)
+        stresses = self._stresses.values_of(
+            self._jet(self._model.u, self._reference_samples), state.mu
+        )
         tensors = {
-            name: self._gathered(np.einsum("...ia,...a->...i", self._six, S))
+            name: self._gather_cells(np.einsum("...ia,...a->...i", self._to_space, S))
             for name, S in stresses.items()
         }
         if not self._recovered:
             return None
-        smooth, jumps = self._recovered.fields(tensors, self._n0)
-        fields = self._constant | smooth | rubber_fields(smooth, law) | averaged
+        recovered, jumps = self._recovered.fields(tensors, self._n0)
+        fields = self._constant | recovered | rubber_fields(recovered, law) | averaged
         fields = resolved_pressure(self._cells, fields)
         names = self._model.midsurface.shells
         return Surface(
             self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"], shells=names
         )
 
-    def _shell_of(self) -> Array:
-        """The number of its shell at the nodes of each owned cell."""
+    def _shell_numbers(self) -> Array:
+        """Return the number of its shell at the nodes of each owned cell (cells, nodes)."""
         midsurface = self._model.midsurface
-        inside = [midsurface.patches[name][: self._owned] for name in midsurface.shells]
-        return np.repeat(
-            np.argmax(inside, axis=0)[:, None].astype(np.float64), len(self._places), axis=1
-        )
+        in_shells = [midsurface.patches[name][: self._owned_cells] for name in midsurface.shells]
+        numbers = np.argmax(in_shells, axis=0)[:, None].astype(np.float64)
+        return np.repeat(numbers, len(self._reference_nodes), axis=1)
 
-    def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values of all ranks' cells on rank 0, elsewhere those of its own."""
+    def _gather_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of all ranks' cells on rank 0, those of its own on other ranks."""
         parts = self.comm.gather(values)
         return values if self.comm.rank else np.concatenate(parts)
 
-    def _jet(self, f: fem.Function, at: Array, order: int = 2) -> Array:
-        """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at points of each owned cell,
-        up to an order.
+    def _jet(self, f: fem.Function, points: Array, order: int = 2) -> Array:
+        """Return f, f,_1, f,_2, f,_11, f,_12, f,_22 at reference points of each owned cell.
+
+        Derivatives are in reference coordinates, up to an order; shape (6, cells, points, 3).
         """
-        table = self._model.V.element.basix_element.tabulate(order, at)[:, :, :, 0]
-        coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
+        table = self._model.V.element.basix_element.tabulate(order, points)[:, :, :, 0]
+        coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned_cells]]
         return np.asarray(np.matmul(table[:, None], coefficients))
 
-    def _thickness(self, at: Array) -> Array | None:
-        """h(x)/h at points of each owned cell, if it varies."""
+    def _thickness(self, points: Array) -> Array | None:
+        """Return h(x)/h (cells, points) at reference points of each owned cell; None if uniform."""
         factor = self._model.thickness
         if factor is None:
             return None
         V = factor.function_space
-        values = V.element.basix_element.tabulate(0, at)[0, :, :, 0]
-        return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
+        values = V.element.basix_element.tabulate(0, points)[0, :, :, 0]
+        return np.asarray(factor.x.array[V.dofmap.list[: self._owned_cells]] @ values.T)
 
-    def _made_of(self) -> Array | None:
-        """The material of each owned cell, where shells have their own."""
-        own = self._model.made_of
-        return (
-            None
-            if own is None
-            else own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[: self._owned, 0]]
-        )
+    def _cell_materials(self) -> Array | None:
+        """Return the material (cells, 4) of each owned cell, where shells have their own."""
+        materials = self._model.made_of
+        if materials is None:
+            return None
+        cell_dofs = materials.function_space.dofmap.list[: self._owned_cells, 0]
+        return np.asarray(materials.x.array.reshape(-1, 4)[cell_dofs])
 
     def _law_at_nodes(self) -> Law:
-        """Collective; on rank 0 with arrays (nodes,)."""
-        own, law = self._made_of(), self._model.material.law
-        if own is None:
+        """Return the law of elasticity, on rank 0 with arrays (nodes,); collective."""
+        materials, law = self._cell_materials(), self._model.material.law
+        if materials is None:
             return law
-        e, nu, _, which = (
-            self._averaged(np.repeat(each[:, None], len(self._places), axis=1)) for each in own.T
+        count = len(self._reference_nodes)
+        e, nu, _, law_number = (
+            self._averaged(np.repeat(values[:, None], count, axis=1)) for values in materials.T
         )
-        return law.made_of(e, nu, which)
+        return law.made_of(e, nu, law_number)
 
     def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
-        """The matrix of the mean of the cells that share a node, weighted by area, from the nodes
-        of all cells.
+        """Return the sparse matrix of the area-weighted mean over the cells that share a node.
+
+        Its columns are the nodes of all cells. On rank 0; None on other ranks.
         """
-        weights = self._gathered(self._fields.weight).ravel()
+        weights = self._gather_cells(self._fields.weight).ravel()
         if self.comm.rank:
             return None
-        where = self._numbers.ravel()
-        share = weights / np.bincount(where, weights)[where]
-        return scipy.sparse.csr_matrix((share, (where, np.arange(len(where)))))
+        node_numbers = self._numbers.ravel()
+        share = weights / np.bincount(node_numbers, weights)[node_numbers]
+        return scipy.sparse.csr_matrix((share, (node_numbers, np.arange(len(node_numbers)))))
 
     def _averaged(self, values: Array) -> Array:
-        """Weighted mean over the cells that share a node, on rank 0."""
-        whole = self._gathered(values)
-        if self._mean is None:
+        """Return the weighted mean over the cells that share a node, on rank 0."""
+        values_of_all, matrix = self._gather_cells(values), self._averaging_matrix
+        if matrix is None:
             return values
-        return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(
-            -1, *values.shape[2:]
-        )
+        averaged = np.asarray(matrix @ values_of_all.reshape(matrix.shape[1], -1))
+        return averaged.reshape(-1, *values.shape[2:])
 
 
 def add_contact(
@@ -324,8 +349,8 @@ def add_contact(
     """Add the contact pressure and the gap between shells to fields at the nodes of cells;
     collective.
 
-    Beside the pressure it adds what `resolved_pressure` takes out again: `RESOLVED`, one in a cell
-    that is pressed all over; `RESOLVED_PRESSURE`, the pressure of such a cell; `GAP_OPEN`, one
+    Besides the pressure it adds what `resolved_pressure` takes out again: `RESOLVED`, one in a cell
+    that is in contact all over; `RESOLVED_PRESSURE`, the pressure of such a cell; `GAP_OPEN`, one
     where there is a gap to a body.
 
     Parameters
@@ -333,7 +358,7 @@ def add_contact(
     values
         Name -> (cells, nodes of a cell). The gap to bodies is there already, over h.
     at_nodes
-        Makes (cells, nodes of a cell) of a value of each local cell.
+        Function from a value of each local cell to (cells, nodes of a cell).
     """
     pressure = model.cell_pressures(state)
     if pressure is not None:
@@ -366,57 +391,64 @@ def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dic
     if PRESSURE not in fields:
         return fields
     auxiliary = {RESOLVED, RESOLVED_PRESSURE, GAP_OPEN}
-    drawn = {name: values for name, values in fields.items() if name not in auxiliary}
+    shown_fields = {name: values for name, values in fields.items() if name not in auxiliary}
     in_zone = fields[RESOLVED] > 0
     in_zone_or_edge = in_zone.copy()
     in_zone_or_edge[cells[in_zone[cells].any(axis=1)]] = True
     pressure_in_zone = fields[RESOLVED_PRESSURE] / np.where(in_zone, fields[RESOLVED], 1.0)
     edge_is_open = in_zone_or_edge & (fields[GAP_OPEN] > 0)
-    pressure_outside = np.where(edge_is_open, 0.0, drawn[PRESSURE])
+    pressure_outside = np.where(edge_is_open, 0.0, shown_fields[PRESSURE])
     pressure = np.where(in_zone, pressure_in_zone, pressure_outside)
-    drawn[PRESSURE] = np.where((pressure > 0) & ~in_zone_or_edge, np.nan, pressure)
-    return drawn
+    shown_fields[PRESSURE] = np.where((pressure > 0) & ~in_zone_or_edge, np.nan, pressure)
+    return shown_fields
 
 
-def grown(growing: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]) -> list[Deviation]:
-    """Imperfections that grow, at their amplitudes."""
+def deviations_at(
+    imperfections: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]
+) -> list[Deviation]:
+    """Return the growing imperfections at their amplitudes."""
 
     def times(deviation: Deviation, factor: float) -> Deviation:
         return lambda places: factor * deviation(places)
 
     return [
-        times(deviation, mu.get(name, 0.0)) for name, each in growing.items() for deviation in each
+        times(deviation, mu.get(name, 0.0))
+        for name, deviations in imperfections.items()
+        for deviation in deviations
     ]
 
 
-def turned(surface: Surface, azimuth: float) -> Surface:
-    """The surface rotated about e3 by an angle in rad: from the model's frame to the user's."""
-    return _moved(surface, rotation(azimuth))
+def rotated_surface(surface: Surface, azimuth: float) -> Surface:
+    """Return the surface rotated about e3 by an angle in rad.
+
+    So it is in the user's frame in place of the model's.
+    """
+    return _transformed(surface, rotation(azimuth))
 
 
 def completed(surface: Surface, mirror: Array) -> Surface:
-    """A half surface together with its mirror image.
+    """Return a half surface together with its mirror image.
 
     `mirror` is the plane's unit normal (3,), followed by its offset if that is not zero. Seen from
     outside, the image's triangles have the opposite orientation.
     """
     normal, offset = mirror[:3], float(mirror[3:].sum())
-    image = _moved(surface, np.eye(3) - 2 * np.outer(normal, normal))
+    image = _transformed(surface, np.eye(3) - 2 * np.outer(normal, normal))
     image = replace(image, r0=image.r0 + 2 * offset * normal)
 
     sign = _parity(surface, normal, offset)
-    for name in BOTH_WAYS & surface.fields.keys():
+    for name in FIELDS_OF_EITHER_PARITY & surface.fields.keys():
         image.fields[name] *= sign
 
-    def both(f: Array, other: Array) -> Array:
-        return np.concatenate([f, other])
+    def with_image(values: Array, values_of_image: Array) -> Array:
+        return np.concatenate([values, values_of_image])
 
     return Surface(
-        both(surface.r0, image.r0),
-        both(surface.u, image.u),
-        both(surface.n0, image.n0),
+        with_image(surface.r0, image.r0),
+        with_image(surface.u, image.u),
+        with_image(surface.n0, image.n0),
         np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
-        {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
+        {name: with_image(f, image.fields[name]) for name, f in surface.fields.items()},
         surface.outlines,
         surface.jump,
         surface.strain_jump,
@@ -425,78 +457,91 @@ def completed(surface: Surface, mirror: Array) -> Surface:
     )
 
 
-def whole(surface: Surface, mirror: Mirror) -> Surface:
-    """All of the shell from the half, or the sector, that is modelled."""
-    joined = completed(surface, mirror.plane)
+def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
+    """Return all of the shell from the half, or the sector, that is modelled."""
+    two_sectors = completed(surface, mirror.plane)
     if not isinstance(mirror, Sector):
-        return joined
+        return two_sectors
     turns = [image.Q.T for image in mirror.images if image.sign > 0]
-    copies = [_moved(joined, Q) for Q in turns]
-    count = len(joined.r0)
+    copies = [_transformed(two_sectors, Q) for Q in turns]
+    count = len(two_sectors.r0)
 
-    def every(of: Callable[[Surface], Array]) -> Array:
-        return np.concatenate([of(copy) for copy in copies])
+    def of_all_copies(values_of: Callable[[Surface], Array]) -> Array:
+        return np.concatenate([values_of(copy) for copy in copies])
 
     return replace(
-        joined,
-        r0=every(lambda s: s.r0),
-        u=every(lambda s: s.u),
-        n0=every(lambda s: s.n0),
-        cells=np.concatenate([joined.cells + k * count for k in range(len(copies))]),
-        fields={name: every(lambda s, name=name: s.fields[name]) for name in joined.fields},  # type: ignore[misc]
+        two_sectors,
+        r0=of_all_copies(lambda s: s.r0),
+        u=of_all_copies(lambda s: s.u),
+        n0=of_all_copies(lambda s: s.n0),
+        cells=np.concatenate([two_sectors.cells + k * count for k in range(len(copies))]),
+        fields={
+            name: np.concatenate([copy.fields[name] for copy in copies])
+            for name in two_sectors.fields
+        },
     )
 
 
-def on_nodes_of(surface: Surface, like: Surface) -> Surface:
-    """Displacements and fields at the nodes of another mesh of the same shell; itself on that mesh.
+def on_nodes_of(surface: Surface, target: Surface) -> Surface:
+    """Return displacements and fields at the nodes of another mesh of the same shell.
 
-    By linear functions through the nearest nodes: exact to the second order of their distance.
+    They are linear functions through the nearest nodes: exact to the second order of their
+    distance. On the same mesh the result is the surface itself.
     """
-    if surface.r0.shape == like.r0.shape and np.abs(surface.r0 - like.r0).max() < ON_PLANE:
+    if (
+        surface.r0.shape == target.r0.shape
+        and np.abs(surface.r0 - target.r0).max() < SAME_PLACE_TOLERANCE
+    ):
         return surface
-    distance, near = scipy.spatial.cKDTree(surface.r0).query(like.r0, NEAREST)
-    beside = surface.r0[near] - like.r0[:, None]
-    size = np.maximum(distance.max(axis=1), ON_PLANE)[:, None]
+    distance, nearest_nodes = scipy.spatial.cKDTree(surface.r0).query(target.r0, NODES_OF_FIT)
+    offsets = surface.r0[nearest_nodes] - target.r0[:, None]
+    size = np.maximum(distance.max(axis=1), SAME_PLACE_TOLERANCE)[:, None]
     weight = np.exp(-((2 * distance / size) ** 2))[..., None]
-    basis = np.concatenate([np.ones((*near.shape, 1)), beside / size[..., None]], axis=2)
-    rows = np.linalg.pinv(weight * basis, rcond=FLAT)[:, 0] * weight[..., 0]
+    basis = np.concatenate([np.ones((*nearest_nodes.shape, 1)), offsets / size[..., None]], axis=2)
+    interpolation = np.linalg.pinv(weight * basis, rcond=EXTENT_TOLERANCE)[:, 0] * weight[..., 0]
 
-    def moved(f: Array) -> Array:
-        return np.asarray(np.einsum("nk,nk...->n...", rows, f[near]))
+    def interpolated(f: Array) -> Array:
+        return np.asarray(np.einsum("nk,nk...->n...", interpolation, f[nearest_nodes]))
 
-    fields = {name: moved(f) for name, f in surface.fields.items()}
+    fields = {name: interpolated(f) for name, f in surface.fields.items()}
     return replace(
-        surface, r0=like.r0, u=moved(surface.u), n0=like.n0, cells=like.cells, fields=fields
+        surface,
+        r0=target.r0,
+        u=interpolated(surface.u),
+        n0=target.n0,
+        cells=target.cells,
+        fields=fields,
     )
 
 
 def _parity(surface: Surface, normal: Array, offset: float) -> float:
-    """1 if the mirror images of remanence and applied field continue them, -1 if their opposites
+    """Return 1 if mirror images of remanence and applied field continue them, -1 if the opposites
     do.
 
-    Both have the same sign. It is that of the applied field at the plane, which is continuous
-    there; without one, that of the remanence, if it does not jump at the plane.
+    Both fields have the same sign. It is that of the applied field at the plane, which is
+    continuous there; without one, that of the remanence, if it does not jump at the plane.
     """
-    on = np.abs(surface.r0 @ normal - offset) < ON_PLANE
+    on_plane = np.abs(surface.r0 @ normal - offset) < SAME_PLACE_TOLERANCE
     for name in ("Ba", "Br"):
-        vectors = surface.fields.get(name, np.zeros((len(on), 3)))[on]
+        vectors = surface.fields.get(name, np.zeros((len(on_plane), 3)))[on_plane]
         size = np.nan_to_num(np.linalg.norm(vectors, axis=1))
         if size.max(initial=0.0) > 0:
             jumps = size.min() < size.max() / 2
-            return (
-                1.0 if jumps or 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(size**2) else -1.0
-            )
+            is_tangential = 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(size**2)
+            return 1.0 if jumps or is_tangential else -1.0
     return 1.0
 
 
-def _moved(surface: Surface, Q: Array) -> Surface:
-    """Transform points and vectors v -> v Q, and tensors T -> Q^T T Q."""
+def _transformed(surface: Surface, Q: Array) -> Surface:
+    """Return a surface with points and vectors v -> v Q, and tensors T -> Q^T T Q."""
 
-    def moved(f: Array) -> Array:
-        return f if f.ndim == 1 else f @ Q if f.ndim == 2 else Q.T @ f @ Q
+    def transformed(f: Array) -> Array:
+        if f.ndim == 1:
+            return f
+        return f @ Q if f.ndim == 2 else Q.T @ f @ Q
 
-    fields = {name: moved(f) for name, f in surface.fields.items()}
+    fields = {name: transformed(f) for name, f in surface.fields.items()}
     lines = tuple(line @ Q for line in surface.outlines)
     solids = tuple(solid.transformed(Q.T, np.zeros(3)) for solid in surface.solids)
-    r0, u, n0 = (moved(f) for f in (surface.r0, surface.u, surface.n0))
+    r0, u, n0 = (transformed(f) for f in (surface.r0, surface.u, surface.n0))
     return replace(surface, r0=r0, u=u, n0=n0, fields=fields, outlines=lines, solids=solids)

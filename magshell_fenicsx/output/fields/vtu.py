@@ -1,5 +1,6 @@
-"""Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read
-them back.
+"""Fields for ParaView: a .vtu file with curved cells per point, and a .pvd list of the points.
+
+Pictures read these files back.
 """
 
 import os
@@ -32,15 +33,13 @@ if TYPE_CHECKING:  # VTK takes long to import
 
 Array = NDArray[np.float64]
 Read = TypeVar("Read")
-SYMMETRIC = (
-    [0, 1, 2, 0, 1, 0],
-    [0, 1, 2, 1, 2, 2],
-)  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
-FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
+# VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
+VTK_TENSOR_INDICES = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])
+VTK_TENSOR_POSITIONS = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
-SHELLS = "shells"  # their names, in the order of the numbers in `shell`
-OWN_DATA = ("u", "u_over_h", "w_over_h", "r0", "n0")
-UNITS = {  # of the arrays, for those who open them elsewhere
+SHELLS = "shells"  # names of the shells, in the order of the numbers in `shell`
+DATA_OF_SURFACE = ("u", "u_over_h", "w_over_h", "r0", "n0")
+UNITS = {  # of the arrays, for those who open the files in other programs
     **dict.fromkeys(("points", "u", "r0"), "R"),
     **dict.fromkeys(("u_over_h", "w_over_h", "w0_over_h", "gap_over_h"), "h"),
     **dict.fromkeys(("n0", "E", "E_1", "E_2", "E_total"), "1"),
@@ -51,11 +50,11 @@ UNITS = {  # of the arrays, for those who open them elsewhere
     "Ba": "mu0 E / largest remanence",
     "contact_pressure": "E h/R",
 }
-LATER = 1e-9  # between points of one time, in units of the time
+TIME_INCREMENT = 1e-9  # between points of one time, in units of the time
 
 
 @dataclass(frozen=True)
-class About:
+class ShellData:
     """Data of a shell that pictures need besides the nodes; every file has them.
 
     Attributes
@@ -80,11 +79,12 @@ class About:
 def unstructured_grid(
     surface: Surface, h: float, *, deformed: bool = False
 ) -> "vtkUnstructuredGrid":
-    """The surface or body with u, u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R.
+    """Return the surface or body with u, u/h, w/h, r0, n0 and its fields at the nodes, as VTK's
+    grid.
 
     Its points are undeformed, so that warping by the vector `u` deforms it to scale, or deformed.
-
-    It is built without pyvista, which takes longer to import than all fields of a path to write.
+    Lengths are over R. It is built without pyvista, which takes longer to import than all fields of
+    a path to write.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
@@ -96,27 +96,31 @@ def unstructured_grid(
     starts, nodes = np.arange(0, (number + 1) * count, count), surface.cells.ravel()
     cells.SetData(*(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, nodes)))
     grid.SetPoints(points)
-    grid.SetCells(
-        TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE,
-        cells,
-    )
-    own = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
-    fields = {name: f if f.ndim < 3 else f[:, *SYMMETRIC] for name, f in surface.fields.items()}
-    for name, values in {**dict(zip(OWN_DATA, own, strict=True)), **fields}.items():
-        give(grid.GetPointData(), name, values)
+    cell_type = LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
+    grid.SetCells(TRIANGLE if count == 3 else cell_type, cells)
+    data_of_surface = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
+    fields = {
+        name: values if values.ndim < 3 else values[:, *VTK_TENSOR_INDICES]
+        for name, values in surface.fields.items()
+    }
+    for name, values in {
+        **dict(zip(DATA_OF_SURFACE, data_of_surface, strict=True)),
+        **fields,
+    }.items():
+        add_array(grid.GetPointData(), name, values)
     return grid
 
 
-def give(to: Any, name: str, values: NDArray[Any]) -> None:
+def add_array(vtk_data: Any, name: str, values: NDArray[Any]) -> None:
     """Add an array to VTK's data of points, or of a file."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
     array.SetName(name)
-    to.AddArray(array)
+    vtk_data.AddArray(array)
 
 
-def give_texts(to: Any, name: str, lines: Sequence[str]) -> None:
+def add_texts(vtk_data: Any, name: str, lines: Sequence[str]) -> None:
     """Add texts to VTK's data of a file."""
     from vtkmodules.vtkCommonCore import vtkStringArray
 
@@ -124,57 +128,53 @@ def give_texts(to: Any, name: str, lines: Sequence[str]) -> None:
     array.SetName(name)
     for line in lines:
         array.InsertNextValue(line)
-    to.AddArray(array)
+    vtk_data.AddArray(array)
 
 
-def read_vtu(file: Path) -> tuple[Surface, About]:
-    """Read a file of `FieldSeries` or `write_mode`.
+def read_vtu(file: Path) -> tuple[Surface, ShellData]:
+    """Return the surface and the shell's data in a file of `FieldSeries` or `write_mode`.
 
     Raises
     ------
     CaseError
-        If an earlier version wrote it, without the data of `About`, or it is damaged.
+        If an earlier version wrote it, without the data of `ShellData`, or it is damaged.
     """
     return read_grid(file, lambda grid: _surface(grid, file))
 
 
-def read_grid(file: Path, made: "Callable[[vtkUnstructuredGrid], Read]") -> "Read":
-    """What is made of the data of a .vtu file.
+def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "Read":
+    """Return what a function makes of the grid in a .vtu file.
 
     Raises
     ------
     Damaged
-        If it is damaged; whatever `made` raises of data that are missing says so.
+        If the file is damaged; whatever `convert` raises of data that are missing says so.
     """
     from vtkmodules.vtkCommonCore import vtkObject
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
     if not is_whole(file):
-        raise Damaged(
-            f"{file}: is damaged: {'it is cut off' if file.exists() else 'it is missing'}"
-        )
-    errors, reader, vtk_warnings = (
-        list[str](),
-        vtkXMLUnstructuredGridReader(),
-        vtkObject.GetGlobalWarningDisplay(),
-    )
+        reason = "it is cut off" if file.exists() else "it is missing"
+        raise Damaged(f"{file}: is damaged: {reason}")
+    errors, reader = list[str](), vtkXMLUnstructuredGridReader()
+    vtk_warnings = vtkObject.GetGlobalWarningDisplay()
     reader.AddObserver("ErrorEvent", lambda _, event: errors.append(event))
     reader.SetFileName(str(file))
     vtkObject.GlobalWarningDisplayOff()  # the message follows
     try:
         reader.Update()
-        read = made(reader.GetOutput())
+        content = convert(reader.GetOutput())
     except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
         raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     finally:
         vtkObject.SetGlobalWarningDisplay(vtk_warnings)
     if errors or reader.GetErrorCode():
         raise Damaged(f"{file}: is damaged: VTK cannot read it")
-    return read
+    return content
 
 
 def is_whole(file: Path) -> bool:
-    """Whether there is a file of VTK in XML with its beginning and its end."""
+    """Whether a file is XML of VTK with its beginning and its end."""
     if not file.is_file():
         return False
     with file.open("rb") as stream:
@@ -183,31 +183,38 @@ def is_whole(file: Path) -> bool:
         return b"<VTKFile" in head and stream.read().rstrip().endswith(b"</VTKFile>")
 
 
-def arrays(of: Any) -> dict[str, Array]:
-    """Name -> the numbers of VTK's data."""
+def arrays(vtk_data: Any) -> dict[str, Array]:
+    """Return the numerical arrays of VTK's data of points, or of a file, by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    named = ((of.GetArrayName(i), of.GetArray(i)) for i in range(of.GetNumberOfArrays()))
-    return {name: vtk_to_numpy(array) for name, array in named if array}  # texts are no numbers
-
-
-def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
-    """What a grid of `unstructured_grid` has; whatever is raised, it is none."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(
-        grid.GetNumberOfCells(), -1
+    named_arrays = (
+        (vtk_data.GetArrayName(i), vtk_data.GetArray(i))
+        for i in range(vtk_data.GetNumberOfArrays())
     )
+    return {
+        name: vtk_to_numpy(array) for name, array in named_arrays if array
+    }  # texts are no numbers
+
+
+def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellData]:
+    """Return the surface and the shell's data in a grid of `unstructured_grid`.
+
+    Whatever exception is raised, the grid has none.
+    """
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    node_numbers = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
+    cells = node_numbers.reshape(grid.GetNumberOfCells(), -1)
     data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
     fields = {
-        name: f[:, FULL] if f.shape[1:] == (6,) else f
+        name: f[:, VTK_TENSOR_POSITIONS] if f.shape[1:] == (6,) else f
         for name, f in data.items()
-        if name not in OWN_DATA
+        if name not in DATA_OF_SURFACE
     }
     if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     R = float(numbers["R_in_m"][0]) if "R_in_m" in numbers else nan
-    about = About(
+    shell_data = ShellData(
         float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"), R
     )
     r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
@@ -219,52 +226,73 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
         raise ValueError("its cells have no nodes")
     if not all(np.isfinite(values).all() for values in (r0, u, n0)):
         raise ValueError("a node is nowhere")
-    jump, strain_jump = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
-    named = grid.GetFieldData().GetAbstractArray(SHELLS)
-    shells = tuple(named.GetValue(i) for i in range(named.GetNumberOfValues())) if named else ()
+    moment_jump, strain_jump = (
+        float(numbers[name][0]) if name in numbers else None for name in JUMPS
+    )
+    shell_names = grid.GetFieldData().GetAbstractArray(SHELLS)
+    shells = (
+        tuple(shell_names.GetValue(i) for i in range(shell_names.GetNumberOfValues()))
+        if shell_names
+        else ()
+    )
     return Surface(
-        r0, u * about.h, n0, cells, fields, jump=jump, strain_jump=strain_jump, shells=shells
-    ), about
+        r0,
+        u * shell_data.h,
+        n0,
+        cells,
+        fields,
+        jump=moment_jump,
+        strain_jump=strain_jump,
+        shells=shells,
+    ), shell_data
 
 
 class FieldSeries:
-    """Writes `point_NNNN.vtu` files and updates `path.pvd` after each; continues after an
-    interrupted run.
+    """Writer of `point_NNNN.vtu` files, which updates `path.pvd` after each.
+
+    It continues after an interrupted run.
 
     Parameters
     ----------
     outlines
-        Name of a point's file with the outlines of sources and bodies, of its number; empty
-        without.
-    grids
-        Names of the grids with fields beside the shell; each has files and a list of its own.
+        Format of the name of a point's file with the outlines of sources and bodies, of the point's
+        number; empty without.
     rows
-        Those of the points that an interrupted run has written.
+        Rows of path.csv of the points that an interrupted run has written.
+    grids
+        Names of the grids with fields outside the shell; each has files and a list of its own.
 
     Attributes
     ----------
-    kept
-        Number of leading points whose files are whole.
+    complete_points
+        Number of leading points whose files are complete.
     """
 
     def __init__(
         self,
         folder: Path,
-        about: About,
+        shell_data: ShellData,
         outlines: str = "",
         rows: Sequence[Mapping[str, Any]] = (),
         grids: Sequence[str] = (),
     ) -> None:
-        self._folder, self._about, self._outlines, self._grids = folder, about, outlines, grids
+        self._folder, self._shell_data, self._outlines, self._grids = (
+            folder,
+            shell_data,
+            outlines,
+            grids,
+        )
         folder.mkdir(exist_ok=True)
-        self.kept = 0
-        while all(map(is_whole, self._files(self.kept))):
-            self.kept += 1
-        self.kept = min(self.kept, len(rows)) if rows else self.kept
-        self._rows: list[Mapping[str, Any]] = list(rows[: self.kept]) or [
-            {"point": n} for n in range(self.kept)
+        self.complete_points = 0
+        while all(map(is_whole, self._files(self.complete_points))):
+            self.complete_points += 1
+        self.complete_points = (
+            min(self.complete_points, len(rows)) if rows else self.complete_points
+        )
+        self._rows: list[Mapping[str, Any]] = list(rows[: self.complete_points]) or [
+            {"point": n} for n in range(self.complete_points)
         ]
-        if self.kept:
+        if self.complete_points:
             self._write_list()
 
     def write(
@@ -272,10 +300,16 @@ class FieldSeries:
         number: int,
         surface: Surface,
         row: Mapping[str, Any] | None = None,
-        beside: Mapping[str, bytes] = MappingProxyType({}),
+        grid_contents: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write a point's file; `row` is that of path.csv, `beside` the contents of the files of
-        all grids.
+        """Write the files of a point.
+
+        Parameters
+        ----------
+        row
+            The point's row of path.csv.
+        grid_contents
+            Name of a grid -> content of its file.
 
         Raises
         ------
@@ -288,43 +322,50 @@ class FieldSeries:
                 vtp_content(surface.outlines, surface.solids),
                 waits=False,
             )
-        for name, content in beside.items():
+        for name, content in grid_contents.items():
             write_whole(self._folder / grid_file(name, number), content, waits=False)
         write_whole(
-            self._folder / point_file(number), vtu_content(surface, self._about), waits=False
+            self._folder / point_file(number), vtu_content(surface, self._shell_data), waits=False
         )
         self._rows.append(row or {"point": number})
         self._write_list()
 
     def _files(self, number: int) -> list[Path]:
-        """The files of a point."""
-        names = [point_file(number), *([self._outlines.format(number)] if self._outlines else [])]
-        return [
-            self._folder / name
-            for name in (*names, *(grid_file(grid, number) for grid in self._grids))
-        ]
+        """Return the files of a point."""
+        names = self._files_of_shell(number)
+        names += [grid_file(grid, number) for grid in self._grids]
+        return [self._folder / name for name in names]
+
+    def _files_of_shell(self, number: int) -> list[str]:
+        """Return the names of a point's files of the shell and of what is beside it."""
+        outlines = [self._outlines.format(number)] if self._outlines else []
+        return [point_file(number), *outlines]
 
     def _write_list(self) -> None:
+        """Write the lists of all points, path.pvd and one of each grid."""
         numbers = [int(row["point"]) for row in self._rows]
-        at = abscissae(self._rows)
-        files = [
-            [point_file(n), *([self._outlines.format(n)] if self._outlines else [])]
-            for n in numbers
-        ]
-        write_whole(self._folder / "path.pvd", pvd_content(at, files), waits=False)
+        times = abscissae(self._rows)
+        files = [self._files_of_shell(number) for number in numbers]
+        write_whole(self._folder / "path.pvd", pvd_content(times, files), waits=False)
         for grid in self._grids:
-            content = pvd_content(at, [[grid_file(grid, n)] for n in numbers])
+            content = pvd_content(times, [[grid_file(grid, number)] for number in numbers])
             write_whole(self._folder / f"map_{grid}.pvd", content, waits=False)
 
 
-def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
-    """The content of a .pvd file: the files of each point, part 0 the shell, at its place on
-    ParaView's time axis.
+def pvd_content(times: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
+    """Return the content of a .pvd file.
+
+    Parameters
+    ----------
+    times
+        Place of each point on ParaView's time axis.
+    files
+        The files of each point, first that of the shell.
     """
     rows = "\n".join(
         f'    <DataSet timestep="{t!r}" part="{part}" file="{file}"/>'
-        for t, each in zip(at, files, strict=True)
-        for part, file in enumerate(each)
+        for t, files_of_point in zip(times, files, strict=True)
+        for part, file in enumerate(files_of_point)
     )
     return (
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
@@ -333,63 +374,65 @@ def pvd_content(at: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
 
 
 def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Where the points of a path are on ParaView's time axis: they rise.
+    """Return the places of the points of a path on ParaView's time axis, ascending.
 
-    The time of a run with motions, in s if it has units; points at rest follow it closely. Else the
-    amplitude that varied, in the case's unit, if it is one and rises all the way; else the numbers
-    of the points.
+    They are the time of a run with motions, in s if it has units; points at rest follow it closely.
+    Else they are the amplitude that varied, in the case's unit, if it is one and rises all the way;
+    else the numbers of the points.
 
     Examples
     --------
-    >>> abscissae([{"point": i, "time": t, "amplitude": "time"} for i, t in enumerate([0.0, 0.0, 0.5])])
+    >>> times = enumerate([0.0, 0.0, 0.5])
+    >>> abscissae([{"point": i, "time": t, "amplitude": "time"} for i, t in times])
     [0.0, 1e-09, 0.5]
-    >>> pressed = [{"point": i, "p_over_pc": p, "amplitude": "pressure"} for i, p in enumerate([0, 0.2, 0.3])]
+    >>> loads = enumerate([0, 0.2, 0.3])
+    >>> pressed = [{"point": i, "p_over_pc": p, "amplitude": "pressure"} for i, p in loads]
     >>> abscissae(pressed), abscissae([*pressed, {**pressed[0], "point": 3}])
     ([0.0, 0.2, 0.3], [0.0, 1.0, 2.0, 3.0])
     """
     numbers = [float(row["point"]) for row in rows]
-    varied = {str(row.get("amplitude", "")) for row in rows} - {""}
+    amplitudes = {str(row.get("amplitude", "")) for row in rows} - {""}
     if rows and "time" in rows[0]:
         times = list[float]()
         for row in rows:
             t = float(row[shown_quantity("time", row).name])
-            times.append(max(t, times[-1] + LATER) if times else t)
+            times.append(max(t, times[-1] + TIME_INCREMENT) if times else t)
         return times
-    if len(varied) != 1:
+    if len(amplitudes) != 1:
         return numbers
-    column = shown_quantity(amplitude(next(iter(varied))).column, rows[0]).name
+    column = shown_quantity(amplitude(next(iter(amplitudes))).column, rows[0]).name
     loads = [float(row[column]) for row in rows]
     return loads if all(a < b for a, b in pairwise(loads)) else numbers
 
 
 def point_file(number: int) -> str:
-    """The name of a point's file."""
+    """Return the name of a point's file."""
     return f"point_{number:04d}.vtu"
 
 
 def grid_file(name: str, number: int) -> str:
-    """The name of a point's file of a grid beside the shell."""
+    """Return the name of a point's file of a grid outside the shell."""
     return f"map_{name}_{number:04d}.vtu"
 
 
-def vtu_content(surface: Surface, about: About) -> bytes:
-    """The content of a .vtu file; VTK's own writer would ignore a full disk.
+def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
+    """Return the content of a .vtu file; VTK's own writer would ignore a full disk.
 
     LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more
     on curved surfaces.
     """
-    grid = unstructured_grid(surface, about.h)
+    grid = unstructured_grid(surface, shell_data.h)
     numbers = {
-        "h_over_R": np.array([about.h]),
-        "poisson_ratio": np.array([about.nu]),
-        "mirror": about.mirror,
+        "h_over_R": np.array([shell_data.h]),
+        "poisson_ratio": np.array([shell_data.nu]),
+        "mirror": shell_data.mirror,
     }
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
     numbers |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
-    numbers |= {"R_in_m": None if isnan(about.R) else np.array([about.R])}
+    numbers |= {"R_in_m": None if isnan(shell_data.R) else np.array([shell_data.R])}
     for name, values in numbers.items():
         if values is not None:
-            give(grid.GetFieldData(), name, values)
+            add_array(grid.GetFieldData(), name, values)
     data = grid.GetPointData()
     names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
     texts = {
@@ -398,12 +441,12 @@ def vtu_content(surface: Surface, about: About) -> bytes:
     }
     for name, lines in texts.items():
         if lines or name != SHELLS:
-            give_texts(grid.GetFieldData(), name, lines)
+            add_texts(grid.GetFieldData(), name, lines)
     return content_of(grid)
 
 
 def content_of(grid: "vtkUnstructuredGrid") -> bytes:
-    """The content of a .vtu file."""
+    """Return the content of a .vtu file of a grid."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
@@ -417,19 +460,25 @@ def content_of(grid: "vtkUnstructuredGrid") -> bytes:
     return content if isinstance(content, bytes) else content.encode()
 
 
-def read_point(folder: Path, number: int) -> tuple[Surface, About]:
-    """The surface of a point in a folder of fields, with the outlines beside it; a half shell is
-    completed.
+def read_point(folder: Path, number: int) -> tuple[Surface, ShellData]:
+    """Return the surface of a point in a folder of fields, with the outlines beside it.
+
+    A half shell is completed.
     """
-    surface, about = read_vtu(folder / point_file(number))
+    surface, shell_data = read_vtu(folder / point_file(number))
     lines, solids = read_outlines(folder, number)
     surface = replace(surface, outlines=lines, solids=solids)
-    return surface if about.mirror is None else completed(surface, about.mirror), about
+    return surface if shell_data.mirror is None else completed(
+        surface, shell_data.mirror
+    ), shell_data
 
 
 def write_whole_shells(folder: Path) -> list[str]:
-    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell; the files, none if
-    it is whole.
+    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell.
+
+    Returns
+    -------
+    The names of the files; none if the shell is whole.
 
     Raises
     ------
@@ -440,10 +489,10 @@ def write_whole_shells(folder: Path) -> list[str]:
     rows = [row for row in rows if (fields / point_file(int(row["point"]))).exists()]
     for row in rows:
         number = int(row["point"])
-        surface, about = read_point(fields, number)
-        if about.mirror is None:
+        surface, shell_data = read_point(fields, number)
+        if shell_data.mirror is None:
             return []
         names.append(f"whole_{number:04d}.vtu")
-        write_whole(fields / names[-1], vtu_content(surface, replace(about, mirror=None)))
+        write_whole(fields / names[-1], vtu_content(surface, replace(shell_data, mirror=None)))
     write_whole(fields / "whole.pvd", pvd_content(abscissae(rows), [[name] for name in names]))
     return [*names, "whole.pvd"]

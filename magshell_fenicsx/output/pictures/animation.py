@@ -9,51 +9,57 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.beside import near_places
-from magshell_fenicsx.output.pictures.colours import Coloured
+from magshell_fenicsx.output.pictures.bodies_and_magnets import near_places
+from magshell_fenicsx.output.pictures.colours import ColouredField
 from magshell_fenicsx.output.pictures.curve import plot_curve
-from magshell_fenicsx.output.pictures.layout import Boxes, Panel, directions, drawing
-from magshell_fenicsx.output.pictures.lines import Part, drawn_parts, place
+from magshell_fenicsx.output.pictures.layout import FigureBoxes, Panel, directions, drawing
+from magshell_fenicsx.output.pictures.lines import CurveStep, curve_coordinates, curve_steps
 from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
 from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
-from magshell_fenicsx.output.pictures.view import Camera, Image, Window
 from magshell_fenicsx.output.store.table import POLE, Row
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
     from PIL import Image as Pillow
 
-SEEN = 0.1  # least drawn size of the largest displacement, over the shell's extent
-WINDOW = 620  # pixels
-SECONDS = 6.0  # duration of all frames
-HELD = 1500  # milliseconds of the last frame
-MOST_CURVES = 4  # beside each other
-COLOURS = 128
+MIN_DRAWN_DISPLACEMENT = 0.1  # drawn size of the largest displacement, over the shell's extent
+WINDOW_WIDTH = 620  # pixels
+DURATION = 6.0  # s, of all frames
+DURATION_OF_LAST = 1500  # ms, of the last frame
+MIN_FRAME_DURATION = 80  # ms
+MAX_CURVES = 4  # above each other
+COLOURS = 128  # half of the palette
 STYLE = OutputSection(dpi=120, font_size=9)
 WHITE = (255, 255, 255)
 FOOT = 34  # pixels below the shell
-GREY, RIM = 0.35, 0.8  # of the line around what is drawn, and how much of it is seen
+EDGE_GREY, EDGE_OPACITY = 0.35, 0.8  # of the line around the shell
 Array = NDArray[np.float64]
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
-    """The factor of the drawn displacements: the least of 1, 2, 5, 10, ... with which the largest
-    is visible.
+    """Return the factor of the drawn displacements: 1, 2, 5, 10, ...
+
+    It is the least one with which the largest displacement is visible.
 
     Examples
     --------
     >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    >>> [magnification([Surface(square, u * square, square, np.array([[0, 1, 2]]), {})]) for u in (0.3, 0.03, 0.006)]
+    >>> cells = np.array([[0, 1, 2]])
+    >>> sizes = (0.3, 0.03, 0.006)
+    >>> [magnification([Surface(square, u * square, square, cells, {})]) for u in sizes]
     [1.0, 5.0, 20.0]
     """
-    largest = max(float(np.linalg.norm(s.u, axis=1).max()) for s in surfaces)
-    wanted = SEEN * float(np.ptp(surfaces[0].r0, axis=0).max()) / (largest or np.inf)
-    if wanted <= 1:
+    largest = max(float(np.linalg.norm(surface.u, axis=1).max()) for surface in surfaces)
+    ideal = (
+        MIN_DRAWN_DISPLACEMENT * float(np.ptp(surfaces[0].r0, axis=0).max()) / (largest or np.inf)
+    )
+    if ideal <= 1:
         return 1.0
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(decade * next(step for step in (1, 2, 5, 10) if step * decade >= wanted))
+    decade = 10.0 ** np.floor(np.log10(ideal))
+    return float(decade * next(step for step in (1, 2, 5, 10) if step * decade >= ideal))
 
 
 def animated(
@@ -61,16 +67,18 @@ def animated(
     h: float,
     titles: Sequence[str],
     rows: Sequence[Row],
-    shown: Sequence[Row],
+    frame_rows: Sequence[Row],
     camera: Camera,
     pole: str = POLE,
 ) -> bytes:
-    """A GIF file.
+    """Return the content of a GIF file.
 
     Parameters
     ----------
-    surfaces, titles, shown
+    surfaces, titles, frame_rows
         For each frame: the whole deformed shell, the title and the row of path.csv.
+    h
+        Thickness over R.
     rows
         All rows of the path.
     pole
@@ -81,23 +89,22 @@ def animated(
     factor = magnification(surfaces)
     with drawing(STYLE):
         views = _views(surfaces, h, factor, camera)
-        frames = _composed(views, factor, titles, rows, shown, pole)
+        frames = _composed(views, factor, titles, rows, frame_rows, pole)
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
-    palette = _palette(
-        [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
-    )  # the same for all
-    first, *others = (
+    samples = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
+    palette = _palette(samples)  # the same for all frames
+    first_image, *further = (
         _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither))
         for frame in frames
     )
-    each = round(max(1000 * SECONDS / len(frames), 80), -1)
-    durations = [*[each] * len(others), HELD]
+    duration = round(max(1000 * DURATION / len(frames), MIN_FRAME_DURATION), -1)
+    durations = [*[duration] * len(further), DURATION_OF_LAST]
     content = io.BytesIO()
-    first.save(
+    first_image.save(
         content,
         "GIF",
         save_all=True,
-        append_images=others,
+        append_images=further,
         duration=durations,
         loop=0,
         optimize=False,
@@ -106,8 +113,9 @@ def animated(
 
 
 def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
-    """A frame in the colours of a palette, white where it is white: Pillow takes a neighbour of
-    white there.
+    """Return a frame in the colours of a palette, white where it is white.
+
+    Pillow alone takes a neighbour of white there.
     """
     from PIL import Image as Pillow
 
@@ -119,29 +127,38 @@ def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
 
 
 def _palette(frames: Sequence[Image]) -> "Pillow.Image":
-    """A palette of 2 COLOURS: half of them cover all colours, half resolve the frequent ones."""
+    """Return a palette of 2 `COLOURS` entries.
+
+    Half of them cover all colours, half resolve the frequent ones.
+    """
     from PIL import Image as Pillow
 
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    levels = [c for method in methods for c in colours.quantize(COLOURS, method).getpalette() or []]
+    levels = list[int]()
+    for method in methods:
+        levels += colours.quantize(COLOURS, method).getpalette() or []
     palette.putpalette([*WHITE, *levels[3:]])
     return palette
 
 
 def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
-    """The same window and colours for all frames."""
-    limits = from_zero(
-        min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h
-    )
-    moved = [replace(s, u=factor * s.u) for s in surfaces]
-    places = [r for s in moved for r in (s.r0 + s.u, *near_places(s))]
-    window = Window.around(camera(np.concatenate([surfaces[0].r0, *places])), WINDOW)
+    """Return the panels of all frames, with the same window and colours."""
+    lowest = min(float(surface.w.min()) for surface in surfaces)
+    highest = max(float(surface.w.max()) for surface in surfaces)
+    limits = from_zero(lowest / h, highest / h)
+    magnified = [replace(surface, u=factor * surface.u) for surface in surfaces]
+    places = [surfaces[0].r0]
+    for surface in magnified:
+        places += [surface.r0 + surface.u, *near_places(surface)]
+    window = Window.around(camera(np.concatenate(places)), WINDOW_WIDTH)
     panels = []
-    for surface, drawn in zip(surfaces, moved, strict=True):
-        layer = Coloured("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
-        panels.append(Background(drawn, camera, WINDOW, window).panel(layer, STYLE))
+    for surface, magnified_surface in zip(surfaces, magnified, strict=True):
+        layer = ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
+        panels.append(
+            Background(magnified_surface, camera, WINDOW_WIDTH, window).panel(layer, STYLE)
+        )
     return panels
 
 
@@ -150,75 +167,77 @@ def _composed(
     factor: float,
     titles: Sequence[str],
     rows: Sequence[Row],
-    shown: Sequence[Row],
+    frame_rows: Sequence[Row],
     pole: str,
 ) -> list[NDArray[np.uint8]]:
-    """Frames (height, width, 3); the fixed parts are drawn once, then the title, the shell and the
-    marker on copies.
+    """Return the frames (height, width, 3).
+
+    The fixed parts are drawn once, then the title, the shell and the marker on copies.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    high, across = views[0].image.shape[:2]
-    width, height = across + 600, max(high + 40 + FOOT, 400)
-    low = FOOT + (height - 40 - FOOT - high) // 2
+    shell_height, shell_width = views[0].image.shape[:2]
+    width, height = shell_width + 600, max(shell_height + 40 + FOOT, 400)
+    shell_low = FOOT + (height - 40 - FOOT - shell_height) // 2
     figure = Figure(figsize=(width / STYLE.dpi, height / STYLE.dpi), dpi=STYLE.dpi)
-    boxes = Boxes(figure)
+    boxes = FigureBoxes(figure)
 
-    def box(left: float, low: float, wide: float, tall: float) -> "Axes":
-        return boxes.axes(*(n / STYLE.dpi for n in (left, low, wide, tall)))
+    def box(left: float, low: float, box_width: float, box_height: float) -> "Axes":
+        return boxes.axes(*(length / STYLE.dpi for length in (left, low, box_width, box_height)))
 
     canvas = FigureCanvasAgg(figure)
-    colour_bar(figure, box(across + 30, 90, 16, height - 180), views[0].scale, "vertical")
+    colour_bar(figure, box(shell_width + 30, 90, 16, height - 180), views[0].scale, "vertical")
     figure.text(15 / width, 12 / height, _scale(factor))
-    directions(box(across - 60, 4, 70, 70), views[0].camera, STYLE)
-    parts = (
-        drawn_parts(rows, str(rows[-1]["amplitude"]))[-MOST_CURVES:]
-        if rows[-1]["amplitude"]
-        else []
-    )
-    room = (height - 70) // max(len(parts), 1)
-    markers: dict[int, tuple[Axes, Part, Line2D]] = {}
-    for i, part in enumerate(reversed(parts)):  # from below
-        axes = box(across + 230, 70 + i * room, 350, room - 70)
-        plot_curve(axes, part, pole)
+    directions(box(shell_width - 60, 4, 70, 70), views[0].camera, STYLE)
+    steps = list[CurveStep]()
+    if rows[-1]["amplitude"]:
+        steps = curve_steps(rows, str(rows[-1]["amplitude"]))[-MAX_CURVES:]
+    height_of_curve = (height - 70) // max(len(steps), 1)
+    markers: dict[int, tuple[Axes, CurveStep, Line2D]] = {}
+    for i, step in enumerate(reversed(steps)):  # from below
+        axes = box(shell_width + 230, 70 + i * height_of_curve, 350, height_of_curve - 70)
+        plot_curve(axes, step, pole)
         marker = axes.plot([], [], "o", color="k", markersize=8, animated=True)[0]
-        markers |= {int(row["point"]): (axes, part, marker) for row in part.rows}
+        markers |= {int(row["point"]): (axes, step, marker) for row in step.rows}
     title = figure.text(15 / width, 1 - 12 / height, "", va="top", animated=True)
     canvas.draw()
-    still = canvas.copy_from_bbox(figure.bbox)
+    fixed_parts = canvas.copy_from_bbox(figure.bbox)
     frames = []
-    for view, text, row in zip(views, titles, shown, strict=True):
-        canvas.restore_region(still)
+    for view, text, row in zip(views, titles, frame_rows, strict=True):
+        canvas.restore_region(fixed_parts)
         title.set_text(text)
         figure.draw_artist(title)
         if row["point"] in markers:
-            axes, part, marker = markers[int(row["point"])]
-            marker.set_data(*([x] for x in place(row, part.amplitude)))
+            axes, step, marker = markers[int(row["point"])]
+            marker.set_data(*([x] for x in curve_coordinates(row, step.amplitude)))
             axes.draw_artist(marker)
         frame = np.array(canvas.buffer_rgba())[:, :, :3]
-        _lay(view.image, frame[height - low - high : height - low, 10 : 10 + across])
+        shell_rows = slice(height - shell_low - shell_height, height - shell_low)
+        _overlay(view.image, frame[shell_rows, 10 : 10 + shell_width])
         frames.append(frame)
     return frames
 
 
-def _lay(image: Image, under: NDArray[np.uint8]) -> None:
+def _overlay(image: Image, frame: NDArray[np.uint8]) -> None:
     """Put an image with transparency on a part of a frame."""
-    part = image[..., 3:] / 255
-    laid = part * image[..., :3] + (1 - part) * under
-    edge = RIM * edge_of(part)
-    under[:] = np.rint((1 - edge) * laid + edge * 255 * GREY)
+    opacity = image[..., 3:] / 255
+    overlaid = opacity * image[..., :3] + (1 - opacity) * frame
+    edge = EDGE_OPACITY * edge_of(opacity)
+    frame[:] = np.rint((1 - edge) * overlaid + edge * 255 * EDGE_GREY)
 
 
-def edge_of(part: Array) -> Array:
-    """Where what is drawn ends, of how much of each pixel (n, m, 1) it covers: one in the pixels at
-    its rim.
+def edge_of(coverage: Array) -> Array:
+    """Return the edge of what is drawn: one in the pixels at its rim.
+
+    `coverage` (n, m, 1) is how much of each pixel it covers.
     """
-    least = part.copy()
-    for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        least = np.minimum(least, np.roll(part, way, axis))
-    return np.asarray(part - least)
+    smallest = coverage.copy()
+    for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        smallest = np.minimum(smallest, np.roll(coverage, shift, axis))
+    return np.asarray(coverage - smallest)
 
 
 def _scale(factor: float) -> str:
+    """Return words for the scale of the displacements."""
     return "displacements to scale" if factor == 1 else rf"displacements drawn $\times$ {factor:g}"

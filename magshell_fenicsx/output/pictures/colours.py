@@ -1,5 +1,6 @@
-"""Fields as colours: values, limits, captions with units; what is zero or cannot be said is named,
-not drawn.
+"""Fields as colours: values, limits, captions with units.
+
+A field that is zero or unknown is named in a note and not drawn.
 """
 
 from collections.abc import Iterable
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import SHELL, Surface
-from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, from_zero
+from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, from_zero
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
@@ -32,7 +33,7 @@ LOADS = {  # caption with its unit, name in words
     "k": (r"rotational springs $k/(hE\lambda_\mathrm{m})$", "rotational springs"),
     "tau": (r"torque of gradients $|\tau(u)|/(hE\lambda_\mathrm{m})$", "torque of gradients"),
 }
-SCALARS = {  # of the interactive report, in HTML; of vectors the length
+SCALARS = {  # captions of the interactive report, in HTML; of vectors the length
     "w_over_h": "inward displacement w/h",
     "E_1": "larger membrane strain E<sub>1</sub>",
     "E_2": "smaller membrane strain E<sub>2</sub>",
@@ -64,26 +65,39 @@ WITH_SIGN = {
     "contact_pressure",
     "w0_over_h",
 }
-ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding
-ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
-LEAST_JUMP = 0.01  # per cent
-NOISE = 20.0  # colour limit over the difference between fields of cells and the smooth ones
-NONE = 0.01  # of the larger of two fields: what is smaller is zero
-UNRESOLVED, SLIGHT = (
-    0.05,
-    0.02,
-)  # differences between cells, and strains over those of bending, that are not drawn
-DETAIL, AROUND = (
-    0.15,
-    2.0,
-)  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
-FEW = 12  # cells that carry a pressure whose distribution is not resolved
-EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
+ZERO_LOAD = 1e-9  # loads are of the order of one or of h: smaller ones come from rounding
+ZERO_STRESS = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
+MIN_STRETCH_RANGE = 1e-9  # of the colours
+MIN_JUMP = 0.01  # per cent, that is said
+LIMIT_OVER_NOISE = 20.0  # colour limit over the difference of fields of cells from smooth ones
+ZERO_FRACTION = 0.01  # of the larger of two fields: a smaller one is zero
+UNRESOLVED_JUMP = 0.05  # strains that differ more from cell to cell may be left out
+SMALL_STRAIN = 0.02  # strains over those of bending that may be left out
+UNKNOWN_RATIO = 1e-4  # strains over those of bending: for smaller ones the ratio is not said
+MAX_CONTACT_SIZE = 0.15  # of a contact that is drawn alone, over the shell's extent
+CONTACT_MARGIN = 2.0  # size of the region around a contact over that of the contact
+MIN_PRESSED_CELLS = 12  # that resolve the distribution of a pressure
+# colour limit: PEAK times this quantile of the area
+AREA_QUANTILE, PEAK = 0.997, 1.5
 
 
 @dataclass(frozen=True)
-class Coloured:
-    """Values (n,) at the nodes with their limits, a colour map and the caption of its bar."""
+class ColouredField:
+    """Field of a picture as colours.
+
+    Attributes
+    ----------
+    name
+        Name of the field, see `surface.Surface`.
+    values
+        (n,) at the nodes.
+    limits
+        Values at the ends of the colours.
+    colours
+        Name of the colour map, see `scales.colour_map`; empty for grey.
+    caption
+        Caption of the colour bar.
+    """
 
     name: str
     values: Array
@@ -92,226 +106,235 @@ class Coloured:
     caption: str
 
 
-def shell(surface: Surface, h: float) -> list[Coloured]:
-    """w/h, white at zero."""
+def shell(surface: Surface, h: float) -> list[ColouredField]:
+    """Return the inward normal displacement w/h, white at zero."""
     w = np.asarray(surface.w / h, np.float64)
     limits = from_zero(float(w.min()), float(w.max()))
-    return [Coloured("w_over_h", w, limits, SIGNED, "inward normal displacement $w/h$")]
+    return [ColouredField("w_over_h", w, limits, SIGNED, "inward normal displacement $w/h$")]
 
 
-def strains(surface: Surface, h: float) -> tuple[list[Coloured], str]:
-    """The principal strains, and a sentence on them; none where they are those of the mesh."""
-    if bent_alone(surface, h):
+def strains(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
+    """Return the principal strains and a note; none where they are noise of the mesh."""
+    if unresolved_strains_note(surface, h):
         return [], ""
-    shown, said = _principal(surface, STRAINS, surface.strain_jump)
-    return shown, " ".join([*said, jump_said(surface.strain_jump, "strains")]) if shown else ""
+    fields, notes = _principal(surface, STRAINS, surface.strain_jump)
+    if not fields:
+        return [], ""
+    return fields, " ".join([*notes, jump_note(surface.strain_jump, "strains")])
 
 
-def moments(surface: Surface, h: float) -> tuple[list[Coloured], str]:
-    """The principal moments, and a sentence on them, and on strains that are not drawn."""
-    shown, said = _principal(surface, MOMENTS, surface.jump)
-    if shown:
-        said.append(jump_said(surface.jump, "moments"))
-    return shown, " ".join([*said, bent_alone(surface, h)]) if shown else ""
+def moments(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
+    """Return the principal moments and a note, also on strains that are left out."""
+    fields, notes = _principal(surface, MOMENTS, surface.jump)
+    if not fields:
+        return [], ""
+    notes += [jump_note(surface.jump, "moments"), unresolved_strains_note(surface, h)]
+    return fields, " ".join(notes)
 
 
-def bent_alone(surface: Surface, h: float) -> str:
-    """That strains are not drawn, where they are small beside those of bending and differ from cell
-    to cell.
+def unresolved_strains_note(surface: Surface, h: float) -> str:
+    """Return a note that strains are not drawn; empty where they are.
+
+    They are left out where they are small beside those of bending and differ from cell to cell.
     """
-    if (
-        not {*STRAINS, *MOMENTS} <= surface.fields.keys()
-        or (surface.strain_jump or 0.0) < UNRESOLVED
-    ):
+    jump = surface.strain_jump or 0.0
+    if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or jump < UNRESOLVED_JUMP:
         return ""
-    largest, bending = (
-        max(float(np.abs(surface.fields[name]).max()) for name in names)
-        for names in (STRAINS, MOMENTS)
-    )
-    bending *= h / 2
-    if not 0 < largest < SLIGHT * bending:
+    membrane, bending = _largest(surface, STRAINS), h / 2 * _largest(surface, MOMENTS)
+    if not 0 < membrane < SMALL_STRAIN * bending:
         return ""
-    times = (
-        f"{float(f'{bending / largest:.1g}'):.0f}"
-        if largest > 1e-4 * bending
-        else "more than 10 000"
-    )
+    ratio = "more than 10 000"
+    if membrane > UNKNOWN_RATIO * bending:
+        ratio = f"{float(f'{bending / membrane:.1g}'):.0f}"
     return (
-        f"Strains of the mid-surface are not drawn: those of bending are {times} times larger, "
-        f"and the former differ from cell to cell by {100 * (surface.strain_jump or 0.0):.2g} % (rms)."
+        f"Strains of the mid-surface are not drawn: those of bending are {ratio} times larger, "
+        f"and the former differ from cell to cell by {100 * jump:.2g} % (rms)."
     )
 
 
-def stretches(surface: Surface) -> list[Coloured]:
-    """Stretches and true stresses of rubber; stresses are white at zero.
+def stretches(surface: Surface) -> list[ColouredField]:
+    """Return stretches and true stresses of rubber; stresses are white at zero.
 
     Shells of another law beside it have none.
     """
-    coloured = []
-    for name, said in STRETCHES.items():
+    fields = []
+    for name, caption in STRETCHES.items():
         if (values := surface.fields.get(name)) is not None:
-            low, high, signed = (
-                float(np.nanmin(values)),
-                float(np.nanmax(values)),
-                name.startswith("sigma"),
-            )
-            limits = (
-                from_zero(low, max(high, ROUNDING["E_1"]))
-                if signed
-                else (low, max(high, low + 1e-9))
-            )
-            coloured.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, said))
-    return coloured
+            low, high = float(np.nanmin(values)), float(np.nanmax(values))
+            if name.startswith("sigma"):
+                limits = from_zero(low, max(high, ZERO_STRESS["E_1"]))
+                fields.append(ColouredField(name, values, limits, SIGNED, caption))
+            else:
+                limits = low, max(high, low + MIN_STRETCH_RANGE)
+                fields.append(ColouredField(name, values, limits, MAGNITUDE, caption))
+    return fields
 
 
-def jump_said(jump: float | None, what: str) -> str:
-    """How far the strains or moments of the cells are from the smooth field that is drawn."""
+def jump_note(jump: float | None, quantities: str) -> str:
+    """Return how far strains or moments of the cells are from the smooth field that is drawn."""
     if jump is None:
         return ""
     rms = 100 * jump
-    far = f"by {rms:.2g} %" if rms >= LEAST_JUMP else f"by less than {LEAST_JUMP:g} %"
-    return f"Smoothed across cells, whose own {what} differ from what is drawn {far} (rms)."
+    difference = f"by {rms:.2g} %" if rms >= MIN_JUMP else f"by less than {MIN_JUMP:g} %"
+    return (
+        f"Smoothed across cells, whose own {quantities} differ from what is drawn "
+        f"{difference} (rms)."
+    )
 
 
 def _largest(surface: Surface, names: Iterable[str]) -> float:
+    """Return the largest magnitude of some fields."""
     return max(float(np.abs(surface.fields[name]).max()) for name in names)
 
 
 def _principal(
     surface: Surface, captions: dict[str, str], jump: float | None
-) -> tuple[list[Coloured], list[str]]:
-    """Two fields with the same colours, white at zero, so that rounding of a constant field is
-    invisible.
+) -> tuple[list[ColouredField], list[str]]:
+    """Return two principal fields with the same colours, white at zero, and notes on those left
+    out.
 
-    One that is zero beside the other, or no larger than what the mesh leaves of both, is named, not
-    drawn.
+    The common limit makes rounding of a constant field invisible. A field that is zero beside the
+    other, or no larger than the noise of the mesh, is named and not drawn.
     """
     if not captions.keys() <= surface.fields.keys():
         return [], []
     first, second = captions
-    limit = max(_limit(surface, first, second), _noise(surface, first, second, jump or 0.0))
-    shown, said = list[Coloured](), list[str]()
+    noise = _noise(surface, first, second, jump or 0.0)
+    limit = max(_limit(surface, first, second), noise)
+    fields, notes = list[ColouredField](), list[str]()
     sizes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
     for name, caption in captions.items():
         values = surface.fields[name]
-        if sizes[name] < NONE * max(sizes.values()):
-            said.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
+        if sizes[name] < ZERO_FRACTION * max(sizes.values()):
+            notes.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
             continue
-        if float(np.sqrt((values**2).mean())) < _noise(surface, first, second, jump or 0.0) / NOISE:
-            said.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
+        if float(np.sqrt((values**2).mean())) < noise / LIMIT_OVER_NOISE:
+            notes.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
             continue
-        below, above = from_zero(float(values.min()), float(values.max()), NONE)
-        limits = (-limit if below < 0 else 0.0, limit if above > 0 else 0.0)
-        if max(sizes.values()) < ROUNDING[first]:
+        lowest, highest = from_zero(float(values.min()), float(values.max()), ZERO_FRACTION)
+        limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
+        if max(sizes.values()) < ZERO_STRESS[first]:
             limits = -limit, limit
-        shown.append(Coloured(name, values, limits, SIGNED, caption))
-    return shown, said
+        fields.append(ColouredField(name, values, limits, SIGNED, caption))
+    return fields, notes
 
 
 def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
-    """The colour limit far above that by which the fields of cells differ: what is zero but for the
-    mesh is pale.
+    """Return a colour limit far above the difference of the fields of cells from smooth ones.
+
+    With it a field that is zero but for the mesh is pale.
     """
     sizes = surface.fields[first] ** 2 + surface.fields[second] ** 2
-    return NOISE * jump * float(np.sqrt(sizes.mean()))
+    return LIMIT_OVER_NOISE * jump * float(np.sqrt(sizes.mean()))
 
 
 def _limit(surface: Surface, first: str, second: str) -> float:
-    """The colour limit of two fields: their largest magnitude, without peaks of small area such as
-    at a point load.
+    """Return the colour limit of two fields: their largest magnitude.
+
+    Peaks of small area, such as at a point load, are cut off.
     """
     size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
-    if (largest := float(size.max())) < ROUNDING[first]:
+    if (largest := float(size.max())) < ZERO_STRESS[first]:
         return 1.0
     in_cells = size[surface.cells].mean(axis=1)
     a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     order = np.argsort(in_cells)
-    most = in_cells[order][np.searchsorted(np.cumsum(area[order]), EVERYWHERE * area.sum())]
-    return float(min(largest, max(PEAK * most, ROUNDING[first])))
+    quantile = in_cells[order][np.searchsorted(np.cumsum(area[order]), AREA_QUANTILE * area.sum())]
+    return float(min(largest, max(PEAK * quantile, ZERO_STRESS[first])))
 
 
 def couple(surface: Surface) -> Array | None:
-    """The moment (n, 3) of the field on the carried remanence per area, over h E λ_m; None without
-    a field.
+    """Return the moment (n, 3) of the field on the carried remanence per area, over h E λ_m.
 
-    λ_m is the largest length of the applied field, so that of a uniform field it is the product of
-    unit vectors.
+    None without a field. λ_m is the largest length of the applied field, so that for a uniform
+    field the result is the product of unit vectors.
     """
     fields = surface.fields
     if not {"Br", "Ba"} <= fields.keys():
         return None
     largest = float(np.nan_to_num(np.linalg.norm(fields["Ba"], axis=1)).max())
-    return (
-        np.asarray(np.cross(fields["Br"], fields["Ba"]) / largest, np.float64) if largest else None
-    )
+    if not largest:
+        return None
+    return np.asarray(np.cross(fields["Br"], fields["Ba"]) / largest, np.float64)
 
 
-def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
-    """The magnetic loads that are not zero everywhere, and a sentence on those left out."""
+def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
+    """Return the magnetic loads that are not zero everywhere, and a note on those left out."""
     fields = surface.fields
-    c = couple(surface)
-    if c is None:
+    magnetic_couple = couple(surface)
+    if magnetic_couple is None:
         return [], ""
-    shown, zero, unknown = [], [], []
+    coloured, zero_loads, unknown_loads = [], [], []
     for name, (caption, words) in LOADS.items():
-        values = c if name == "couple" else fields.get(name)
+        values = magnetic_couple if name == "couple" else fields.get(name)
         if values is None:
-            unknown.append(words)
+            unknown_loads.append(words)
             continue
-        signed = values.ndim == 1
-        values = np.nan_to_num(values if signed else np.linalg.norm(values, axis=1))
+        has_sign = values.ndim == 1
+        values = np.nan_to_num(values if has_sign else np.linalg.norm(values, axis=1))
         largest = float(np.abs(values).max())
-        if largest < ZERO:
-            zero.append(words)
+        if largest < ZERO_LOAD:
+            zero_loads.append(words)
             continue
-        limits = from_zero(float(values.min()), float(values.max())) if signed else (0.0, largest)
-        shown.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, caption))
-    said = [f"Zero everywhere: {', '.join(zero)}."] if zero else []
-    said += [f"Not defined for this remanence or field: {', '.join(unknown)}."] if unknown else []
-    return shown, " ".join(said)
+        if has_sign:
+            limits = from_zero(float(values.min()), float(values.max()))
+            coloured.append(ColouredField(name, values, limits, SIGNED, caption))
+        else:
+            coloured.append(ColouredField(name, values, (0.0, largest), MAGNITUDE, caption))
+    notes = [f"Zero everywhere: {', '.join(zero_loads)}."] if zero_loads else []
+    if unknown_loads:
+        notes.append(f"Not defined for this remanence or field: {', '.join(unknown_loads)}.")
+    return coloured, " ".join(notes)
 
 
-def contact(surface: Surface) -> list[Coloured]:
-    """The gap and the pressure of bodies; none where nothing touches or the mesh resolves no
-    pressure.
+def contact(surface: Surface) -> list[ColouredField]:
+    """Return the gap and the contact pressure.
+
+    Empty without contact; the gap alone where the mesh resolves no pressure.
     """
     if not {"gap_over_h", "contact_pressure"} <= surface.fields.keys():
         return []
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
-    layers = [Coloured("gap_over_h", gap, (0.0, 1.0), NEAR, "gap$/h$")]
-    if (most := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
+    layers = [ColouredField("gap_over_h", gap, (0.0, 1.0), DISTANCE, "gap$/h$")]
+    if (largest := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
         caption = r"contact pressure $pR/(Eh)$"
-        layers.append(Coloured("contact_pressure", pressure, (0.0, most), SIGNED, caption))
+        layers.append(ColouredField("contact_pressure", pressure, (0.0, largest), SIGNED, caption))
     return layers
 
 
-def pressure_said(surface: Surface) -> str:
-    """Return the note under the contact pressure: nothing touches, no cell resolves it, or few
-    cells carry it.
+def pressure_note(surface: Surface) -> str:
+    """Return the note under the contact pressure; empty without one.
+
+    It says that nothing is in contact, that no cell resolves the pressure, or that few cells carry
+    it.
     """
     pressure = surface.fields["contact_pressure"]
-    unresolved, most = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
-    if not most:
-        narrow = "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
-        return narrow if unresolved else "Nothing touches."
-    if unresolved:
+    is_unresolved, largest = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
+    if not largest:
+        if not is_unresolved:
+            return "Nothing touches."
+        return "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
+    if is_unresolved:
         return "Where the contact is narrower than a cell of the mesh, no pressure is drawn."
     number = int((pressure[surface.cells] > 0).all(axis=1).sum())
-    return f"The pressure is a mean over each cell; {number} carry it." if 0 < number < FEW else ""
+    if 0 < number < MIN_PRESSED_CELLS:
+        return f"The pressure is a mean over each cell; {number} carry it."
+    return ""
 
 
 def contact_region(surface: Surface) -> Array | None:
-    """Places (8, 3) around the contact, if it is so small that a picture of the whole shell would
-    not show it.
+    """Return places (8, 3) around the contact.
+
+    None without contact, or if it is large enough to be seen in a picture of the whole shell.
     """
     r = surface.r0 + surface.u
-    touching = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]
-    if not len(touching):
+    in_contact = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]
+    if not len(in_contact):
         return None
-    low, high = touching.min(axis=0), touching.max(axis=0)
+    low, high = in_contact.min(axis=0), in_contact.max(axis=0)
     size = float((high - low).max())
-    if size > DETAIL * float(np.ptp(r, axis=0).max()):
+    if size > MAX_CONTACT_SIZE * float(np.ptp(r, axis=0).max()):
         return None
     corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
-    return np.asarray((low + high) / 2 + AROUND * size * corners)
+    return np.asarray((low + high) / 2 + CONTACT_MARGIN * size * corners)

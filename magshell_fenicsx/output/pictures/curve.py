@@ -1,29 +1,27 @@
-"""The load-displacement or pressure-volume curve as a picture, and natural frequencies along a
-path.
-"""
+"""Curves of a run as pictures: load over displacement, and natural frequencies along a path."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.fields.modes import Frequency
+from magshell_fenicsx.output.fields.mode_fields import Frequency
 from magshell_fenicsx.output.pictures.captions import write_numbers
-from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
+from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMNS, drawing
 from magshell_fenicsx.output.pictures.lines import (
-    FINE,
+    SEGMENTS_PER_INTERVAL,
+    CurveStep,
     Line,
-    Part,
     axes_for,
-    drawn_parts,
+    curve_coordinates,
+    curve_steps,
     is_unstable,
     line_coordinates,
-    named,
-    of_load,
-    place,
+    load_axis,
+    with_point_name,
 )
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
@@ -39,321 +37,363 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 PlaceOf = Callable[[Row], tuple[float, float]]
 DASHED = (0, (2, 1.2))
-NARROW = 0.3  # of the figure: few numbers fit below
+NARROW_AXES = 0.3  # of the figure's width: few numbers fit below
 MARKS = {"fold": "o", "bifurcation": "D"}
-MARK = 3.5  # points
-HIDDEN = 12.0  # points: an unstable part as small as this is hidden by the marks at its ends
-AROUND = 0.8  # around such a part in its inset, over its size
-ROUNDING = 1e-9  # of the widest curve of the same kind: a curve that is as narrow as this is noise
-STRAIGHT = 0.005  # of its extent: a curve as near as this to its chord is a straight line
-INSET = 0.4  # of the axes
-CROWDED = 0.02  # of the points of all curves: an inset that covers more has no place
+MARK_SIZE = 3.5  # points
+HIDDEN_SIZE = 12.0  # points: a smaller unstable part is hidden by the marks at its ends
+INSET_MARGIN = 0.8  # around such a part in its inset, over its size
+WIDTH_TOLERANCE = 1e-9  # over the widest curve of the same kind: a narrower curve is noise
+STRAIGHTNESS_TOLERANCE = 0.005  # distance from the chord over the extent, of a straight line
+INSET_SIZE = 0.4  # of the axes
+INSET_GAP = 0.14  # of the axes: room for the numbers of the inset
+MAX_COVERED = 0.02  # of the points of all curves, that an inset may cover
 
 
 def curve_figure(
-    rows: Sequence[Row], amplitude: str, style: OutputSection, place: str = POLE
+    rows: Sequence[Row], amplitude: str, style: OutputSection, pole: str = POLE
 ) -> "Figure":
-    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are
-    marked and numbered.
+    """Return the figure of the part of the path in which `amplitude` varied, and its branches.
 
-    Of a programme each step is drawn, the last one largest, but for steps of a single straight
-    line. Stable parts are solid, unstable parts dashed; an unstable part that its marks would hide
-    is drawn again in an inset. A user-defined amplitude is drawn over the displacement of the pole,
-    or what is called so.
+    Instabilities are marked and numbered. For a programme each step is drawn, the last one largest,
+    without steps of a single straight line. Stable parts are solid, unstable parts dashed; an
+    unstable part that its marks would hide is drawn again in an inset. A user-defined amplitude is
+    drawn over the displacement of the pole.
 
     Parameters
     ----------
-    place
+    rows
+        Rows of path.csv.
+    pole
         Name of the point of w_pole_over_h without named points.
     """
     from matplotlib.figure import Figure
 
-    parts = worth_drawing(drawn_parts(rows, amplitude))
-    first, wide = len(parts) - 1, parts[-1].amplitude == "time" or len(parts) > 2
-    across = min(first, 3) if wide and first else len(parts)
-    high = -(-first // across) if wide and first else 0
-    width = (style.width or (ONE if len(parts) == 1 else SEVERAL)) / INCH
-    last, each = width * (0.45 if wide and first else 0.75 / across), 0.75 * width / max(across, 2)
+    steps = worth_drawing(curve_steps(rows, amplitude))
+    last_number = len(steps) - 1
+    last_is_wide = steps[-1].amplitude == "time" or len(steps) > 2
+    width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
+    if last_is_wide and last_number:
+        columns = min(last_number, 3)
+        small_rows = -(-last_number // columns)
+        last_height = 0.45 * width
+    else:
+        columns, small_rows = len(steps), 0
+        last_height = width * (0.75 / columns)
+    small_height = 0.75 * width / max(columns, 2)
     with drawing(style):
-        figure = Figure(figsize=(width, last + high * each), dpi=style.dpi, layout="constrained")
-        grid = figure.add_gridspec(high + 1, across, height_ratios=[each] * high + [last])
-        for i, part in enumerate(parts):
-            alone = wide and i == first
-            axes = figure.add_subplot(grid[high, :] if alone else grid[i // across, i % across])
-            plot_curve(axes, part, place)
-            axes.set_title(part.title)
-        legend(figure, 4 * min(len(parts), 2))
+        figure = Figure(
+            figsize=(width, last_height + small_rows * small_height),
+            dpi=style.dpi,
+            layout="constrained",
+        )
+        grid = figure.add_gridspec(
+            small_rows + 1, columns, height_ratios=[small_height] * small_rows + [last_height]
+        )
+        for i, step in enumerate(steps):
+            spans_row = last_is_wide and i == last_number
+            cell = grid[small_rows, :] if spans_row else grid[i // columns, i % columns]
+            axes = figure.add_subplot(cell)
+            plot_curve(axes, step, pole)
+            axes.set_title(step.title)
+        legend(figure, 4 * min(len(steps), 2))
         figure.draw_without_rendering()  # insets need the places of the axes
-        for axes, part in zip(list(figure.axes), parts, strict=True):
-            draw_hidden(axes, part)
+        for axes, step in zip(list(figure.axes), steps, strict=True):
+            draw_hidden(axes, step)
     return figure
 
 
-def worth_drawing(parts: Sequence[Part]) -> list[Part]:
-    """The steps without those of a single straight line; the last one always."""
-    widths: dict[str, float] = defaultdict(float)  # of what is drawn to the right
+def worth_drawing(parts: Sequence[CurveStep]) -> list[CurveStep]:
+    """Return the steps of a curve without those of a single straight line; the last one always."""
+    widths: dict[str, float] = defaultdict(float)  # of the curves over each quantity
     names = [axes_for(part)[0].name for part in parts]
     for name, part in zip(names, parts, strict=True):
         widths[name] = max(widths[name], float(np.ptp(_points(part)[0])))
     bent = (
         part
         for name, part in zip(names[:-1], parts[:-1], strict=True)
-        if _bends(part, ROUNDING * widths[name])
+        if _bends(part, WIDTH_TOLERANCE * widths[name])
     )
     return [*bent, parts[-1]]
 
 
-def _points(part: Part) -> Array:
-    """The points of a curve (2, rows)."""
-    return np.array([place(row, part.amplitude) for row in part.rows]).T
+def _points(step: CurveStep) -> Array:
+    """Return the points of a curve (2, rows)."""
+    return np.array([curve_coordinates(row, step.amplitude) for row in step.rows]).T
 
 
-def _bends(part: Part, least: float) -> bool:
-    """Whether the points of a curve are on no line; what is narrower than the least is upright."""
-    x, y = _points(part)
-    if np.ptp(x) <= least:
+def _bends(step: CurveStep, min_width: float) -> bool:
+    """Whether a curve is no straight line; one narrower than `min_width` is an upright line."""
+    x, y = _points(step)
+    if np.ptp(x) <= min_width:
         return False
-    wide, high = (float(np.ptp(values)) or 1.0 for values in (x, y))
-    (a, b), x, y = (
-        np.subtract((x[-1], y[-1]), (x[0], y[0])) / [wide, high],
-        (x - x[0]) / wide,
-        (y - y[0]) / high,
-    )
-    return bool(
-        len(x) > 2 and np.abs(x * b - y * a).max() > STRAIGHT * (float(np.hypot(a, b)) or 1.0)
-    )
+    width, height = (float(np.ptp(values)) or 1.0 for values in (x, y))
+    x, y = (x - x[0]) / width, (y - y[0]) / height
+    chord_x, chord_y = x[-1], y[-1]
+    chord = float(np.hypot(chord_x, chord_y)) or 1.0
+    distance = np.abs(x * chord_y - y * chord_x).max()
+    return bool(len(x) > 2 and distance > STRAIGHTNESS_TOLERANCE * chord)
 
 
-def legend(figure: "Figure", most: int) -> None:
-    """One legend above all axes, where it covers no curve."""
-    entries = {
-        name: line
-        for axes in figure.axes
-        for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
+def legend(figure: "Figure", max_columns: int) -> None:
+    """Draw one legend above all axes, where it covers no curve."""
+    entries = dict[str, Any]()
+    for axes in figure.axes:
+        handles, names = axes.get_legend_handles_labels()
+        entries |= dict(zip(names, handles, strict=True))
     if entries:
         figure.legend(
             entries.values(),
             entries.keys(),
             loc="outside upper center",
-            ncols=min(len(entries), most),
+            ncols=min(len(entries), max_columns),
             frameon=False,
             handlelength=1.5,
             columnspacing=1,
         )
 
 
-def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
-    """Draw a part of a path in given axes."""
+def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
+    """Draw a step of a path in given axes."""
     x_label, y_label = (
-        named(each, of.rows[0], pole, r"\$").label for each in axes_for(of)
-    )  # a name is plain text
-    drawn = draw_lines(axes, of)
-    marked = [row for row in of.rows if row["label"] in LOCATED]
-    solutions = [row for row in of.rows if row["label"] == SOLUTION]
+        with_point_name(axis_quantity, step.rows[0], pole, r"\$").label
+        for axis_quantity in axes_for(step)
+    )
+    curves = draw_lines(axes, step)
+    instabilities = [row for row in step.rows if row["label"] in LOCATED]
+    solutions = [row for row in step.rows if row["label"] == SOLUTION]
     for row in solutions:
-        name, inside = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
+        name, fill = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
         axes.plot(
-            *place(row, of.amplitude),
+            *curve_coordinates(row, step.amplitude),
             "s",
             color="C2",
-            markerfacecolor=inside,
+            markerfacecolor=fill,
             markersize=4.5,
             label=label,
         )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
-    texts = [str(of.numbers[int(row["point"])]) for row in marked] + [
-        str(row["branch"]) for row in solutions
-    ]
-    places = [place(row, of.amplitude) for row in (*marked, *solutions)]
-    write_numbers(axes, list(zip(places, texts, strict=True)), drawn)
-    axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
+    texts = [str(step.numbers[int(row["point"])]) for row in instabilities]
+    texts += [str(row["branch"]) for row in solutions]
+    places = [curve_coordinates(row, step.amplitude) for row in (*instabilities, *solutions)]
+    write_numbers(axes, list(zip(places, texts, strict=True)), curves)
+    is_narrow = axes.get_position().width <= NARROW_AXES
+    axes.locator_params(axis="x", nbins=3 if is_narrow else 6)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(number_format())
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    if marked and any(is_unstable(row) for row in of.rows if row["label"] != SOLUTION):
+    has_unstable = any(is_unstable(row) for row in step.rows if row["label"] != SOLUTION)
+    if instabilities and has_unstable:
         axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
 
 def draw_lines(
-    axes: "Axes", of: Part, colour: str = "C0", place_of: PlaceOf | None = None
+    axes: "Axes", step: CurveStep, colour: str = "C0", place_of: PlaceOf | None = None
 ) -> list[Array]:
-    """Draw the lines, points and marks of a part; its smooth curves (2, n).
+    """Draw the lines, points and marks of a step, and return its smooth curves (2, n).
 
     Parameters
     ----------
+    colour
+        Of the lines and points.
     place_of
         The coordinates of a row; by default those of the curve of the amplitude.
     """
-    drawn, at = list[Array](), place_of or (lambda row: place(row, of.amplitude))
-    load = None if place_of else of_load(of.amplitude)
-    for line in line_coordinates(of):
-        curve = line.joined(*zip(*map(at, line.rows), strict=True), of_load=load)
-        drawn.append(curve)
-        crossings = [row for row in of.rows if row["label"] in LOCATED and row not in line.rows]
-        for unstable, pieces in groupby(
-            _pieces(line, curve, crossings, at), key=lambda piece: piece[2]
-        ):
-            ends = [(first, last) for first, last, _ in pieces]
-            piece = curve[:, ends[0][0] : ends[-1][1] + 1]
-            axes.plot(*piece, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
-        dots = [at(row) for row in line.rows if row["label"] in ("target", "step", "field")]
+    curves = list[Array]()
+    coordinates = place_of or (lambda row: curve_coordinates(row, step.amplitude))
+    load_coordinate = None if place_of else load_axis(step.amplitude)
+    for line in line_coordinates(step):
+        curve = line.smooth_curve(
+            *zip(*map(coordinates, line.rows), strict=True), load_axis=load_coordinate
+        )
+        curves.append(curve)
+        crossings = [row for row in step.rows if row["label"] in LOCATED and row not in line.rows]
+        segments = _segments(line, curve, crossings, coordinates)
+        for unstable, group in groupby(segments, key=lambda segment: segment[2]):
+            ends = [(first, last) for first, last, _ in group]
+            part = curve[:, ends[0][0] : ends[-1][1] + 1]
+            axes.plot(*part, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
+        dots = [
+            coordinates(row) for row in line.rows if row["label"] in ("target", "step", "field")
+        ]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color=colour, markersize=3.5)
-    for row in (row for row in of.rows if row["label"] in LOCATED):
+    for row in (row for row in step.rows if row["label"] in LOCATED):
         kind = str(row["label"])
         axes.plot(
-            *at(row),
+            *coordinates(row),
             MARKS[kind],
             color="C3",
             markerfacecolor="white",
-            markersize=MARK,
+            markersize=MARK_SIZE,
             markeredgewidth=0.9,
             label=_once(axes, kind),
             zorder=4,
         )
-    return drawn
+    return curves
 
 
-def _pieces(
+def _segments(
     line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceOf
 ) -> Iterator[tuple[int, int, bool]]:
-    """The first and last point of each piece of a smooth curve, and whether it is unstable.
+    """Yield the first and last point of each segment of a smooth curve, and whether it is unstable.
 
-    Between two rows a mode that the model excludes crosses zero at the first or the last of the
+    Between two rows a symmetry-breaking mode crosses zero at the first or the last of the
     `crossings` there.
     """
     extent = np.ptp(curve, axis=1)[:, None]
     for i, unstable in enumerate(line.unstable):
-        (row, after), low, high = line.rows[i : i + 2], i * FINE, (i + 1) * FINE
-        within = [
-            it for it in crossings if int(row["point"]) < int(it["point"]) < int(after["point"])
+        row, next_row = line.rows[i : i + 2]
+        low, high = i * SEGMENTS_PER_INTERVAL, (i + 1) * SEGMENTS_PER_INTERVAL
+        first, last = int(row["point"]), int(next_row["point"])
+        crossings_between = [
+            crossing for crossing in crossings if first < int(crossing["point"]) < last
         ]
-        if within and row["label"] not in LOCATED and is_unstable(row) != unstable:
-            at = np.array(place_of(within[0 if unstable else -1]))[:, None]
-            middle = low + int(
-                np.argmin(np.linalg.norm((curve[:, low : high + 1] - at) / extent, axis=0))
-            )
+        changes = row["label"] not in LOCATED and is_unstable(row) != unstable
+        if crossings_between and changes:
+            crossing_place = np.array(place_of(crossings_between[0 if unstable else -1]))[:, None]
+            offsets = (curve[:, low : high + 1] - crossing_place) / extent
+            middle = low + int(np.argmin(np.linalg.norm(offsets, axis=0)))
             yield low, middle, not unstable
             yield middle, high, unstable
         else:
             yield low, high, unstable
 
 
-def hidden(axes: "Axes", of: Part) -> Array | None:
-    """The corners (2, 2) of the first unstable part of a curve that its marks hide; None if all can
-    be seen.
+def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
+    """Return the corners (2, 2) around the first unstable part of a curve that its marks hide.
+
+    None if all unstable parts can be seen.
     """
-    for line in line_coordinates(of):
-        places = [place(row, of.amplitude) for row in line.rows]
-        curve = line.joined(*zip(*places, strict=True), of_load=of_load(of.amplitude))
-        for first, last, unstable in line.pieces:
-            piece = curve[:, first * FINE : last * FINE + 1]
-            size = np.ptp(axes.transData.transform(piece.T), axis=0) * 72 / axes.figure.dpi
-            if unstable and line.rows[last]["label"] in LOCATED and max(size) < HIDDEN:
-                low, high = piece.min(axis=1), piece.max(axis=1)
-                return np.array([low - AROUND * (high - low), high + AROUND * (high - low)])
+    for line in line_coordinates(step):
+        places = [curve_coordinates(row, step.amplitude) for row in line.rows]
+        load_coordinate = load_axis(step.amplitude)
+        curve = line.smooth_curve(*zip(*places, strict=True), load_axis=load_coordinate)
+        for first, last, unstable in line.segments:
+            part = curve[:, first * SEGMENTS_PER_INTERVAL : last * SEGMENTS_PER_INTERVAL + 1]
+            size = np.ptp(axes.transData.transform(part.T), axis=0) * 72 / axes.figure.dpi
+            if unstable and line.rows[last]["label"] in LOCATED and max(size) < HIDDEN_SIZE:
+                low, high = part.min(axis=1), part.max(axis=1)
+                margin = INSET_MARGIN * (high - low)
+                return np.array([low - margin, high + margin])
     return None
 
 
-def draw_hidden(axes: "Axes", of: Part) -> None:
-    """Draw an unstable part that its marks hide once more in an inset, in the corner with the least
-    of the curves.
+def draw_hidden(axes: "Axes", step: CurveStep) -> None:
+    """Draw an unstable part that its marks hide once more in an inset.
+
+    The inset is in the corner with the fewest points of the curves; there is none where all corners
+    are covered.
     """
-    if (box := hidden(axes, of)) is None:
+    if (box := hidden_box(axes, step)) is None:
         return
     points = drawn_points(axes)
-    inside = axes.transAxes.inverted().transform(axes.transData.transform(points))
-    gap = 0.14  # room for the numbers of the inset
-    corners = [(x, y) for y in (gap, 0.97 - INSET) for x in (0.97 - INSET, gap)]
-    low = np.array(corners) - gap
-    covered = [((inside > at) & (inside < at + INSET + gap)).all(axis=1).mean() for at in low]
+    places = axes.transAxes.inverted().transform(axes.transData.transform(points))
+    far_side = 0.97 - INSET_SIZE
+    corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
+    covered = list[float]()
+    for corner in np.array(corners) - INSET_GAP:
+        is_covered = (places > corner) & (places < corner + INSET_SIZE + INSET_GAP)
+        covered.append(float(is_covered.all(axis=1).mean()))
     best = int(np.argmin(covered))
-    if covered[best] > CROWDED:
+    if covered[best] > MAX_COVERED:
         return
-    small = axes.inset_axes((*corners[best], INSET, INSET))
-    draw_lines(small, of)
-    small.set(xlim=box[:, 0], ylim=box[:, 1])
-    small.tick_params(labelsize="x-small", length=2)
-    small.locator_params(nbins=3)
-    axes.indicate_inset_zoom(small, edgecolor="0.4", linewidth=0.6)
+    inset = axes.inset_axes((*corners[best], INSET_SIZE, INSET_SIZE))
+    draw_lines(inset, step)
+    inset.set(xlim=box[:, 0], ylim=box[:, 1])
+    inset.tick_params(labelsize="x-small", length=2)
+    inset.locator_params(nbins=3)
+    axes.indicate_inset_zoom(inset, edgecolor="0.4", linewidth=0.6)
 
 
 def drawn_points(axes: "Axes") -> Array:
-    """The places (n, 2) of all lines in axes."""
+    """Return the places (n, 2) of all lines in axes, in data coordinates."""
     return np.concatenate(
         [np.asarray(line.get_xydata(), float).reshape(-1, 2) for line in axes.lines]
     )
 
 
 def _once(axes: "Axes", name: str) -> str:
-    """A label of the legend; matplotlib leaves out "_"."""
+    """Return a label of the legend, "_" if it is there already: matplotlib leaves that out."""
     return "_" if name in axes.get_legend_handles_labels()[1] else name
 
 
-NAMED = 12  # most waves in the legend
+MAX_NAMED_WAVES = 12  # waves in the legend
 
 
 def frequencies_figure(
     frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection
 ) -> "Figure":
-    """Frequencies over the amplitude that varied last; the n-th lowest of each wave is one line.
+    """Return the figure of frequencies over the amplitude that varied last.
 
-    Of one point alone over the number of waves, where all have one, else over the number of the
-    mode. In Hz with a density, those of unstable modes below zero; else ω² ρ R²/E.
+    The n-th lowest frequency of each wave is one line. Frequencies of one point alone are drawn
+    over the number of waves, where all have one, else over the number of the mode. They are in Hz
+    with a density, those of unstable modes below zero; else ω² ρ R²/E.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
-    column = shown_quantity(registered(varied).column, rows[0]) if varied else None
+    varied_amplitudes = (str(row["amplitude"]) for row in reversed(rows) if row["amplitude"])
+    name = next(varied_amplitudes, "")
+    column = shown_quantity(registered(name).column, rows[0]) if name else None
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
-    vibrating = (it for it in frequencies if it.omega2 > 0 and not np.isnan(it.hertz))
-    of_root = max(
-        (it.hertz / np.sqrt(it.omega2) for it in vibrating), default=0.0
-    )  # Hz; 0 without a density
+    shown = [frequency for frequency in frequencies if frequency.point in places]
+    is_one_point = len({frequency.point for frequency in shown}) == 1
+    over_waves = all(f.wave.isdigit() for f in shown if f.wave != TORSION)
+    hertz_per_root = _hertz_per_root(frequencies)
+
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
-    drawn = [it for it in frequencies if it.point in places]
-    alone, of_waves = (
-        len({it.point for it in drawn}) == 1,
-        all(it.wave.isdigit() for it in drawn if it.wave != TORSION),
-    )
-    for n, it in enumerate(drawn, 1):
-        signed = np.sign(it.omega2) * of_root * np.sqrt(abs(it.omega2)) if of_root else it.omega2
-        place = (int(it.wave) if it.wave.isdigit() else 0) if of_waves else n
-        lines[it.wave, count[it.point, it.wave]].append(
-            (place if alone else places[it.point], float(signed))
-        )
-        count[it.point, it.wave] += 1
-    width = (style.width or ONE) / INCH
+    for number, frequency in enumerate(shown, 1):
+        omega2 = frequency.omega2
+        value = omega2
+        if hertz_per_root:
+            value = float(np.sign(omega2) * hertz_per_root * np.sqrt(abs(omega2)))
+        abscissa = places[frequency.point]
+        if is_one_point and over_waves:
+            abscissa = int(frequency.wave) if frequency.wave.isdigit() else 0
+        elif is_one_point:
+            abscissa = number
+        rank = count[frequency.point, frequency.wave]
+        lines[frequency.wave, rank].append((abscissa, float(value)))
+        count[frequency.point, frequency.wave] += 1
+
+    width = (style.width or ONE_COLUMN) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
     axes, waves = figure.subplots(), list(dict.fromkeys(wave for wave, _ in lines))
-    if spectrum := alone and of_waves:
+    if is_spectrum := is_one_point and over_waves:
         waves = ["waves", *({TORSION} & set(waves))]
-    for (wave, number), points in lines.items():
-        wave = "waves" if spectrum and wave != TORSION else wave
-        named = wave if number == 0 and waves.index(wave) < NAMED else None
+    for (wave, rank), points in lines.items():
+        wave = "waves" if is_spectrum and wave != TORSION else wave
+        number = waves.index(wave)
+        label = wave if rank == 0 and number < MAX_NAMED_WAVES else None
         axes.plot(
-            *zip(*points, strict=True),
-            ".-",
-            color=f"C{waves.index(wave) % 10}",
-            label=named,
-            lw=1,
-            ms=4,
+            *zip(*points, strict=True), ".-", color=f"C{number % 10}", label=label, lw=1, ms=4
         )
     axes.axhline(0, color="0.6", lw=0.6)
-    grows = "; below zero it grows" if any(it.omega2 < 0 for it in frequencies) else ""
-    said = f"frequency  (Hz){grows}"
-    of_one = "waves around the axis" if of_waves else "number of the mode"
-    of_path = column.label if column else ""
-    axes.set(
-        xlabel=of_one if alone else of_path, ylabel=said if of_root else r"$\omega^2 \rho R^2/E$"
-    )
-    if alone:
+    has_unstable = any(frequency.omega2 < 0 for frequency in frequencies)
+    if hertz_per_root:
+        axes.set(ylabel="frequency  (Hz)" + ("; below zero it grows" if has_unstable else ""))
+    else:
+        axes.set(ylabel=r"$\omega^2 \rho R^2/E$")
+    if is_one_point:
+        axes.set(xlabel="waves around the axis" if over_waves else "number of the mode")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    else:
+        axes.set(xlabel=column.label if column else "")
     if waves not in ([""], ["waves"]):
         figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
     return figure
+
+
+def _hertz_per_root(frequencies: Sequence[Frequency]) -> float:
+    """Return the frequency in Hz of omega2 = 1; 0 without a density."""
+    return max(
+        (
+            frequency.hertz / np.sqrt(frequency.omega2)
+            for frequency in frequencies
+            if frequency.omega2 > 0 and not np.isnan(frequency.hertz)
+        ),
+        default=0.0,
+    )

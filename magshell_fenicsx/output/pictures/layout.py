@@ -1,5 +1,6 @@
-"""Figures of panels: images of shells with outlines, arrows, colour bars and the directions of e1,
-e2, e3.
+"""Layout of figures: panels with images of shells, outlines, arrows and colour bars, in inches.
+
+The directions of e1, e2, e3 are drawn once in a figure.
 """
 
 import io
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window, axes_on_screen
 from magshell_fenicsx.output.pictures.scales import Scale, colour_bar
-from magshell_fenicsx.output.pictures.view import Camera, Image, Window, axes_on_screen
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -22,18 +23,29 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 Pen = tuple[str, str]
 INCH = 25.4  # mm
-ONE, SEVERAL = 90.0, 180.0  # default widths in mm: one and two columns of a journal
+ONE_COLUMN, TWO_COLUMNS = 90.0, 180.0  # mm: default widths, of a journal
 GAP = 4.0  # mm between panels
-HEAD = 0.012  # around the ends of arrows, over a panel's width
-LONG = 0.08  # an arrow of this length over a panel's width has the full thickness
-LINE = 1.45 / 72  # height of a line of text in inches, for each point of the font
-LETTER = 0.6  # room of a letter beside the directions
-LEVEL = 3  # files are a quarter larger than by default and take a third of the time
+ARROW_MARGIN = 0.012  # around the ends of arrows, over a panel's width
+FULL_ARROW_LENGTH = 0.08  # over a panel's width: a longer arrow has the full thickness
+LINE_HEIGHT = 1.45 / 72  # inches of a line of text, for each point of the font
+LETTER_WIDTH = 0.47  # of the font
+LETTER_DISTANCE = 0.6  # least distance of letters at the directions
+MAX_SLOPE_TO_EYE = 0.3  # length in the picture over the length, of an arrow drawn as a point
+MIN_DIRECTION = 0.05  # length in the picture of a direction that is no point
+COMPRESSION_LEVEL = 3  # PNG files are a quarter larger than by default and take a third of the time
 
 
 @dataclass(frozen=True)
 class Arrow:
-    """Arrows in a panel: feet and vectors (n, 3) as the camera projects them, colour, name."""
+    """Arrows of one field in a panel.
+
+    Attributes
+    ----------
+    feet, vectors
+        (n, 3) as the camera projects them.
+    colour, name
+        Of all of them.
+    """
 
     feet: Array
     vectors: Array
@@ -52,7 +64,7 @@ class Panel:
     texts
         Places in the projection, and letters there.
     names
-        The same of names of shells.
+        Places in the projection, and names of shells there.
     """
 
     image: Image
@@ -66,120 +78,130 @@ class Panel:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """(left, right, low, high) of what is drawn: the window, and arrows that leave it."""
+        """Box (left, right, low, high) of the window, and of arrows that leave it."""
         left, right, low, high = self.window.box
         if not any(len(arrows.feet) for arrows in self.arrows):
             return self.window.box
-        x, y = np.concatenate(
-            [p[:, :2] for a in self.arrows for p in (a.feet, a.feet + a.vectors)]
-        ).T
-        spare = HEAD * (right - left)
+        ends = list[Array]()
+        for arrows in self.arrows:
+            ends += [arrows.feet[:, :2], (arrows.feet + arrows.vectors)[:, :2]]
+        x, y = np.concatenate(ends).T
+        margin = ARROW_MARGIN * (right - left)
         return (
-            min(left, x.min() - spare),
-            max(right, x.max() + spare),
-            min(low, y.min() - spare),
-            max(high, y.max() + spare),
+            min(left, x.min() - margin),
+            max(right, x.max() + margin),
+            min(low, y.min() - margin),
+            max(high, y.max() + margin),
         )
 
     @property
     def size(self) -> tuple[float, float]:
-        """Height and width in pixels, the width that of the image."""
+        """Height and width in pixels; the width is that of the image."""
         left, right, low, high = self.frame
         width = self.image.shape[1]
         return width * (high - low) / (right - left), width
 
 
 def drawing(style: OutputSection) -> AbstractContextManager[None]:
-    """Matplotlib's settings while a figure is made and written: text stays text in svg and pdf."""
+    """Return a context with matplotlib's settings while a figure is made and written.
+
+    Text stays text in svg and pdf.
+    """
     import matplotlib
 
     size = style.font_size
-    own: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "font.size": size,
         "axes.labelsize": size,
         "axes.titlesize": size,
         "legend.fontsize": size,
     }
-    own |= {"xtick.labelsize": 0.9 * size, "ytick.labelsize": 0.9 * size, "axes.linewidth": 0.6}
-    own |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
-    return matplotlib.rc_context(own)
+    settings |= {
+        "xtick.labelsize": 0.9 * size,
+        "ytick.labelsize": 0.9 * size,
+        "axes.linewidth": 0.6,
+    }
+    settings |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
+    return matplotlib.rc_context(settings)
 
 
 def columns(panels: int) -> int:
-    """The number of panels beside each other, of so many."""
-    return panels if panels < 4 else 2 if panels == 4 else 3
+    """Return how many of so many panels are in a row."""
+    if panels == 4:
+        return 2
+    return min(panels, 3)
 
 
-def panel_width(style: OutputSection, beside: int) -> int:
-    """The width of a panel's image in pixels, of so many panels beside each other."""
-    width = style.width or (ONE if beside == 1 else SEVERAL)
-    return max(int((width / beside - GAP) / INCH * style.dpi), 50)
+def panel_width(style: OutputSection, panels_per_row: int) -> int:
+    """Return the width of a panel's image in pixels, of so many panels in a row."""
+    width = style.width or (ONE_COLUMN if panels_per_row == 1 else TWO_COLUMNS)
+    return max(int((width / panels_per_row - GAP) / INCH * style.dpi), 50)
 
 
 def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "") -> "Figure":
-    """Panels in rows, each above its colour bar; the directions once; a note at the foot."""
+    """Return panels in rows, each above its colour bar; the directions once; a note at the foot."""
     from matplotlib.figure import Figure
 
-    across, line = columns(len(panels)), LINE * style.font_size
-    rows = -(-len(panels) // across)
+    per_row, line = columns(len(panels)), LINE_HEIGHT * style.font_size
+    rows = -(-len(panels) // per_row)
     gap, dpi = GAP / INCH, style.dpi
-    tall, wide = (max(size) / dpi for size in zip(*(panel.size for panel in panels), strict=True))
-    wide += gap
-    barred = any(panel.scale.colours for panel in panels)
-    below = (4.2 if barred else 0.4) * line
+    heights, widths = zip(*(panel.size for panel in panels), strict=True)
+    image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
+    has_bar = any(panel.scale.colours for panel in panels)
+    below = (4.2 if has_bar else 0.4) * line
     legend = max((sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0)
     above = gap / 2 + legend * line
-    beside = (
-        barred and across < 3
-    )  # the directions stand beside the first bar, else in a free panel or at the foot
-    free = 0 if beside else len(panels) % across
-    indent = gap / 2 + (0.0 if beside or free else 4.0 * line)
-    notes = _wrapped(note, wide * across - indent - gap / 2, style.font_size)
-    foot = max(len(notes) * line, 0.0 if beside or free else 3.2 * line)
-    height = rows * (tall + below + above) + foot
-    figure = Figure(figsize=(wide * across, height), dpi=dpi)
-    boxes = Boxes(figure)
+    cell_height = image_height + below + above
+
+    # the directions are beside the first bar, else in a free panel or at the foot
+    beside_bar = has_bar and per_row < 3
+    free_panels = 0 if beside_bar else len(panels) % per_row
+    at_foot = not beside_bar and not free_panels
+    indent = gap / 2 + (4.0 * line if at_foot else 0.0)
+    notes = _wrapped(note, cell_width * per_row - indent - gap / 2, style.font_size)
+    foot = max(len(notes) * line, 3.2 * line if at_foot else 0.0)
+    height = rows * cell_height + foot
+    figure = Figure(figsize=(cell_width * per_row, height), dpi=dpi)
+    boxes = FigureBoxes(figure)
     for i, panel in enumerate(panels):
-        left, low = i % across * wide, height - (i // across + 1) * (tall + below + above)
-        h, w = (n / dpi for n in panel.size)
-        start = left + (wide - w) / 2
-        draw_panel(boxes.axes(start, low + below + (tall - h) / 2, w, h), panel, style)
+        left, low = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
+        panel_height, width = (pixels / dpi for pixels in panel.size)
+        start = left + (cell_width - width) / 2
+        panel_low = low + below + (image_height - panel_height) / 2
+        draw_panel(boxes.axes(start, panel_low, width, panel_height), panel, style)
         for k, arrows in enumerate(panel.arrows):
-            y = low + below + tall + above - gap / 2 - (k + 0.5) * line
-            figure.text(
-                *boxes.place(left + gap / 2, y), arrows.name, color=arrows.colour, va="center"
-            )
+            y = low + below + image_height + above - gap / 2 - (k + 0.5) * line
+            place = boxes.place(left + gap / 2, y)
+            figure.text(*place, arrows.name, color=arrows.colour, va="center")
         if panel.scale.colours:
-            spare = (4.4 if beside else 2.2) * line  # a power of ten needs the other side
-            reach = max(wide - gap - spare - 3.2 * line, 3 * line)
-            bar = boxes.axes(left + gap / 2 + spare, low + 1.7 * line, reach, 0.65 * line)
-            colour_bar(figure, bar, panel.scale, room=reach + (0.8 if beside else 2 * 2.2) * line)
-    size, low = 3.4 * line, height - (tall + below + above) if beside else foot
-    low += -3.3 * line if not beside and not free else 0.4 * line
-    directions(boxes.axes(free * wide + gap / 2, low, size, size), panels[0].camera, style)
+            spare = (4.4 if beside_bar else 2.2) * line  # a power of ten needs the other side
+            length = max(cell_width - gap - spare - 3.2 * line, 3 * line)
+            bar = boxes.axes(left + gap / 2 + spare, low + 1.7 * line, length, 0.65 * line)
+            room = length + (0.8 if beside_bar else 2 * 2.2) * line
+            colour_bar(figure, bar, panel.scale, room=room)
+    size, low = 3.4 * line, height - cell_height if beside_bar else foot
+    low += -3.3 * line if at_foot else 0.4 * line
+    box = boxes.axes(free_panels * cell_width + gap / 2, low, size, size)
+    directions(box, panels[0].camera, style)
     for k, text in enumerate(reversed(notes)):
-        figure.text(
-            *boxes.place(indent, (k + 0.5) * line),
-            text,
-            va="center",
-            fontsize=0.9 * style.font_size,
-        )
+        place = boxes.place(indent, (k + 0.5) * line)
+        figure.text(*place, text, va="center", fontsize=0.9 * style.font_size)
     return figure
 
 
 @dataclass(frozen=True)
-class Boxes:
-    """Places in inches from the lower left of a figure."""
+class FigureBoxes:
+    """Boxes in inches from the lower left of a figure."""
 
     figure: "Figure"
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        """In the figure's own coordinates."""
-        wide, tall = self.figure.get_size_inches()
-        return x / wide, y / tall
+        """Return a place in the figure's own coordinates, from 0 to 1."""
+        width, height = self.figure.get_size_inches()
+        return x / width, y / height
 
     def axes(self, left: float, low: float, width: float, height: float) -> "Axes":
-        """Axes in a box."""
+        """Return new axes in a box."""
         return self.figure.add_axes((*self.place(left, low), *self.place(width, height)))
 
 
@@ -188,11 +210,11 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
     from matplotlib.patheffects import withStroke
 
     left, right, low, high = panel.frame
-    same = panel.frame == panel.window.box  # pixel by pixel
+    is_whole_image = panel.frame == panel.window.box  # then it is drawn pixel by pixel
     axes.imshow(
         panel.image,
         extent=panel.window.box,
-        interpolation="none" if same else "antialiased",
+        interpolation="none" if is_whole_image else "antialiased",
         aspect="auto",
     )
     for line, (grey, dashes) in panel.lines:
@@ -211,7 +233,7 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
             fontsize=0.9 * style.font_size,
         )
     for x, y, name in panel.names:
-        around = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
+        halo = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
         axes.text(
             x,
             y,
@@ -220,26 +242,28 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
             va="center",
             color="0.1",
             fontsize=0.9 * style.font_size,
-            path_effects=around,
+            path_effects=halo,
         )
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
 
 
 def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSection) -> None:
-    """In the plane of the picture; what points to the eye is a dot in a circle, what points away a
-    cross in it.
+    """Draw arrows in the plane of the picture.
+
+    An arrow that points to the eye is a dot in a circle, one that points away a cross in it.
     """
-    flat, length = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
-    along = np.linalg.norm(flat, axis=1) < 0.3 * length
+    in_picture, lengths = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
+    is_point = np.linalg.norm(in_picture, axis=1) < MAX_SLOPE_TO_EYE * lengths
     x, y = arrows.feet[:, :2].T
-    thin = min(1.0, float(np.linalg.norm(flat, axis=1).max(initial=0.0)) / (LONG * extent))
+    longest = float(np.linalg.norm(in_picture, axis=1).max(initial=0.0))
+    thinness = min(1.0, longest / (FULL_ARROW_LENGTH * extent))
     axes.quiver(
-        *(x[~along], y[~along], *flat[~along].T),
+        *(x[~is_point], y[~is_point], *in_picture[~is_point].T),
         angles="xy",
         scale_units="xy",
         scale=1,
-        width=0.006 * thin,
+        width=0.006 * thinness,
         minlength=0,
         zorder=4,
         clip_on=False,
@@ -250,14 +274,19 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
     )
     size = (0.9 * style.font_size) ** 2
     axes.scatter(
-        x[~along], y[~along], s=size / 9 * thin**2, color=arrows.colour, zorder=4, linewidths=0
+        x[~is_point],
+        y[~is_point],
+        s=size / 9 * thinness**2,
+        color=arrows.colour,
+        zorder=4,
+        linewidths=0,
     )
-    for inside, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
-        at = along & inside
-        if at.any():
+    for is_selected, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
+        points = is_point & is_selected
+        if points.any():
             axes.scatter(
-                x[at],
-                y[at],
+                x[points],
+                y[points],
                 s=size,
                 facecolors="white",
                 edgecolors=arrows.colour,
@@ -265,8 +294,8 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
                 zorder=5,
             )
             axes.scatter(
-                x[at],
-                y[at],
+                x[points],
+                y[points],
                 s=size / 3,
                 color=arrows.colour,
                 marker=marker,
@@ -287,59 +316,61 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
         "lw": 0.7,
         "mutation_scale": style.font_size * 0.8,
     }
-    written = list[Array]()
+    letters = list[Array]()
     for number, (x, y) in enumerate(zip(*(0.9 * on_screen).T, strict=True), 1):
         size = float(np.hypot(x, y))
-        if size < 0.05:  # it points to the eye, or away
+        if size < MIN_DIRECTION:  # it points to the eye, or away
             axes.plot(0, 0, "k.", ms=0.4 * style.font_size)
             x, y, size = -0.35, -0.35, 0.5
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
-        written.append(_beside(np.array([x, y]), size, written))
+        letters.append(_letter_place(np.array([x, y]), size, letters))
         axes.text(
-            float(written[-1][0]), float(written[-1][1]), f"$e_{number}$", ha="center", va="center"
+            float(letters[-1][0]), float(letters[-1][1]), f"$e_{number}$", ha="center", va="center"
         )
 
 
-def _beside(end: Array, size: float, others: Sequence[Array]) -> Array:
-    """Where the letter of an arrow stands: ahead of its end, or beside it if another letter is
-    there.
+def _letter_place(end: Array, size: float, others: Sequence[Array]) -> Array:
+    """Return the place (2,) of the letter of an arrow.
+
+    It is ahead of the arrow's end, or beside it if another letter is there.
     """
-    ahead, across = 0.4 * end / size, LETTER * np.array([-end[1], end[0]]) / size
-    places = [end + ahead, end + across, end - across]
-    free = [
-        place for place in places if all(np.linalg.norm(place - other) > LETTER for other in others)
-    ]
-    return np.asarray((free or places)[0])
+    forward, sideways = 0.4 * end / size, LETTER_DISTANCE * np.array([-end[1], end[0]]) / size
+    places = [end + forward, end + sideways, end - sideways]
+    for place in places:
+        if all(np.linalg.norm(place - other) > LETTER_DISTANCE for other in others):
+            return np.asarray(place)
+    return np.asarray(places[0])
 
 
 def _wrapped(text: str, inches: float, size: float) -> list[str]:
+    """Return a text in lines that fit a width, with letters of a size in points."""
     import textwrap
 
-    return textwrap.wrap(text, max(int(inches * 72 / (0.47 * size)), 20)) if text else []
+    return textwrap.wrap(text, max(int(inches * 72 / (LETTER_WIDTH * size)), 20)) if text else []
 
 
-def written(figure: "Figure", style: OutputSection, name: str) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of a figure's files: PNG and the further formats."""
+def figure_files(figure: "Figure", style: OutputSection, name: str) -> Iterator[tuple[str, bytes]]:
+    """Yield names and contents of a figure's files: PNG and the further formats."""
     with drawing(style):
         yield f"{name}.png", png(figure)
     for kind in dict.fromkeys(kind for kind in style.formats if kind != "png"):
         content = io.BytesIO()
         with drawing(style):
-            figure.savefig(content, format=kind, dpi=style.dpi, metadata={_DATE[kind]: None})
+            figure.savefig(content, format=kind, dpi=style.dpi, metadata={DATE_KEYS[kind]: None})
         yield f"{name}.{kind}", content.getvalue()
 
 
-_DATE = {"svg": "Date", "pdf": "CreationDate"}
+DATE_KEYS = {"svg": "Date", "pdf": "CreationDate"}  # of metadata
 
 
 def png(figure: "Figure") -> bytes:
-    """A PNG file, without the fourth channel that Matplotlib writes."""
+    """Return the content of a PNG file, without the fourth channel that Matplotlib writes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Pillow
 
     canvas, content = FigureCanvasAgg(figure), io.BytesIO()
     canvas.draw()
     colours = Pillow.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    colours.save(content, "PNG", dpi=(figure.dpi, figure.dpi), compress_level=LEVEL)
+    colours.save(content, "PNG", dpi=(figure.dpi, figure.dpi), compress_level=COMPRESSION_LEVEL)
     return content.getvalue()

@@ -1,5 +1,5 @@
-"""What a curve consists of, for pictures and the report alike: steps, lines of points, and how
-points are joined.
+"""Curves of a run as data, for pictures and the report alike: steps, lines of points, smooth
+curves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,25 @@ from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, s
 from magshell_fenicsx.quantities.registry import amplitude as registered
 
 Array = NDArray[np.float64]
-FINE = 16  # drawn segments between two points
-STEEPEST = 3.0  # slope of a curve at a point over the lesser one of the chords there
+SEGMENTS_PER_INTERVAL = 16  # drawn between two points
+MAX_SLOPE_RATIO = 3.0  # slope of a curve at a point over the lesser one of the chords there
+MIN_CHORD = 1e-12  # scaled; a shorter one counts as this
 
 
 @dataclass(frozen=True)
-class Part:
-    """The rows in which an amplitude varied, with the one before them, and the numbers of its
-    instabilities.
+class CurveStep:
+    """Step of a path that is drawn as one curve.
+
+    Attributes
+    ----------
+    amplitude
+        The amplitude that varied.
+    rows
+        Its rows of path.csv, after the row before the step.
+    title
+        Title of the curve.
+    numbers
+        Number of a point -> number of its instability.
     """
 
     amplitude: str
@@ -32,57 +43,60 @@ class Part:
     numbers: Mapping[int, int] = field(default_factory=dict)
 
 
-def numbered(rows: Sequence[Row]) -> dict[int, int]:
-    """Point -> number of its instability, from 1 along path.csv; so they are numbered in all
-    pictures and tables.
+def instability_numbers(rows: Sequence[Row]) -> dict[int, int]:
+    """Return point -> number of its instability, from 1 along path.csv.
+
+    So instabilities are numbered in all pictures and tables.
     """
-    return {
-        int(row["point"]): n
-        for n, row in enumerate((row for row in rows if row["label"] in LOCATED), 1)
-    }
+    located = [row for row in rows if row["label"] in LOCATED]
+    return {int(row["point"]): number for number, row in enumerate(located, 1)}
 
 
-def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
-    """The steps of a programme, or the last part in which the amplitude varied."""
+def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
+    """Return the steps of a programme, or the last part in which the amplitude varied."""
     steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
+    numbers = instability_numbers(rows)
     if len(steps) < 2:
-        return [Part(amplitude, varied(rows, amplitude), "", numbered(rows))]
-    parts = []
+        return [CurveStep(amplitude, last_varied_rows(rows, amplitude), "", numbers)]
+    curves = []
     for step in steps:
         first = next(i for i, row in enumerate(rows) if row["step"] == step)
-        before = max((i for i in range(first) if rows[i]["branch"] == 0), default=0)
-        within = [row for row in rows[first:] if row["step"] == step]
-        name = str(within[0]["amplitude"])
-        varying = quantity(registered(name).column).words
-        parts.append(Part(name, [rows[before], *within], f"step {step}: {varying}", numbered(rows)))
-    return parts
+        previous = max((i for i in range(first) if rows[i]["branch"] == 0), default=0)
+        rows_of_step = [row for row in rows[first:] if row["step"] == step]
+        name = str(rows_of_step[0]["amplitude"])
+        words = quantity(registered(name).column).words
+        title = f"step {step}: {words}"
+        curves.append(CurveStep(name, [rows[previous], *rows_of_step], title, numbers))
+    return curves
 
 
-def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
-    """The last part of a path in which an amplitude varied."""
+def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
+    """Return the last part of a path in which an amplitude varied."""
+    if amplitude == "lambda_m":
+        return rows
     first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
-    return rows[0 if amplitude == "lambda_m" else first :]
+    return rows[first:]
 
 
-def axes_for(part: Part) -> tuple[Quantity, Quantity]:
-    """The quantities on the x and the y axis of a part's curve."""
-    x, y = axes_of(part.amplitude, part.rows[0])
-    if part.amplitude == "load" and all(
-        row["w_over_h"] == row["w_pole_over_h"] for row in part.rows
-    ):
-        x = shown_quantity("w_pole_over_h", part.rows[0])  # moments have no conjugate displacement
+def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
+    """Return the quantities on the x and the y axis of a step's curve."""
+    x, y = axes_of(step.amplitude, step.rows[0])
+    is_at_pole = all(row["w_over_h"] == row["w_pole_over_h"] for row in step.rows)
+    if step.amplitude == "load" and is_at_pole:
+        x = shown_quantity("w_pole_over_h", step.rows[0])  # moments have no conjugate displacement
     return x, y
 
 
-def place(row: Row, amplitude: str) -> tuple[float, float]:
-    """The coordinates of a point in the curve's axes."""
+def curve_coordinates(row: Row, amplitude: str) -> tuple[float, float]:
+    """Return the coordinates of a point in the axes of its curve."""
     x, y = axes_of(amplitude, row)
     return x.on_axis(row), y.on_axis(row)
 
 
-def named(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
-    """A quantity whose words name the point of `w_pole_over_h`; `dollar` stands for that sign in
-    the name.
+def with_point_name(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
+    """Return a quantity whose words name the point of `w_pole_over_h`.
+
+    `dollar` replaces that sign in the name.
     """
     name = pole_name(row, pole).replace("$", dollar)
     return replace(
@@ -91,10 +105,16 @@ def named(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> 
 
 
 def is_unstable(row: Row) -> bool:
-    """Whether the model, or a mode that it excludes, is unstable; an earlier path.csv has no
-    excluded_pivots.
+    """Whether the model, or a mode that it excludes, is unstable.
+
+    A path.csv of an earlier version has no excluded_pivots.
     """
-    return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
+    return _unstable_count(row) > 0
+
+
+def _unstable_count(row: Row) -> int:
+    """Return the number of unstable directions, also of modes that the model excludes."""
+    return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0))
 
 
 @dataclass(frozen=True)
@@ -106,7 +126,7 @@ class Line:
     in_time
         Whether the points are those of a motion, joined by a spline over the time.
     amplitude
-        That of its curve.
+        The amplitude of the curve.
     """
 
     rows: Sequence[Row]
@@ -115,88 +135,91 @@ class Line:
 
     @property
     def unstable(self) -> list[bool]:
-        """Whether each of the segments between the rows is: as its end, or if that is located as
-        its beginning.
+        """Whether each segment between two rows is unstable.
 
-        Between two located rows the number of unstable directions is that of a row, or one more, at
-        both.
+        A segment is as its end, or if that is located as its beginning. Between two located rows
+        the number of unstable directions is that of a row, or one more, at both.
         """
-        of_segments: list[bool] = []
+        are_unstable: list[bool] = []
         for first, last in pairwise(self.rows):
-            rows = [row for row in (last, first) if row["label"] not in LOCATED]
-            a, b = (
-                int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0))
-                for row in (first, last)
-            )
-            between = {a, a + 1} & {b, b + 1}
-            alternates = not (of_segments and of_segments[-1])
-            of_segments.append(
-                is_unstable(rows[0]) if rows else min(between, default=0) > 0 or alternates
-            )
-        return of_segments
+            not_located = [row for row in (last, first) if row["label"] not in LOCATED]
+            if not_located:
+                are_unstable.append(is_unstable(not_located[0]))
+                continue
+            first_count, last_count = _unstable_count(first), _unstable_count(last)
+            possible_counts = {first_count, first_count + 1} & {last_count, last_count + 1}
+            alternates = not (are_unstable and are_unstable[-1])
+            are_unstable.append(min(possible_counts, default=0) > 0 or alternates)
+        return are_unstable
 
     @property
-    def pieces(self) -> list[tuple[int, int, bool]]:
-        """The first and the last row of each part that is stable or unstable, and whether it is
-        unstable.
-        """
+    def segments(self) -> list[tuple[int, int, bool]]:
+        """First and last row of each stable or unstable part, and whether it is unstable."""
         parts = []
-        for unstable, group in groupby(enumerate(self.unstable), key=lambda each: each[1]):
+        for unstable, group in groupby(enumerate(self.unstable), key=lambda item: item[1]):
             numbers = [i for i, _ in group]
             parts.append((numbers[0], numbers[-1] + 1, unstable))
         return parts
 
     @property
     def level(self) -> list[int]:
-        """Its ends, 0 and -1, at which its amplitude has an extreme: a fold in that."""
+        """Ends of the line, 0 and -1, at which its amplitude has an extreme: a fold in it."""
+        fold = "fold", self.amplitude
         return [
-            i
-            for i in (0, -1)
-            if (self.rows[i]["label"], self.rows[i]["amplitude"]) == ("fold", self.amplitude)
+            end for end in (0, -1) if (self.rows[end]["label"], self.rows[end]["amplitude"]) == fold
         ]
 
-    def joined(
-        self, x: Sequence[float], y: Sequence[float], *, of_load: int | None = None
+    def smooth_curve(
+        self, x: Sequence[float], y: Sequence[float], *, load_axis: int | None = None
     ) -> Array:
-        """A smooth curve (2, FINE (n - 1) + 1) through coordinates of its rows.
+        """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through coordinates of its n
+        rows.
 
         Parameters
         ----------
-        of_load
-            Which of the coordinates is its amplitude, 0 or 1; None if none is.
+        x, y
+            (n,) coordinates of the rows.
+        load_axis
+            Which of the coordinates is the amplitude, 0 or 1; None if none is.
         """
         if self.in_time:
-            return splined(x, y, [float(row["time"]) for row in self.rows])
-        level = [] if of_load is None else [(of_load, end) for end in self.level]
+            return spline_curve(x, y, [float(row["time"]) for row in self.rows])
+        level = [] if load_axis is None else [(load_axis, end) for end in self.level]
         return smooth(x, y, [row["label"] in LOCATED for row in self.rows], level)
 
 
-def line_coordinates(part: Part) -> list[Line]:
-    """The branches of a part of a path, in their order."""
-    path = [row for row in part.rows if row["label"] != SOLUTION]
-    in_time = part.amplitude == "time"
+def line_coordinates(step: CurveStep) -> list[Line]:
+    """Return the lines of a step: its branches, in their order."""
+    path = [row for row in step.rows if row["label"] != SOLUTION]
+    in_time = step.amplitude == "time"
     branches = sorted({int(row["branch"]) for row in path})
-    of_branches = [
-        _line([row for row in path if row["branch"] == b], part.amplitude) for b in branches
-    ]
-    return [Line(rows, in_time, part.amplitude) for rows in of_branches]
+    lines = []
+    for branch in branches:
+        rows = _line([row for row in path if row["branch"] == branch], step.amplitude)
+        lines.append(Line(rows, in_time, step.amplitude))
+    return lines
 
 
 def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
-    """The rows of a branch along its curve: those of the model, and what the model excludes at its
-    end.
+    """Return the rows of a branch along its curve.
+
+    They are those of the model, and a symmetry-breaking instability at its end.
     """
-    own = [row for row in rows if row["mode"] in OWN_MODES]
-    last, before = (place(row, amplitude) for row in (own[-1], own[max(len(own) - 2, 0)]))
-    beyond = [row for row in rows[-1:] if row not in own and row["label"] in LOCATED]
-    ahead = np.subtract(last, before)
-    return own + [
-        row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0
-    ]
+    rows_of_model = [row for row in rows if row["mode"] in OWN_MODES]
+    last = curve_coordinates(rows_of_model[-1], amplitude)
+    previous = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
+    at_end = [row for row in rows[-1:] if row not in rows_of_model and row["label"] in LOCATED]
+    direction = np.subtract(last, previous)
+    line = list(rows_of_model)
+    for row in at_end:
+        step = np.subtract(curve_coordinates(row, amplitude), last)
+        if np.dot(step, direction) > 0:
+            line.append(row)
+    return line
 
 
-def of_load(amplitude: str) -> int:
-    """Which coordinate of its curve an amplitude is."""
+def load_axis(amplitude: str) -> int:
+    """Return which coordinate of its curve an amplitude is: 0 or 1."""
     return 0 if registered(amplitude).sideways else 1
 
 
@@ -206,15 +229,17 @@ def smooth(
     located: Sequence[bool] = (),
     level: Sequence[tuple[int, int]] = (),
 ) -> Array:
-    """A smooth curve (2, FINE (n - 1) + 1) through n points; the parameter is the root of the
-    scaled chord.
+    """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through n points.
 
-    Cubics with the slopes of parabolas through three points, limited so that what rises from point
-    to point rises (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). What turns between two
-    points turns smoothly there, what turns at a located point turns at it.
+    The parameter is the root of the scaled chord. The curve consists of cubics with the slopes of
+    parabolas through three points, limited so that what rises from point to point rises (Fritsch
+    and Carlson, SIAM J. Numer. Anal. 17, 1980). What turns between two points turns smoothly there,
+    what turns at a located point turns at it.
 
     Parameters
     ----------
+    x, y
+        (n,) coordinates of the points.
     located
         Whether each point is a fold or a bifurcation, where a coordinate that turns has its
         extreme.
@@ -226,61 +251,77 @@ def smooth(
     if xy.shape[1] == 1:
         return xy
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
-    chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, 1e-12)))])
-    ends = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
-    slopes = np.array([_slopes(chord, values, ends) for values in xy])
+    chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, MIN_CHORD)))])
+    is_located = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
+    slopes = np.array([_slopes(chord, values, is_located) for values in xy])
     for coordinate, end in level:
         slopes[coordinate, end] = 0.0
-    t, h, rise = np.arange(FINE) / FINE, np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
+    t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
+    h, rise = np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
     first, last = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
-    curve = xy[:, :-1, None] + t * (
-        first + t * (3 * rise - 2 * first - last + t * (first + last - 2 * rise))
-    )
+    quadratic, cubic = 3 * rise - 2 * first - last, first + last - 2 * rise
+    curve = xy[:, :-1, None] + t * (first + t * (quadratic + t * cubic))
     return np.concatenate([curve.reshape(2, -1), xy[:, -1:]], axis=1)
 
 
 def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
-    """The derivatives (n,) of values over a parameter at n points."""
+    """Return the derivatives (n,) of values over a parameter at n points."""
     h, chords = np.diff(t), np.diff(values) / np.diff(t)
     if len(chords) == 1:
         return np.full(2, chords[0])
-    before, after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
-    most = STEEPEST * np.abs(chords)
-    most[1:-1][chords[:-2] * chords[2:] < 0] = np.inf  # it turns between these two points
-    steepest = np.minimum(most[:-1], most[1:])
-    inner = np.clip((h2 * before + h1 * after) / (h1 + h2), -steepest, steepest)
-    inner[located[1:-1] & (before * after < 0)] = 0.0
-    ends = [_end(h[0], h[1], chords[0], chords[1]), _end(h[-1], h[-2], chords[-1], chords[-2])]
+    chords_before, chords_after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
+    limits = MAX_SLOPE_RATIO * np.abs(chords)
+    limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf  # it turns between these two points
+    max_slopes = np.minimum(limits[:-1], limits[1:])
+    inner = np.clip((h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes)
+    inner[located[1:-1] & (chords_before * chords_after < 0)] = 0.0
+    ends = [
+        _end_slope(h[0], h[1], chords[0], chords[1]),
+        _end_slope(h[-1], h[-2], chords[-1], chords[-2]),
+    ]
     return np.concatenate([ends[:1], inner, ends[1:]])
 
 
-def _end(h1: float, h2: float, first: float, second: float) -> float:
-    """The slope at an end: that of a parabola through three points, or none, or STEEPEST times the
-    chord's.
+def _end_slope(h1: float, h2: float, first: float, second: float) -> float:
+    """Return the slope at an end: that of a parabola through three points, limited.
+
+    It is zero if its sign is not that of the first chord, and at most MAX_SLOPE_RATIO times its
+    slope.
+
+    Parameters
+    ----------
+    h1, h2
+        Lengths of the first two intervals.
+    first, second
+        Slopes of their chords.
     """
     slope = ((2 * h1 + h2) * first - h1 * second) / (h1 + h2)
     if slope * first <= 0:
         return 0.0
-    return float(np.clip(slope, -STEEPEST * abs(first), STEEPEST * abs(first)))
+    return float(np.clip(slope, -MAX_SLOPE_RATIO * abs(first), MAX_SLOPE_RATIO * abs(first)))
 
 
-def splined(x: Sequence[float], y: Sequence[float], t: Sequence[float]) -> Array:
-    """The same by cubic splines over the time: with four points a period a vibration keeps its
-    form.
+def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[float]) -> Array:
+    """Return a smooth curve by cubic splines over the time, see `smooth`.
 
-    Equal times, such as those of the point before a motion and of its first, are joined straight.
+    With four points a period a vibration keeps its form. Equal times, such as those of the point
+    before a motion and of its first, are joined straight.
     """
-    xy, times = np.array([x, y], float), np.array(t, float)
-    later = np.concatenate([[True], np.diff(times) > 0])
-    if later.sum() < 4 or not later[2:].all():
+    xy, times = np.array([x, y], float), np.array(point_times, float)
+    is_later = np.concatenate([[True], np.diff(times) > 0])
+    if is_later.sum() < 4 or not is_later[2:].all():
         return smooth(x, y)
-    fine = _fine(times)
-    curve = np.asarray(scipy.interpolate.CubicSpline(times[later], xy[:, later], axis=1)(fine))
-    if not later[1]:
-        curve[:, : FINE + 1] = np.linspace(xy[:, 0], xy[:, 1], FINE + 1).T
+    refined_times = _refined(times)
+    spline = scipy.interpolate.CubicSpline(times[is_later], xy[:, is_later], axis=1)
+    curve = np.asarray(spline(refined_times))
+    if not is_later[1]:
+        count = SEGMENTS_PER_INTERVAL + 1
+        curve[:, :count] = np.linspace(xy[:, 0], xy[:, 1], count).T
     return curve
 
 
-def _fine(at: Array) -> Array:
-    """FINE equal steps between every two values."""
-    return np.interp(np.arange(FINE * (len(at) - 1) + 1) / FINE, np.arange(len(at)), at)
+def _refined(values: Array) -> Array:
+    """Return values with SEGMENTS_PER_INTERVAL equal steps between every two of them."""
+    count = SEGMENTS_PER_INTERVAL * (len(values) - 1) + 1
+    positions = np.arange(count) / SEGMENTS_PER_INTERVAL
+    return np.interp(positions, np.arange(len(values)), values)

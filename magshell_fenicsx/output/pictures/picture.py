@@ -10,15 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import SHELL, Surface
-from magshell_fenicsx.output.fields.tessellation import tessellated
-from magshell_fenicsx.output.pictures.beside import Beside, bare_outlines, far_said, near_places
+from magshell_fenicsx.output.fields.tessellation import tessellate
+from magshell_fenicsx.output.pictures.bodies_and_magnets import (
+    BodiesInView,
+    bare_outlines,
+    far_bodies_note,
+    near_places,
+)
 from magshell_fenicsx.output.pictures.colours import (
-    Coloured,
+    ColouredField,
     contact,
     contact_region,
     loads,
     moments,
-    pressure_said,
+    pressure_note,
     shell,
     strains,
     stretches,
@@ -31,70 +36,80 @@ from magshell_fenicsx.output.pictures.layout import (
     panel_width,
     panels_figure,
 )
+from magshell_fenicsx.output.pictures.rendering import Camera, Image, RenderedSurface, Window
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
-from magshell_fenicsx.output.pictures.view import Camera, Image, InView, Window
-from magshell_fenicsx.problem.wanted import OutputSection
+from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-NAMED = ("", "w_over_h")  # layers with the names of shells
+FIELDS_WITH_NAMES = ("", "w_over_h")  # names of fields whose pictures name the shells
 GREY = 0.93  # of a surface without colours
-NONE_BEYOND = 0.01  # of a bar: values no farther beyond its ends are those of the ends
+END_TOLERANCE = 0.01  # of a bar's length: values no farther beyond its ends are those of the ends
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
-# pixels between the outlines of the undeformed and of the deformed shell; nearer the former is no
-# news
-SEEN_APART = 2.0
-CRUMB = 40.0  # pixels: what is left of that outline is longer
-SAME_PLACE = 1e-7  # over R
-DIVISION = 8  # of a line between two nodes
+MIN_OUTLINE_DISTANCE = 2.0  # pixels, of the drawn undeformed outline from the deformed one
+MIN_OUTLINE_LENGTH = 40.0  # pixels, of drawn parts of the undeformed outline
+SAME_PLACE_TOLERANCE = 1e-7  # over R
+DEPTH_TOLERANCE = 2.0  # pixels: depth below the surface at which lines are visible
+ARROW_DEPTH_TOLERANCE = 0.03  # over the shell's extent, at which places of arrows are visible
+SEGMENTS_PER_INTERVAL = 8  # of a line between two nodes
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a picture shows, what it says at its foot, and the places (n, 3) around which it is;
-    None: all.
+    """Content of a picture.
+
+    Attributes
+    ----------
+    layers
+        One field for each panel.
+    note
+        Note at the foot.
+    detail
+        Places (n, 3) around which the picture is; None for all of the shell.
     """
 
-    layers: Sequence[Coloured]
+    layers: Sequence[ColouredField]
     note: str = ""
     detail: Array | None = None
 
 
-def _with_arrows(surface: Surface, h: float) -> Content:
-    arrows = drawn_arrows(surface)
-    return Content(
-        [Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if arrows else [],
-        far_said(surface),
-    )
+def _arrows_content(surface: Surface, h: float) -> Content:
+    """Return the content of the picture of magnetic fields: a grey shell with arrows."""
+    layers = list[ColouredField]()
+    if field_arrows(surface):
+        layers.append(ColouredField("", np.zeros(len(surface.r0)), (0, 1), "", ""))
+    return Content(layers, far_bodies_note(surface))
 
 
-def _of_contact(surface: Surface) -> Content:
+def _contact_content(surface: Surface) -> Content:
+    """Return the content of the picture of contact."""
     layers = contact(surface)
-    detail = contact_region(surface) if layers else None
+    if not layers:
+        return Content([])
+    detail = contact_region(surface)
     notes = [] if detail is None else ["The part of the shell around the contact."]
-    return Content(
-        layers, " ".join([*notes, pressure_said(surface)] if layers else []).strip(), detail
-    )
+    return Content(layers, " ".join([*notes, pressure_note(surface)]).strip(), detail)
 
 
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {
-    "shell": lambda surface, h: Content(shell(surface, h), far_said(surface)),
+    "shell": lambda surface, h: Content(shell(surface, h), far_bodies_note(surface)),
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
     "strains": lambda surface, h: Content(*strains(surface, h)),
     "moments": lambda surface, h: Content(*moments(surface, h)),
     "stretches": lambda surface, h: Content(stretches(surface)),
-    "fields": _with_arrows,
-    "contact": lambda surface, h: _of_contact(surface),
+    "fields": _arrows_content,
+    "contact": lambda surface, h: _contact_content(surface),
 }
 
 
 def figures(
     surface: Surface, h: float, style: OutputSection, camera: Camera, names: Sequence[str] = ()
 ) -> dict[str, "Figure"]:
-    """Draw pictures of a whole deformed shell, by default all of `PICTURES`; empty pictures are
-    left out.
+    """Return pictures of a whole deformed shell by name, by default all of `PICTURES`.
+
+    Empty pictures are left out.
     """
     drawn, views = {}, dict[int, Background]()
     for name in names or PICTURES:
@@ -114,78 +129,79 @@ def figures(
 
 
 class Background:
-    """A shell as it is seen, to be coloured by its fields; the outline of the undeformed one,
-    sources and bodies.
+    """A shell in view, to be coloured by its fields, with outlines, sources and bodies.
+
+    The outline of the undeformed shell is dashed.
     """
 
     def __init__(
         self, surface: Surface, camera: Camera, width: int, window: Window | None = None
     ) -> None:
         self._surface, self._camera = surface, camera
-        pieces, r = tessellated(surface), surface.r0 + surface.u
+        tessellation, r = tessellate(surface), surface.r0 + surface.u
         self.window = window or Window.around(
             camera(np.concatenate([surface.r0, r, *near_places(surface)])), width
         )
-        self.seen = InView(pieces, r, camera, self.window)
-        self._beside = Beside(surface, camera, self.window, self.seen)
-        coarse = replace(
-            self.window, scale=self.window.scale / 2
-        )  # enough for a line that is wider than a pixel
-        drawn, before = silhouette(self.seen), InView(pieces, surface.r0, camera, coarse)
-        near, crumb = SEEN_APART / self.window.scale, CRUMB / self.window.scale
-        undeformed = apart(
-            [self._not_behind(line, before) for line in silhouette(before)], drawn, near, crumb
-        )
+        self.seen = RenderedSurface(tessellation, r, camera, self.window)
+        self._bodies = BodiesInView(surface, camera, self.window, self.seen)
+        # enough for a line that is wider than a pixel
+        coarse = replace(self.window, scale=self.window.scale / 2)
+        undeformed_view = RenderedSurface(tessellation, surface.r0, camera, coarse)
+        outline = silhouette(self.seen)
+        undeformed = [
+            self._not_behind(line, undeformed_view) for line in silhouette(undeformed_view)
+        ]
+        distance = MIN_OUTLINE_DISTANCE / self.window.scale
+        min_length = MIN_OUTLINE_LENGTH / self.window.scale
+        edges = [self._visible_part(edge_lines(surface))]
+        bare_lines = [self._visible_part(_divided(line)) for line in bare_outlines(surface)]
         self._lines = (
-            *((line, UNDEFORMED) for line in undeformed),
-            *((line, EDGE) for line in drawn),
-            *((line, EDGE) for line in apart([self._where_seen(rims(surface))], drawn, near)),
-            *((line, OTHERS) for line in self._beside.lines),
-            *((self._where_seen(_divided(line)), OTHERS) for line in bare_outlines(surface)),
+            *(
+                (line, UNDEFORMED)
+                for line in lines_away_from(undeformed, outline, distance, min_length)
+            ),
+            *((line, EDGE) for line in outline),
+            *((line, EDGE) for line in lines_away_from(edges, outline, distance)),
+            *((line, OTHERS) for line in self._bodies.lines),
+            *((line, OTHERS) for line in bare_lines),
         )
 
-    def _not_behind(self, line: Array, before: InView) -> Array:
-        """A line (n, 2) around the undeformed shell, without what the deformed one hides."""
-        hidden = (
-            self.seen.depth_around(line)
-            > before.depth_around(line) + SEEN_APART / self.window.scale
-        )
-        return np.where(hidden[:, None], np.nan, line)
+    def _not_behind(self, line: Array, undeformed_view: RenderedSurface) -> Array:
+        """Return a line (n, 2) around the undeformed shell, nan where the deformed one hides it."""
+        tolerance = MIN_OUTLINE_DISTANCE / self.window.scale
+        depth = undeformed_view.depth_around(line)
+        is_hidden = self.seen.depth_around(line) > depth + tolerance
+        return np.where(is_hidden[:, None], np.nan, line)
 
-    def _where_seen(self, line: Array) -> Array:
-        """A line (n, 3) in the projection, without the parts that the shell hides."""
+    def _visible_part(self, line: Array) -> Array:
+        """Return a line (n, 3) in the projection (n, 2), nan where the shell hides it."""
         places = self._camera(line)[:, :2]
-        places[~self.seen.shows(np.nan_to_num(line), 2 / self.window.scale)] = np.nan
+        places[~self.seen.shows(np.nan_to_num(line), DEPTH_TOLERANCE / self.window.scale)] = np.nan
         return places
 
-    def panel(self, layer: Coloured, style: OutputSection) -> Panel:
-        """The shell in a layer's colours; grey with arrows if it has none."""
-        texts = tuple(self._beside.poles)
-        names = self._names() if layer.name in NAMED else ()
+    def panel(self, layer: ColouredField, style: OutputSection) -> Panel:
+        """Return the shell in a layer's colours; grey with arrows if it has none."""
+        texts = tuple(self._bodies.poles)
+        names = self._names() if layer.name in FIELDS_WITH_NAMES else ()
         if not layer.colours:
-            arrows = self._arrows()
-            image = self._whole(self.seen.plain(GREY))
             return Panel(
-                image,
+                self.grey_image(GREY),
                 self.window,
                 self._camera,
                 lines=self._lines,
-                arrows=arrows,
+                arrows=self._arrows(),
                 texts=texts,
                 names=names,
             )
         low, high = style.ranges.get(layer.name, layer.limits)
-        image = self.seen.coloured(
-            layer.values, (low, high), colour_map(layer.colours, (low, high))
-        )
-        slack = NONE_BEYOND * (high - low)
-        beyond = (
-            bool(np.nanmin(layer.values) < low - slack),
-            bool(np.nanmax(layer.values) > high + slack),
-        )
-        scale = Scale((low, high), layer.colours, layer.caption, beyond)
+        colours = colour_map(layer.colours, (low, high))
+        image = self.seen.coloured(layer.values, (low, high), colours)
+        slack = END_TOLERANCE * (high - low)
+        is_below = bool(np.nanmin(layer.values) < low - slack)
+        is_above = bool(np.nanmax(layer.values) > high + slack)
+        scale = Scale((low, high), layer.colours, layer.caption, (is_below, is_above))
         return Panel(
-            self._whole(image),
+            self._with_bodies(image),
             self.window,
             self._camera,
             scale,
@@ -195,116 +211,127 @@ class Background:
         )
 
     def _names(self) -> tuple[tuple[float, float, str], ...]:
-        """The name of each of several shells, as far as it is seen: next to the middle of that
-        part.
+        """Return place and name of each of several shells, as far as it is visible.
+
+        The place is the node next to the middle of the visible part.
         """
-        r, number = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
-        if number is None:
+        r, shell_numbers = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
+        if shell_numbers is None:
             return ()
-        seen, names = self.seen.shows(r, 2 / self.window.scale), []
+        is_visible, names = self.seen.shows(r, DEPTH_TOLERANCE / self.window.scale), []
         for i, name in enumerate(self._surface.shells):
-            places = self._camera(r[seen & (np.rint(number) == i)])[:, :2]
+            places = self._camera(r[is_visible & (np.rint(shell_numbers) == i)])[:, :2]
             if len(places):
                 x, y = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]
                 names.append((float(x), float(y), name))
         return tuple(names)
 
-    def plain(self, grey: float) -> Image:
-        """The shell in one grey, with what is beside it."""
-        return self._whole(self.seen.plain(grey))
+    def grey_image(self, grey: float) -> Image:
+        """Return the image of the shell in one grey, with bodies and sources."""
+        return self._with_bodies(self.seen.grey_image(grey))
 
-    def _whole(self, image: Image) -> Image:
-        """An image of the shell with what is beside it."""
-        for laid in self._beside.laid:
-            image = laid.on(image)
+    def _with_bodies(self, image: Image) -> Image:
+        """Return an image of the shell with the bodies and sources beside it."""
+        for body in self._bodies.images:
+            image = body.over(image)
         return image
 
     def _arrows(self) -> tuple[Arrow, ...]:
+        """Return the arrows of the magnetic fields at visible places."""
         extent = float(np.ptp(self._surface.r0 + self._surface.u, axis=0).max())
-        return drawn_arrows(
-            self._surface, self._camera, lambda r: self.seen.shows(r, 0.03 * extent)
-        )
+        tolerance = ARROW_DEPTH_TOLERANCE * extent
+        return field_arrows(self._surface, self._camera, lambda r: self.seen.shows(r, tolerance))
 
 
-def apart(
-    lines: Sequence[Array], others: Sequence[Array], distance: float, least: float = 0.0
+def lines_away_from(
+    lines: Sequence[Array], others: Sequence[Array], distance: float, min_length: float = 0.0
 ) -> list[Array]:
-    """Lines (n, 2) with nan where they are as near as that to others, or what is left is shorter
-    than `least`.
+    """Return lines (n, 2) with nan where they are near to others.
+
+    Parameters
+    ----------
+    lines, others
+        Lines (n, 2) in the projection.
+    distance
+        Largest distance of a place that is near.
+    min_length
+        Length of the parts that remain, at least.
     """
     from scipy.spatial import cKDTree
 
     if not len(others):
         return list(lines)
-    near = cKDTree(np.concatenate(others))
+    places_of_others = cKDTree(np.concatenate(others))
     broken = []
     for line in lines:
-        far = near.query(np.nan_to_num(line))[0] > distance
-        left = np.where(far[:, None], line, np.nan)
-        part = np.cumsum(np.isnan(left[:, 0]))
-        steps = np.nan_to_num(np.linalg.norm(np.diff(left, axis=0, prepend=left[:1]), axis=1))
-        left[np.bincount(part, steps)[part] < least] = np.nan
-        if not np.isnan(left).all():
-            broken.append(left)
+        is_far = places_of_others.query(np.nan_to_num(line))[0] > distance
+        remaining = np.where(is_far[:, None], line, np.nan)
+        part_numbers = np.cumsum(np.isnan(remaining[:, 0]))
+        steps = np.diff(remaining, axis=0, prepend=remaining[:1])
+        lengths = np.nan_to_num(np.linalg.norm(steps, axis=1))
+        remaining[np.bincount(part_numbers, lengths)[part_numbers] < min_length] = np.nan
+        if not np.isnan(remaining).all():
+            broken.append(remaining)
     return broken
 
 
-def rims(surface: Surface) -> Array:
-    """Places (n, 3) along the edges of a deformed mid-surface, which one triangle has alone; nan
-    follows each.
+def edge_lines(surface: Surface) -> Array:
+    """Return places (n, 3) along the edges of a deformed mid-surface, with nan after each edge.
+
+    An edge belongs to one triangle alone; a solid has none.
     """
     if surface.is_body:
         return np.zeros((0, 3))
     inner = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
-    along = [
+    # in VTK's order
+    nodes_of_sides = [
         [k, *range(3 + k * inner, 3 + (k + 1) * inner), (k + 1) % 3] for k in range(3)
-    ]  # VTK's order
-    edges = surface.cells[:, along].reshape(-1, inner + 2)
-    _, place = np.unique(
-        np.round(surface.r0 / SAME_PLACE) + 0.0, axis=0, return_inverse=True
-    )  # nodes of two may be double
-    _, first, count = np.unique(
-        np.sort(place.ravel()[edges[:, [0, -1]]], axis=1),
-        axis=0,
-        return_index=True,
-        return_counts=True,
-    )
-    lines = (surface.r0 + surface.u)[edges[first[count == 1]]]
-    at, nodes = np.linspace(0, 1, DIVISION * (inner + 1) + 1), np.linspace(0, 1, inner + 2)
-    table = np.vander(at, inner + 2) @ np.linalg.inv(
-        np.vander(nodes)
-    )  # of the shape functions along an edge
-    ended = np.concatenate([table @ lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
-    return np.asarray(ended.reshape(-1, 3))
+    ]
+    edges = surface.cells[:, nodes_of_sides].reshape(-1, inner + 2)
+    # nodes of two shells may be double
+    rounded = np.round(surface.r0 / SAME_PLACE_TOLERANCE) + 0.0
+    _, place_numbers = np.unique(rounded, axis=0, return_inverse=True)
+    ends = np.sort(place_numbers.ravel()[edges[:, [0, -1]]], axis=1)
+    _, first_side, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
+    lines = (surface.r0 + surface.u)[edges[first_side[count == 1]]]
+    positions = np.linspace(0, 1, SEGMENTS_PER_INTERVAL * (inner + 1) + 1)
+    node_positions = np.linspace(0, 1, inner + 2)
+    # values of the shape functions along an edge
+    table = np.vander(positions, inner + 2) @ np.linalg.inv(np.vander(node_positions))
+    lines_with_ends = np.concatenate([table @ lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
+    return np.asarray(lines_with_ends.reshape(-1, 3))
 
 
 def _divided(line: Array) -> Array:
-    """A line (n, 3) with places between its own."""
-    at = np.arange(DIVISION * (len(line) - 1) + 1) / DIVISION
-    return np.column_stack([np.interp(at, np.arange(len(line)), x) for x in line.T])
+    """Return a line (n, 3) with places between its own."""
+    positions = np.arange(SEGMENTS_PER_INTERVAL * (len(line) - 1) + 1) / SEGMENTS_PER_INTERVAL
+    return np.column_stack([np.interp(positions, np.arange(len(line)), x) for x in line.T])
 
 
-def silhouette(seen: InView) -> list[Array]:
-    """Lines (n, 2) around the drawn part of a surface, in the projection; none where it goes on
-    beyond the window.
+def silhouette(view: RenderedSurface) -> list[Array]:
+    """Return lines (n, 2) around the drawn part of a surface, in the projection.
+
+    There are none where the surface goes on beyond the window.
     """
     import contourpy
 
-    part = seen.share
-    left, _, _, high = seen.window.box
-    lines: Any = contourpy.contour_generator(z=np.pad(part, 1, mode="edge")).lines(0.5)
+    left, _, _, high = view.window.box
+    padded = np.pad(view.coverage, 1, mode="edge")
+    lines: Any = contourpy.contour_generator(z=padded).lines(0.5)
     return [
-        np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / seen.window.scale
+        np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / view.window.scale
         for line in lines
     ]
 
 
-SEEDS, APART = 70, 0.13  # largest number of places; their least distance over the shell's extent
-LENGTH, BESIDE = (
-    0.1,
-    0.014,
-)  # of the longest arrow, and from an arrow to its place, over the shell's extent
-ALIKE = 0.2  # sine of the angle below which one arrow covers another from the same place
+MAX_ARROWS = 70  # of a field
+MIN_ARROW_DISTANCE = 0.13  # over the shell's extent
+MAX_ARROW_LENGTH = 0.1  # over the shell's extent
+FOOT_OFFSET = 0.014  # over the shell's extent: of an arrow's foot from its place, beside another
+MIN_ARROW = 1e-3  # over the longest: a shorter arrow is not drawn
+COVERING_ANGLE = 0.2  # sine of the angle below which one arrow covers another from the same place
+MIN_IN_PICTURE = 1e-6  # length in the picture of an arrow that has a left side
+TINY = 1e-300  # least divisor
 FIELDS = {
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$, as the shell carries it"),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
@@ -312,15 +339,21 @@ FIELDS = {
 }
 
 
-def drawn_arrows(
+def field_arrows(
     surface: Surface,
     camera: Camera | None = None,
     visible: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> tuple[Arrow, ...]:
-    """The arrows of the fields that a surface has; they begin at the place that they belong to.
+    """Return the arrows of the magnetic fields of a surface; they begin at the place they belong
+    to.
 
     Where one would cover the other their feet are left and right of it: opposite fields are
     opposite arrows.
+
+    Parameters
+    ----------
+    camera, visible
+        Projection, and which places (n, 3) are visible; without them the arrows have no places.
     """
     lengths = {
         name: np.nan_to_num(np.linalg.norm(surface.fields[name], axis=1))
@@ -331,41 +364,51 @@ def drawn_arrows(
         return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in names)
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
-    seen = np.flatnonzero(visible(r))
-    seeds = seen[spread(r[seen], APART * extent)]
-    places, arrows = camera(r[seeds]), []
-    drawn = {
-        name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max())
+    visible_nodes = np.flatnonzero(visible(r))
+    feet = visible_nodes[spread_points(r[visible_nodes], MIN_ARROW_DISTANCE * extent)]
+    places, arrows = camera(r[feet]), []
+    vectors = {
+        name: camera(surface.fields[name][feet]) * (MAX_ARROW_LENGTH * extent / lengths[name].max())
         for name in names
     }
-    across = _across(list(drawn.values()) or [places]) * BESIDE * extent * (len(names) > 1)
-    for name, side in zip(names, (1, -1, 0), strict=False):
-        shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
-        arrows.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
+    offsets = np.zeros(places.shape)
+    if len(names) > 1:
+        offsets = _foot_offsets(list(vectors.values())) * FOOT_OFFSET * extent
+    for name, sign in zip(names, (1, -1, 0), strict=False):
+        is_long = lengths[name][feet] > MIN_ARROW * lengths[name].max()
+        arrow_feet = (places + sign * offsets)[is_long]
+        arrows.append(Arrow(arrow_feet, vectors[name][is_long], *FIELDS[name]))
     return tuple(arrows)
 
 
-def _across(fields: Sequence[Array]) -> Array:
-    """Unit vectors (n, 3) in the picture, left of the first projected vectors where the last cover
-    them, or zero.
+def _foot_offsets(fields: Sequence[Array]) -> Array:
+    """Return unit vectors (n, 3) in the picture, left of the first of several fields.
+
+    They are zero where the last field does not cover the first.
+
+    Parameters
+    ----------
+    fields
+        Projected vectors (n, 3) of each field.
     """
-    (x, y), (a, b) = fields[0][:, :2].T, fields[-1][:, :2].T
-    size, other = np.hypot(x, y), np.hypot(a, b)
-    cover = np.abs(x * b - y * a) <= ALIKE * size * other
-    flat = np.column_stack([-y, x, 0 * x]) / np.maximum(size, 1e-300)[:, None]
-    left = np.where(size[:, None] > 1e-6, flat, np.array([-1.0, 0, 0]))
-    return np.asarray(left * (cover & (len(fields) > 1))[:, None])
+    (x, y), (last_x, last_y) = fields[0][:, :2].T, fields[-1][:, :2].T
+    size, last_size = np.hypot(x, y), np.hypot(last_x, last_y)
+    covers = np.abs(x * last_y - y * last_x) <= COVERING_ANGLE * size * last_size
+    to_the_left = np.column_stack([-y, x, 0 * x]) / np.maximum(size, TINY)[:, None]
+    offsets = np.where(size[:, None] > MIN_IN_PICTURE, to_the_left, np.array([-1.0, 0, 0]))
+    return np.asarray(offsets * covers[:, None])
 
 
-def spread(r: Array, apart: float) -> NDArray[np.int64]:
-    """Indices of well separated points of (n, 3): each is the farthest from those before, at least
-    `apart` away.
+def spread_points(r: Array, min_distance: float) -> NDArray[np.int64]:
+    """Return indices of well separated points of r (n, 3), at most `MAX_ARROWS`.
+
+    Each is the farthest from those before, at least `min_distance` away.
     """
-    chosen = [int(np.argmax(r[:, 2]))]
+    indices = [int(np.argmax(r[:, 2]))]
     distance = np.full(len(r), np.inf)
-    while len(chosen) < SEEDS:
-        distance = np.minimum(distance, np.linalg.norm(r - r[chosen[-1]], axis=1))
-        if distance.max() < apart:
+    while len(indices) < MAX_ARROWS:
+        distance = np.minimum(distance, np.linalg.norm(r - r[indices[-1]], axis=1))
+        if distance.max() < min_distance:
             break
-        chosen.append(int(np.argmax(distance)))
-    return np.array(chosen)
+        indices.append(int(np.argmax(distance)))
+    return np.array(indices)

@@ -10,10 +10,10 @@ import numpy as np
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.grids import read_map
-from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
+from magshell_fenicsx.output.fields.mode_fields import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import (
-    About,
+    ShellData,
     grid_file,
     point_file,
     read_point,
@@ -23,33 +23,33 @@ from magshell_fenicsx.output.fields.vtu import (
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
+from magshell_fenicsx.output.pictures.curve_additions import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.field_maps import field_maps_figure
-from magshell_fenicsx.output.pictures.layout import drawing, written
-from magshell_fenicsx.output.pictures.lines import drawn_parts
-from magshell_fenicsx.output.pictures.modes import (
+from magshell_fenicsx.output.pictures.layout import drawing, figure_files
+from magshell_fenicsx.output.pictures.lines import curve_steps
+from magshell_fenicsx.output.pictures.mode_pictures import (
     gradients_figure,
     mode_figures,
-    searched,
+    solution_rows,
     solutions_figure,
 )
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.readings import readings_figure
-from magshell_fenicsx.output.pictures.several import add_shapes, runs_figure
-from magshell_fenicsx.output.pictures.view import Camera, run_camera
+from magshell_fenicsx.output.pictures.rendering import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import case_in, headline, pole_of, style_of
+from magshell_fenicsx.output.store.manifest import refuse_unwritten, write_manifest
+from magshell_fenicsx.output.store.stored_results import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
-from magshell_fenicsx.output.store.written import note, refuse_unwritten
 from magshell_fenicsx.parts.seen import MapGrid
 
-MOST_PANELS = 12
-MAPS = "field_maps"  # key of the case with their names
-MOST_FRAMES = 40
+MAX_PANELS = 12  # of solutions.png
+MAPS = "field_maps"  # key of the case with the names of grids
+MAX_FRAMES = 40
 
 
-class Drawn:
-    """A run's folder as pictures need it; files are read once.
+class PicturedRun:
+    """Data of a run's folder for pictures; files are read once.
 
     Parameters
     ----------
@@ -58,8 +58,12 @@ class Drawn:
 
     Attributes
     ----------
+    rows, on_path
+        The rows of path.csv with fields, and those that are no solutions of a search.
     resolved
-        The case as in summary.json.
+        The case of summary.json.
+    headline
+        The row at which pictures show the shell.
 
     Raises
     ------
@@ -74,27 +78,27 @@ class Drawn:
         self.resolved = case_in(folder)
         self.headline = headline(self.resolved, self.rows)
         self.style = style_of(self.resolved, options)
-        self._points: dict[int, tuple[Surface, About]] = {}
+        self._points: dict[int, tuple[Surface, ShellData]] = {}
 
     @property
-    def place(self) -> str:
-        """What the point of w_pole_over_h is called."""
+    def pole_name(self) -> str:
+        """Name of the point of w_pole_over_h."""
         return pole_of(self.resolved)
 
     @cached_property
     def camera(self) -> Camera:
-        """Of all pictures of the run."""
-        return run_camera(self.at(self.headline)[0], self.style)
+        """Camera of all pictures of the run."""
+        return run_camera(self.surface_at(self.headline)[0], self.style)
 
-    def at(self, row: Row) -> tuple[Surface, About]:
-        """The whole deformed shell at a point."""
+    def surface_at(self, row: Row) -> tuple[Surface, ShellData]:
+        """Return the whole deformed shell at a point, and the shell's data."""
         number = int(row["point"])
         if number not in self._points:
             self._points[number] = read_point(self.folder / "fields", number)
         return self._points[number]
 
     def maps_at(self, row: Row) -> list[tuple[MapGrid, float]]:
-        """The grids beside the shell at a point, and R in metres."""
+        """Return the grids beside the shell at a point, and R in metres."""
         files = (
             self.folder / "fields" / grid_file(name, int(row["point"]))
             for name in self.resolved.get(MAPS) or ()
@@ -109,34 +113,42 @@ def plot(
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
 ) -> list[str]:
-    """Draw the pictures again, also animation.gif if requested, and write report.html again; see
-    `draw`.
+    """Draw the pictures again, also animation.gif if requested, and write report.html again.
 
-    A picture of somebody else in the folder is refused, not replaced.
+    See `draw`. A foreign picture in the folder is refused, not replaced.
+
+    Returns
+    -------
+    The names of the files; whole.pvd lists those of `fields/whole_*`, which are left out.
     """
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
-    drawn = draw(folder, point, options, shapes)
+    names = draw(folder, point, options, shapes)
     if animation:
-        drawn.append(draw_animation(folder, options))
+        names.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
         write_report(folder)
-        drawn.append("report.html")
-    note(folder, drawn)
-    return [name for name in drawn if not name.startswith("fields/whole_")]  # whole.pvd lists them
+        names.append("report.html")
+    write_manifest(folder, names)
+    return [name for name in names if not name.startswith("fields/whole_")]
 
 
-def plotted(folders: Sequence[Path], out: Path, options: Mapping[str, Any], **alone: Any) -> str:
-    """Draw one run again, as `plot`, or the curves of several; the files in words.
+def plot_folders(
+    folders: Sequence[Path], out: Path, options: Mapping[str, Any], **options_of_one: Any
+) -> str:
+    """Draw one run again, as `plot`, or the curves of several; return the files in words.
 
     Raises
     ------
     CaseError
-        Of several runs with arguments `alone`, which are for one.
+        If several runs are given with arguments that are for one.
     """
     if len(folders) == 1:
-        return f"{', '.join(plot(folders[0], options=options, **alone))} in {folders[0]}/"
-    if any(value is not None and value is not False and value != [] for value in alone.values()):
+        return f"{', '.join(plot(folders[0], options=options, **options_of_one))} in {folders[0]}/"
+    if any(
+        value is not None and value is not False and value != []
+        for value in options_of_one.values()
+    ):
         raise CaseError(
             "plot: of several runs the curves are drawn in one picture: give one folder for more"
         )
@@ -146,7 +158,11 @@ def plotted(folders: Sequence[Path], out: Path, options: Mapping[str, Any], **al
 def plot_runs(
     folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None
 ) -> list[str]:
-    """Draw the curves of several runs in one picture; the names of its files.
+    """Draw the curves of several runs in one picture.
+
+    Returns
+    -------
+    The names of the files.
 
     Raises
     ------
@@ -158,7 +174,7 @@ def plot_runs(
     runs = {folder: _rows(folder) for folder in folders}
     style = style_of(case_in(folders[0]), options)
     names = []
-    for name, content in written(runs_figure(runs, style), style, file.stem):
+    for name, content in figure_files(runs_figure(runs, style), style, file.stem):
         write_whole(file.parent / name, content)
         names.append(str(file.parent / name))
     return names
@@ -192,14 +208,15 @@ def draw(
     OSError
         If a file cannot be written.
     """
-    run = Drawn(folder, options)
+    run = PicturedRun(folder, options)
     if point is not None and not 0 <= point < len(run.rows):
         raise CaseError(f"--point {point}: {folder} has points 0 to {len(run.rows) - 1}")
     for number in shapes:
         if not 0 <= number < len(run.rows):
             raise CaseError(f"--shapes {number}: {folder} has points 0 to {len(run.rows) - 1}")
     names = []
-    for name, content in _of_point(run, point) if point is not None else _of_run(run, shapes):
+    all_pictures = _pictures_of_run(run, shapes)
+    for name, content in all_pictures if point is None else _pictures_of_point(run, point):
         write_whole(folder / name, content)
         names.append(name)
     if run.style.whole:
@@ -207,111 +224,119 @@ def draw(
     return names
 
 
-def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
-    surface, about = run.at(run.rows[point])
-    for name, figure in figures(
-        in_its_field(surface, run.rows[point], run.rows), about.h, run.style, run.camera
-    ).items():
-        yield from written(figure, run.style, f"{name}_{point:04d}")
+def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, bytes]]:
+    """Yield names and contents of the pictures of one point."""
+    surface, shell_data = run.surface_at(run.rows[point])
+    shown = without_zero_fields(surface, run.rows[point], run.rows)
+    for name, figure in figures(shown, shell_data.h, run.style, run.camera).items():
+        yield from figure_files(figure, run.style, f"{name}_{point:04d}")
     if maps := run.maps_at(run.rows[point]):
-        figure = field_maps_figure(maps, surface, about.h, run.resolved, run.style)
-        yield from written(figure, run.style, f"field_maps_{point:04d}")
+        figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, run.style)
+        yield from figure_files(figure, run.style, f"field_maps_{point:04d}")
 
 
-def _of_run(run: Drawn, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
+    """Yield names and contents of all pictures of a run; shells of some points on the curve."""
     style, last = run.style, run.on_path[-1]
-    surface, about = run.at(run.headline)
+    surface, shell_data = run.surface_at(run.headline)
     if amplitude := str(last["amplitude"]):
-        curve = curve_figure(run.rows, amplitude, style, run.place)
+        curve = curve_figure(run.rows, amplitude, style, run.pole_name)
         if shapes:
             with drawing(style):
-                chosen = [(run.rows[number], run.at(run.rows[number])[0]) for number in shapes]
-                parts = worth_drawing(drawn_parts(run.rows, amplitude))
-                add_shapes(curve, parts, chosen, style, run.camera)
-        yield from written(curve, style, "curve")
+                rows = [run.rows[number] for number in shapes]
+                shells = [(row, run.surface_at(row)[0]) for row in rows]
+                steps = worth_drawing(curve_steps(run.rows, amplitude))
+                add_shapes(curve, steps, shells, style, run.camera)
+        yield from figure_files(curve, style, "curve")
         if run.resolved.get("sensors"):
-            yield from written(
-                readings_figure(run.rows, amplitude, run.resolved, style), style, "sensors"
-            )
-    for name, figure in figures(
-        in_its_field(surface, run.headline, run.rows), about.h, style, run.camera
-    ).items():
-        yield from written(figure, style, name)
+            figure = readings_figure(run.rows, amplitude, run.resolved, style)
+            yield from figure_files(figure, style, "sensors")
+    shown = without_zero_fields(surface, run.headline, run.rows)
+    for name, figure in figures(shown, shell_data.h, style, run.camera).items():
+        yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
-        yield from written(
-            field_maps_figure(maps, surface, about.h, run.resolved, style), style, "field_maps"
-        )
+        figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, style)
+        yield from figure_files(figure, style, "field_maps")
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
-        yield from written(figure, style, name)
+        yield from figure_files(figure, style, name)
     if frequencies := read_frequencies(run.folder):
         with drawing(style):
             figure = frequencies_figure(frequencies, run.rows, style)
-        yield from written(figure, style, "frequencies")
+        yield from figure_files(figure, style, "frequencies")
     if files := gradient_files(run.folder):
-        by_result = {of: read_vtu(file)[0] for of, file in files.items()}
-        yield from written(gradients_figure(by_result, style, run.camera), style, "gradients")
-    if solutions := searched(run.rows)[:MOST_PANELS]:
-        surfaces = [run.at(each)[0] for each in solutions]
-        yield from written(
-            solutions_figure(surfaces, solutions, about.h, style, run.camera), style, "solutions"
-        )
+        by_result = {result: read_vtu(file)[0] for result, file in files.items()}
+        figure = gradients_figure(by_result, style, run.camera)
+        yield from figure_files(figure, style, "gradients")
+    if solutions := solution_rows(run.rows)[:MAX_PANELS]:
+        surfaces = [run.surface_at(row)[0] for row in solutions]
+        figure = solutions_figure(surfaces, solutions, shell_data.h, style, run.camera)
+        yield from figure_files(figure, style, "solutions")
 
 
-def in_its_field(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
-    """A surface without the direction of a field that is zero, and without the remanence where no
-    row has a field.
+def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
+    """Return a surface without the direction of a field that is zero.
+
+    The remanence is left out too, where no row has a field.
     """
     if row["lambda_m"]:
         return surface
-    none = {"Ba"} if any(each["lambda_m"] for each in rows) else {"Ba", "Br"}
-    return replace(
-        surface,
-        fields={name: values for name, values in surface.fields.items() if name not in none},
-    )
+    left_out = {"Ba"} if any(other_row["lambda_m"] for other_row in rows) else {"Ba", "Br"}
+    fields = {name: values for name, values in surface.fields.items() if name not in left_out}
+    return replace(surface, fields=fields)
 
 
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:
-    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied;
-    see `draw`.
+    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied.
 
-    After a motion only it, at equal times.
+    After a motion it shows the motion alone, at equal times. See `draw`.
 
     Returns
     -------
     The name of the file.
     """
-    run = Drawn(folder, options)
+    run = PicturedRun(folder, options)
     rows = run.on_path
     amplitude = str(rows[-1]["amplitude"])
-    parts = drawn_parts(rows, amplitude) if amplitude else []
-    part = rows if len(parts) != 1 else parts[0].rows
-    chosen = in_true_time(rows) if amplitude == "time" else evenly(part, MOST_FRAMES)
-    surfaces, abouts = zip(*(run.at(row) for row in chosen), strict=True)
-    about: About = abouts[0]
-    driven = list(dict.fromkeys(str(row["amplitude"]) for row in rows if row["amplitude"]))
-    titles = [caption(about.h, about.nu, row, driven) for row in chosen]
-    content = animated(surfaces, about.h, titles, rows, chosen, run.camera, run.place)
+    steps = curve_steps(rows, amplitude) if amplitude else []
+    part_of_path = rows if len(steps) != 1 else steps[0].rows
+    frame_rows = (
+        in_true_time(rows) if amplitude == "time" else evenly_chosen(part_of_path, MAX_FRAMES)
+    )
+    surfaces, data_of_frames = zip(*(run.surface_at(row) for row in frame_rows), strict=True)
+    shell_data: ShellData = data_of_frames[0]
+    amplitudes = list(dict.fromkeys(str(row["amplitude"]) for row in rows if row["amplitude"]))
+    titles = [caption(shell_data.h, shell_data.nu, row, amplitudes) for row in frame_rows]
+    content = animated(surfaces, shell_data.h, titles, rows, frame_rows, run.camera, run.pole_name)
     write_whole(folder / "animation.gif", content)
     return "animation.gif"
 
 
 def in_true_time(rows: Sequence[Row]) -> list[Row]:
-    """The rows of a path's motions that are nearest to equal times."""
-    part = [row for row in rows if row["amplitude"] == "time"]
-    times = np.array([float(row["time"]) for row in part])
+    """Return the rows of a path's motions that are nearest to equal times."""
+    motion = [row for row in rows if row["amplitude"] == "time"]
+    times = np.array([float(row["time"]) for row in motion])
     shortest = np.diff(np.unique(times)).min(initial=np.ptp(times) or 1.0)
-    count = int(min(MOST_FRAMES, np.ptp(times) / shortest + 1.5))
-    return [part[int(np.abs(times - t).argmin())] for t in np.linspace(times[0], times[-1], count)]
+    count = int(min(MAX_FRAMES, np.ptp(times) / shortest + 1.5))
+    return [
+        motion[int(np.abs(times - time).argmin())]
+        for time in np.linspace(times[0], times[-1], count)
+    ]
 
 
-def evenly(part: Sequence[Row], most: int) -> list[Row]:
-    """At most so many rows, the first and the last among them."""
-    count = min(len(part), most)
-    return [part[round(i * (len(part) - 1) / max(count - 1, 1))] for i in range(count)]
+def evenly_chosen(rows: Sequence[Row], max_rows: int) -> list[Row]:
+    """Return at most `max_rows` rows, the first and the last among them."""
+    count = min(len(rows), max_rows)
+    return [rows[round(i * (len(rows) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 def _rows(folder: Path) -> list[Row]:
-    """The rows of the points whose field files exist."""
+    """Return the rows of the points whose field files exist.
+
+    Raises
+    ------
+    CaseError
+        If there are none.
+    """
     try:
         rows = read_rows(folder / "path.csv")
     except (FileNotFoundError, NotADirectoryError):

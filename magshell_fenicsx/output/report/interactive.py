@@ -1,7 +1,6 @@
-"""The part of a report to play with: the deformed shell to turn, a slider along the path, the curve
-linked to it.
+"""The interactive part of a report: the deformed shell to turn, a slider along the path, the curve.
 
-All data stand in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
+All data are in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
 """
 
 import base64
@@ -19,21 +18,21 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
-from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellated
+from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellate
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import (
-    Part,
+    CurveStep,
     axes_for,
-    drawn_parts,
+    curve_steps,
     is_unstable,
     line_coordinates,
-    named,
-    of_load,
+    load_axis,
+    with_point_name,
 )
-from magshell_fenicsx.output.pictures.scales import NEAR, SIGNED, colour_map, from_zero
-from magshell_fenicsx.output.pictures.view import near_outlines, near_solids, run_camera
-from magshell_fenicsx.output.store.known import headline, pole_of, style_of
+from magshell_fenicsx.output.pictures.rendering import near_outlines, near_solids, run_camera
+from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, colour_map, from_zero
+from magshell_fenicsx.output.store.stored_results import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -41,84 +40,108 @@ from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
-SAME = 1e-7  # places over R that are one vertex
-MOST = 8000  # triangles of a curved mesh
-STOPS = 33  # of a colour map
+SAME_PLACE_TOLERANCE = 1e-7  # over R: distance of places that are one vertex
+MAX_TRIANGLES = 8000  # of a mesh with curved cells
+COLOUR_STOPS = 33  # of a colour map
+EXACT_SIZE = 1e-5  # over R: edge of cubes up to which their numbers are compared exactly
+GROWTH_OF_CUBES = 1.3  # of the edge, while there are too many vertices
+MIN_RANGE = 1e-12  # of a field; smaller ones are constant
 
 
 @dataclass(frozen=True)
-class Thinned:
-    """Vertices that represent a surface, and triangles (m, 3) of their numbers."""
+class SimplifiedSurface:
+    """Vertices that represent a surface, and triangles between them.
 
-    pieces: Tessellation
-    kept: NDArray[np.int64]
+    Attributes
+    ----------
+    tessellation
+        Flat triangles of the surface.
+    vertices
+        (n,) numbers of the points of the tessellation that are vertices.
+    triangles
+        (m, 3) numbers of vertices.
+    """
+
+    tessellation: Tessellation
+    vertices: NDArray[np.int64]
     triangles: NDArray[np.int64]
 
     @property
     def count(self) -> int:
-        """The number of vertices."""
-        return len(self.kept)
+        """Number of vertices."""
+        return len(self.vertices)
 
-    def at(self, values: Array) -> Array:
-        """Values of nodes at the vertices."""
-        return self.pieces.at(values)[self.kept]
+    def at_vertices(self, values: Array) -> Array:
+        """Return values of nodes (k, ...) at the vertices (n, ...)."""
+        return self.tessellation.at_points(values)[self.vertices]
 
 
-def thinned(surface: Surface, most: int) -> Thinned:
-    """The surface in at most about `most` vertices; where there are more, those within a small cube
-    become one.
+def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
+    """Return a surface with at most about `max_vertices` vertices.
+
+    Where the surface has more, those within a small cube become one.
     """
-    pieces = tessellated(surface, MOST)
-    r, size = pieces.at(surface.r0), SAME
-    kept, triangles = _joined(r, pieces.triangles, size)
-    size = 0.5 * float(np.ptp(r, axis=0).max()) / np.sqrt(most)
-    while len(kept) > most:
-        kept, triangles = _joined(r, pieces.triangles, size)
-        size *= 1.3
-    outwards, corners = pieces.at(surface.n0)[kept][triangles].sum(axis=1), r[kept][triangles]
-    turned = (
-        np.einsum(
-            "ij,ij->i", np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), outwards
-        )
-        < 0
-    )
-    triangles[turned] = triangles[turned][:, ::-1]  # the image of a half has the other orientation
-    return Thinned(pieces, kept, triangles)
+    tessellation = tessellate(surface, MAX_TRIANGLES)
+    r, size = tessellation.at_points(surface.r0), SAME_PLACE_TOLERANCE
+    vertices, triangles = _merge_vertices(r, tessellation.triangles, size)
+    size = 0.5 * float(np.ptp(r, axis=0).max()) / np.sqrt(max_vertices)
+    while len(vertices) > max_vertices:
+        vertices, triangles = _merge_vertices(r, tessellation.triangles, size)
+        size *= GROWTH_OF_CUBES
+    outwards = tessellation.at_points(surface.n0)[vertices][triangles].sum(axis=1)
+    corners = r[vertices][triangles]
+    normals = np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0))
+    # the mirror image of a half shell has the other orientation
+    is_inverted = np.einsum("ij,ij->i", normals, outwards) < 0
+    triangles[is_inverted] = triangles[is_inverted][:, ::-1]
+    return SimplifiedSurface(tessellation, vertices, triangles)
 
 
-def _joined(
+def _merge_vertices(
     r: Array, triangles: NDArray[np.int32], size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return one point of each cube with edges `size`, and the triangles between them.
+
+    Parameters
+    ----------
+    r
+        (n, 3) points over R.
+    triangles
+        (m, 3) numbers of points.
+
+    Returns
+    -------
+    Numbers of the points, and of these for the triangles whose corners remain distinct.
+    """
     cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
-    key = (
-        (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
-        if size > 1e-5
-        else _exact(cubes)
-    )
-    _, kept, number = np.unique(key, return_index=True, return_inverse=True)
+    if size > EXACT_SIZE:
+        key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
+    else:
+        key = _rows_as_values(cubes)
+    _, vertices, number = np.unique(key, return_index=True, return_inverse=True)
     corners = number[triangles]
-    whole = (
+    is_proper = (
         (corners[:, 0] != corners[:, 1])
         & (corners[:, 1] != corners[:, 2])
         & (corners[:, 2] != corners[:, 0])
     )
-    return kept, corners[whole]
+    return vertices, corners[is_proper]
 
 
-def _exact(cubes: NDArray[np.int64]) -> NDArray[np.void]:
-    """Rows as single values."""
+def _rows_as_values(cubes: NDArray[np.int64]) -> NDArray[np.void]:
+    """Return the rows (n, 3) as single values (n,)."""
     return np.ascontiguousarray(cubes).view([("", cubes.dtype)] * 3).ravel()
 
 
-MOST_FRAMES, FEWEST_FRAMES = 24, 6
-MOST_VALUES = 110_000  # vertices times frames
-LEVEL = 3  # of zlib: a tenth larger than by default, in half of the time
+MAX_FRAMES, MIN_FRAMES = 24, 6
+MAX_VALUES = 110_000  # vertices times frames
+COMPRESSION_LEVEL = 3  # of zlib: a tenth larger than by default, in half of the time
 SCRIPT = "interactive.js"
 
 
 @dataclass(frozen=True)
-class Interactive:
-    """What the page's script needs.
+class InteractivePart:
+    """Data for the script of the page.
 
     Attributes
     ----------
@@ -136,83 +159,89 @@ class Interactive:
     script: Markup
 
 
-def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
-    """The data of a run's folder; None without fields of two points, or without Plotly."""
+def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None:
+    """Return the data of a run's folder; None without fields of two points, or without Plotly."""
     fields = folder / "fields"
-    rows = [
-        row
-        for row in read_rows(folder / "path.csv")
-        if (fields / point_file(int(row["point"]))).exists()
-    ]
+    all_rows = read_rows(folder / "path.csv")
+    rows = [row for row in all_rows if (fields / point_file(int(row["point"]))).exists()]
     if len(rows) < 2 or (library := plotly()) is None:
         return None
-    last = next(row for row in reversed(rows) if row["label"] != SOLUTION)
-    about_row = headline(case, rows)
-    surface, about = read_point(fields, int(about_row["point"]))
-    mesh = thinned(surface, MOST_VALUES // FEWEST_FRAMES)
-    frames = chosen_frames(rows, min(MOST_FRAMES, MOST_VALUES // mesh.count))
-    shells = [on_nodes_of(read_point(fields, int(row["point"]))[0], surface) for row in frames]
-    packed = _Packed()
+    last_row = next(row for row in reversed(rows) if row["label"] != SOLUTION)
+    headline_row = headline(case, rows)
+    surface, shell_data = read_point(fields, int(headline_row["point"]))
+    mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
+    frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
+    surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
+    shells = [on_nodes_of(deformed, surface) for deformed in surfaces]
+    number_type = np.uint16 if mesh.count < 2**16 else np.uint32
+    arrays = _Packed()
     content: dict[str, Any] = {
-        **_path(rows, last, pole_of(case)),
+        **_path(rows, last_row, pole_of(case)),
         "frames": [rows.index(row) for row in frames],
-        "opens": frames.index(about_row) if about_row in frames else len(frames) - 1,
-        "h": about.h,
+        "opens": frames.index(headline_row) if headline_row in frames else len(frames) - 1,
+        "h": shell_data.h,
         "camera": run_camera(surface, style_of(case)).direction.tolist(),
-        "r0": packed.add(mesh.at(surface.r0), np.uint16),
-        "triangles": packed.raw(
-            mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)
-        ),
-        "u": [packed.add(mesh.at(s.u), np.int16) for s in shells],
-        "lines": [[np.round(line, 4).tolist() for line in near_outlines(s)] for s in shells],
-        "solids": [[_solid(solid, packed) for solid in near_solids(s)] for s in shells],
-        "fields": _fields(shells, mesh, about.h, packed),
+        "r0": arrays.add(mesh.at_vertices(surface.r0), np.uint16),
+        "triangles": arrays.raw(mesh.triangles.astype(number_type)),
+        "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in shells],
+        "lines": [_lines(shell) for shell in shells],
+        "solids": [[_solid(solid, arrays) for solid in near_solids(shell)] for shell in shells],
+        "fields": _fields(shells, mesh, shell_data.h, arrays),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
     script = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
-    return Interactive(Markup(text), packed.content, library, Markup(script))
+    return InteractivePart(Markup(text), arrays.content, library, Markup(script))
 
 
-def _solid(solid: Solid, packed: "_Packed") -> dict[str, Any]:
-    """The faces of a body or a magnet; the sign of its poles at its corners."""
+def _lines(shell: Surface) -> list[list[list[float]]]:
+    """Return the outlines of bodies and sources near a shell."""
+    return [np.round(line, 4).tolist() for line in near_outlines(shell)]
+
+
+def _solid(solid: Solid, arrays: "_Packed") -> dict[str, Any]:
+    """Return the faces of a body or a magnet, and the sign of its poles at its corners."""
     poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
-    triangles = packed.raw(solid.triangles.astype(np.uint16))
+    triangles = arrays.raw(solid.triangles.astype(np.uint16))
     return {
         "name": solid.name,
-        "r": packed.add(solid.points, np.uint16),
+        "r": arrays.add(solid.points, np.uint16),
         "triangles": triangles,
         "poles": poles,
     }
 
 
-def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
-    """At most about so many rows of a path, besides the first, the last, and instabilities and
-    solutions.
+def chosen_frames(rows: Sequence[Row], max_rows: int) -> list[Row]:
+    """Return about `max_rows` rows of a path at most, to be shown as frames.
 
-    Between them the shape changes about equally: a snap has as many as the slow part before it.
+    The first, the last, instabilities and solutions are among them. Between them the shape changes
+    about equally: a snap has as many as the slow part before it.
     """
-    special = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: most // 2]
+    special = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: max_rows // 2]
     others = [row for row in rows if row not in special]
-    count = min(len(others), max(most - len(special), 2))
-    way = _way(others)
-    even = {int(np.abs(way - at).argmin()) for at in np.linspace(0, way[-1], count)} | {
-        0,
-        len(others) - 1,
-    }
-    left = [i for i in range(len(others)) if i not in even]
-    more = count - len(even)
-    even |= {
-        left[round(i * (len(left) - 1) / max(more - 1, 1))] for i in range(min(more, len(left)))
-    }
-    return sorted([*special, *(others[i] for i in even)], key=lambda row: int(row["point"]))
+    count = min(len(others), max(max_rows - len(special), 2))
+    change = _change_of_shape(others)
+    equal_changes = np.linspace(0, change[-1], count)
+    frame_numbers = {int(np.abs(change - value).argmin()) for value in equal_changes}
+    frame_numbers |= {0, len(others) - 1}
+    remaining = [i for i in range(len(others)) if i not in frame_numbers]
+    missing = count - len(frame_numbers)
+    spacing = (len(remaining) - 1) / max(missing - 1, 1)
+    frame_numbers |= {remaining[round(i * spacing)] for i in range(min(missing, len(remaining)))}
+    return sorted(
+        [*special, *(others[i] for i in frame_numbers)], key=lambda row: int(row["point"])
+    )
 
 
-def _way(rows: Sequence[Row]) -> Array:
-    """How far the shape has changed until each row: of all displacements over their range, and half
-    of it per point.
+def _change_of_shape(rows: Sequence[Row]) -> Array:
+    """Return (n,) how far the shape has changed until each row.
+
+    That is the sum of the changes of all displacements over their ranges, plus a share per point:
+    all shares are half of that sum.
     """
-    moved = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
-    values = np.array([[float(row[name]) for name in moved] for row in rows]).reshape(len(rows), -1)
+    columns = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
+    values = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(
+        len(rows), -1
+    )
     ranges = np.ptp(values, axis=0)
     steps = np.abs(np.diff(values[:, ranges > 0] / ranges[ranges > 0], axis=0)).sum(axis=1)
     share = 0.5 * (float(steps.sum()) or 1.0) / max(len(steps), 1)
@@ -220,23 +249,35 @@ def _way(rows: Sequence[Row]) -> Array:
 
 
 def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
-    """The numbers of path.csv that vary, names of columns, and the lines of the curve of each step."""
-    varied = next(
+    """Return the numbers of path.csv that vary, names of columns, and the curves of all steps.
+
+    Parameters
+    ----------
+    last
+        The last row that is no solution of a search.
+    pole
+        Words for the point of w_pole_over_h.
+    """
+    amplitude_name = next(
         (str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), ""
     )
-    parts = _parts(rows, varied) if varied else []
+    parts = _steps_of_curve(rows, amplitude_name) if amplitude_name else []
     quantities = _quantities(rows[0])
-    first = list[str]()
+    axes = list[str]()
     for part in reversed(parts):  # its words say whose displacement it is
         quantities |= {q.name: q for q in axes_for(part)}
-        first += [q.name for q in axes_for(part)]
+        axes += [q.name for q in axes_for(part)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
     varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
     columns = {}
-    for name in dict.fromkeys([*first, *varying]):
-        shown = quantities.get(name) or quantity(name)
+    for name in dict.fromkeys([*axes, *varying]):
+        column_quantity = quantities.get(name) or quantity(name)
         values = [row[name] for row in rows]
-        columns[name] = {"label": label(shown, rows[0], pole), "values": values, "sign": shown.sign}
+        columns[name] = {
+            "label": label(column_quantity, rows[0], pole),
+            "values": values,
+            "sign": column_quantity.sign,
+        }
     return {
         "columns": columns,
         "steps": [_step(part, rows) for part in parts],
@@ -248,7 +289,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
 
 
 def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
-    """Column -> its quantity; a column in units has the words of that without units.
+    """Return column -> its quantity; a column in units has the words of that without units.
 
     Examples
     --------
@@ -256,94 +297,100 @@ def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
     'displacement  $w$  (mm)'
     """
     by_column = dict[str, Quantity]()
-    for plain in map(quantity, names):
-        for shown in (plain, *plain.in_units):
-            by_column.setdefault(shown.name, shown)
+    for without_units in map(quantity, names):
+        for in_unit in (without_units, *without_units.in_units):
+            by_column.setdefault(in_unit.name, in_unit)
     return by_column
 
 
-def _step(part: Part, rows: Sequence[Row]) -> dict[str, Any]:
-    """A step for the page: numbers of its rows, and the lines between them."""
-    at = {int(row["point"]): i for i, row in enumerate(rows)}
-    varied = quantity(amplitude(part.amplitude).column)
+def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
+    """Return a step for the page: numbers of its rows, and the lines between them."""
+    row_of_point = {int(row["point"]): i for i, row in enumerate(rows)}
+
+    def numbers_of(rows_of_line: Sequence[Row]) -> list[int]:
+        return [row_of_point[int(row["point"])] for row in rows_of_line]
+
+    varied_quantity = quantity(amplitude(part.amplitude).column)
+    lines = [
+        {
+            "rows": numbers_of(line.rows),
+            "pieces": line.segments,
+            "in_time": line.in_time,
+            "level": line.level,
+        }
+        for line in line_coordinates(part)
+    ]
     return {
-        "title": part.title or varied.words,
+        "title": part.title or varied_quantity.words,
         "axes": [q.name for q in axes_for(part)],
-        "varied": varied.name,
-        "load": axes_for(part)[of_load(part.amplitude)].name,
-        "rows": [at[int(row["point"])] for row in part.rows],
-        "lines": [
-            {
-                "rows": [at[int(row["point"])] for row in it.rows],
-                "pieces": it.pieces,
-                "in_time": it.in_time,
-                "level": it.level,
-            }
-            for it in line_coordinates(part)
-        ],
+        "varied": varied_quantity.name,
+        "load": axes_for(part)[load_axis(part.amplitude)].name,
+        "rows": numbers_of(part.rows),
+        "lines": lines,
     }
 
 
-def _parts(rows: Sequence[Row], varied: str) -> list[Part]:
-    """The steps of a curve as in curve.png, after those that it leaves out, such as the field
-    before the loads.
+def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]:
+    """Return the steps of a curve as in curve.png, after those that it leaves out.
+
+    Such is the step in which the field is applied before the loads.
     """
-    drawn = drawn_parts(rows, varied)
-    among = {int(row["point"]) for part in drawn for row in part.rows}
-    before = [row for row in rows if int(row["point"]) not in among]
-    names = list(dict.fromkeys(str(row["amplitude"]) for row in before if row["amplitude"]))
-    others = []
+    drawn_steps = curve_steps(rows, amplitude_name)
+    drawn_points = {int(row["point"]) for part in drawn_steps for row in part.rows}
+    earlier_rows = [row for row in rows if int(row["point"]) not in drawn_points]
+    names = list(dict.fromkeys(str(row["amplitude"]) for row in earlier_rows if row["amplitude"]))
+    earlier_steps = []
     for name in names:
-        own = [row for row in before if row["amplitude"] == name]
-        first = max(rows.index(own[0]) - 1, 0)
-        others.append(
-            Part(name, [*rows[first : first + 1], *own] if rows[first] is not own[0] else own)
-        )
-    return [part for part in (*others, *drawn) if len(part.rows) > 1]
+        rows_of_step = [row for row in earlier_rows if row["amplitude"] == name]
+        first_number = max(rows.index(rows_of_step[0]) - 1, 0)
+        if rows[first_number] is not rows_of_step[0]:
+            rows_of_step = [rows[first_number], *rows_of_step]
+        earlier_steps.append(CurveStep(name, rows_of_step))
+    return [part for part in (*earlier_steps, *drawn_steps) if len(part.rows) > 1]
 
 
 def label(of_axis: Quantity, row: Row, pole: str) -> str:
-    """The label of an axis, as in curve.png, in HTML."""
-    at_point = named(of_axis, row, pole)
+    """Return the label of an axis, as in curve.png, in HTML."""
+    at_point = with_point_name(of_axis, row, pole)
     words = f"{at_point.words} {at_point.note}".strip()
     unit = f" ({at_point.shown_unit})" if at_point.shown_unit else ""
     minus = "−" if at_point.sign < 0 else ""
-    return str(
-        Markup("{}{}{}").format(
-            words, Markup(f" {minus}{at_point.html}") if at_point.symbol else "", unit
-        )
-    )
+    symbol = Markup(f" {minus}{at_point.html}") if at_point.symbol else ""
+    return str(Markup("{}{}{}").format(words, symbol, unit))
 
 
 def _fields(
-    shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed"
+    shells: Sequence[Surface], mesh: SimplifiedSurface, h: float, arrays: "_Packed"
 ) -> list[dict[str, Any]]:
-    """Every scalar and every length of a vector, with the colours of the pictures and the limits of
-    the whole path.
+    """Return every scalar and every length of a vector, with colours and the limits of the whole
+    path.
+
+    The colours are those of the pictures.
     """
     fields = []
     for name, caption in SCALARS.items():
         values = [_values(shell, name, h) for shell in shells]
-        present = [v for v in values if v is not None]
+        present = [values_of_shell for values_of_shell in values if values_of_shell is not None]
         if len(present) < len(shells):
             continue
-        low, high = min(float(v.min()) for v in present), max(float(v.max()) for v in present)
-        if high - low < 1e-12:
+        low = min(float(values_of_shell.min()) for values_of_shell in present)
+        high = max(float(values_of_shell.max()) for values_of_shell in present)
+        if high - low < MIN_RANGE:
             low, high = low - 1.0, low + 1.0
         colours: list[tuple[float, str]] = []  # plotly's own map
         if name == "gap_over_h":
-            low, high, colours = 0.0, 1.0, _stops(NEAR)
+            low, high, colours = 0.0, 1.0, _stops(DISTANCE)
         elif name in WITH_SIGN:
             low, high = from_zero(low, high)
             colours = _stops(SIGNED, (low, high))
         if name == SHELL:
-            caption = (
-                f"{caption}: {', '.join(f'{i} {each}' for i, each in enumerate(shells[0].shells))}"
-            )
-        parts = [np.clip((mesh.at(v) - low) / (high - low), 0.0, 1.0) for v in present]
-        steps = [np.rint(255 * part).astype(np.uint8) for part in parts]
-        still = all((step == steps[0]).all() for step in steps)
-        places = [packed.raw(step) for step in (steps[:1] if still else steps)]
+            names = [f"{i} {shell_name}" for i, shell_name in enumerate(shells[0].shells)]
+            caption = f"{caption}: {', '.join(names)}"
+        at_vertices = [mesh.at_vertices(values_of_shell) for values_of_shell in present]
+        fractions = [np.clip((values - low) / (high - low), 0.0, 1.0) for values in at_vertices]
+        steps = [np.rint(255 * fraction).astype(np.uint8) for fraction in fractions]
+        is_constant = all((step == steps[0]).all() for step in steps)
+        places = [arrays.raw(step) for step in (steps[:1] if is_constant else steps)]
         fields.append(
             {
                 "name": name,
@@ -358,15 +405,20 @@ def _fields(
 
 
 def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[float, str]]:
-    """A colour map of the pictures as plotly takes it."""
+    """Return a colour map of the pictures as Plotly takes it: pairs of a fraction and a colour."""
     from matplotlib.colors import to_hex
 
     colours = colour_map(name, limits)
-    at = [*(float(t) for t in np.linspace(0.0, 1.0, STOPS)[:-1]), 1 - 1e-3, 1.0]
-    return [(t, to_hex(colours(t))) for t in at]
+    fractions = [
+        *(float(fraction) for fraction in np.linspace(0.0, 1.0, COLOUR_STOPS)[:-1]),
+        1 - 1e-3,
+        1.0,
+    ]
+    return [(fraction, to_hex(colours(fraction))) for fraction in fractions]
 
 
 def _values(surface: Surface, name: str, h: float) -> Array | None:
+    """Return a field (n,) at the nodes, or the length of a vector; None where it is absent."""
     if name == "w_over_h":
         return np.asarray(surface.w / h)
     values = couple(surface) if name == "couple" else surface.fields.get(name)
@@ -385,20 +437,21 @@ class _Packed:
         self._length = 0
 
     def add(self, values: Array, kind: type[np.integer[Any]]) -> dict[str, Any]:
-        """Values (n, 3) as integers: low + step i."""
-        least, most = np.iinfo(kind).min, np.iinfo(kind).max
+        """Add values (n, 3) as integers i: low + step i. Return where they are, low and step."""
+        min_integer, max_integer = np.iinfo(kind).min, np.iinfo(kind).max
         low, high = float(values.min()), float(values.max())
-        if least < 0:
+        if min_integer < 0:
             low, high = 0.0, max(abs(low), abs(high))
-        step = (high - low) / most or 1.0
+        step = (high - low) / max_integer or 1.0
         return {**self.raw(np.rint((values - low) / step).astype(kind)), "low": low, "step": step}
 
     def raw(self, values: NDArray[Any]) -> dict[str, Any]:
+        """Add an array as it is, and return where it is, its size and its type."""
         content = np.ascontiguousarray(values).tobytes()
-        at = {"at": self._length, "size": int(values.size), "kind": values.dtype.name}
+        location = {"at": self._length, "size": int(values.size), "kind": values.dtype.name}
         self._parts.append(content + bytes(-len(content) % 4))
         self._length += len(self._parts[-1])
-        return at
+        return location
 
     @property
     def content(self) -> str:
@@ -406,27 +459,28 @@ class _Packed:
 
 
 def packed(content: bytes) -> str:
-    """Compressed, in base64."""
-    return base64.b64encode(zlib.compress(content, LEVEL)).decode()
+    """Return a content compressed, in base64."""
+    return base64.b64encode(zlib.compress(content, COMPRESSION_LEVEL)).decode()
 
 
 @cache
 def plotly() -> str | None:
-    """Plotly's script, packed; None if it is not installed. Its Python is not imported."""
+    """Return Plotly's script, packed; None if it is not installed. Its Python is not imported."""
     package = importlib.util.find_spec("plotly")
-    for place in (package.submodule_search_locations or []) if package else []:
+    places = package.submodule_search_locations if package else None
+    for place in places or []:
         file = Path(place) / "package_data" / "plotly.min.js"
         if file.exists():
-            return _kept(file)
+            return _packed_file(file)
     return None
 
 
-def _kept(file: Path) -> str:
-    """A file, packed once for all runs."""
-    about = file.stat()
-    name = f"packed_{file.name}_{about.st_size}_{about.st_mtime_ns}_{LEVEL}"
-    if kept := load_cached(name):
-        return kept.decode()
+def _packed_file(file: Path) -> str:
+    """Return a file, packed once for all runs."""
+    file_status = file.stat()
+    name = f"packed_{file.name}_{file_status.st_size}_{file_status.st_mtime_ns}_{COMPRESSION_LEVEL}"
+    if cached := load_cached(name):
+        return cached.decode()
     packed_file = packed(file.read_bytes())
     save_cached(name, packed_file.encode())
     return packed_file

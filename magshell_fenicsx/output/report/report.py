@@ -11,7 +11,7 @@ import yaml
 from markupsafe import Markup
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.fields.modes import Frequency, read_frequencies
+from magshell_fenicsx.output.fields.mode_fields import Frequency, read_frequencies
 from magshell_fenicsx.output.report.interactive import interactive
 from magshell_fenicsx.output.report.verdict import (
     Line,
@@ -28,13 +28,13 @@ from magshell_fenicsx.output.report.verdict import (
     verdict,
 )
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import headline, is_flat, pole_of, shell_of
+from magshell_fenicsx.output.store.stored_results import headline, is_flat, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
 NAME, TEMPLATE = "report.html", "report_template.html"
-FOLDED = 30  # a table with at least so many points is folded
+MIN_FOLDED_ROWS = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
     "curve.png": "Load over displacement; dashed where the shell is unstable.",
     "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
@@ -42,20 +42,27 @@ PICTURES = {  # in the order of the report
     "solutions.png": "The end of the path, and the solutions that the search has found.",
     "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
     "animation.gif": "The shell along the path.",
-    "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
+    "magnetic_loads.png": (
+        "The magnetic energy read as loads on the deformed shell, at the last point."
+    ),
     "strains.png": "Strains of the mid-surface at the last point.",
     "stretches.png": "Stretches of the mid-surface and true stresses at the last point.",
     "moments.png": "Bending moments at the last point.",
     "contact.png": "Gap and contact pressure at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",
-    "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
-    "gradients.png": "Where a result would change most: red where more of a field raises it, blue where it lowers it.",
+    "instabilities.png": (
+        "Null vectors at the instabilities, on the deformed shell: how it buckles."
+    ),
+    "gradients.png": (
+        "Where a result would change most: red where more of a field raises it, "
+        "blue where it lowers it."
+    ),
     "frequencies.png": "Natural frequencies; below zero the shell is unstable.",
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
-SMALL = ("curve.png", "shell.png")  # beside each other
+SMALL_PICTURES = ("curve.png", "shell.png")  # side by side
 SOLUTION_COLUMNS = ("w_over_h", "w_pole_over_h", "volume_change", "energy")
-ADAPTED = ("hemisphere", "disc", "strip")  # geometries with mesh.tolerance
+ADAPTIVE_GEOMETRIES = ("hemisphere", "disc", "strip")  # geometries with mesh.tolerance
 TIMES = {
     "jit_s": "compiling kernels",
     "setup_s": "mesh and setup",
@@ -73,7 +80,7 @@ def write_report(folder: Path, *, playable: bool = True) -> None:
     Parameters
     ----------
     playable
-        Whether it has the shell to turn and the path to walk along.
+        Whether the report has the interactive part.
 
     Raises
     ------
@@ -85,19 +92,13 @@ def write_report(folder: Path, *, playable: bool = True) -> None:
 
 
 def report(folder: Path, *, playable: bool = True) -> str:
-    """The content of report.html."""
-    from jinja2 import (
-        BytecodeCache,
-        Environment,
-        FileSystemLoader,
-        StrictUndefined,
-    )  # takes long to import
+    """Return the content of report.html."""
+    # Jinja takes long to import
+    from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined
     from jinja2.bccache import Bucket
 
-    class Compiled(BytecodeCache):
-        """Python's code of the template; Jinja checks that it is that of the file and of this
-        Python.
-        """
+    class CompiledTemplates(BytecodeCache):
+        """Cache of the template's Python code; Jinja checks the file and the version of Python."""
 
         def load_bytecode(self, bucket: Bucket) -> None:
             if code := load_cached(f"template_{bucket.key}"):
@@ -107,57 +108,56 @@ def report(folder: Path, *, playable: bool = True) -> str:
             save_cached(f"template_{bucket.key}", bucket.bytecode_to_string())
 
     loader = FileSystemLoader(Path(__file__).parent)
-    made = Environment(
+    environment = Environment(
         loader=loader,
-        bytecode_cache=Compiled(),
+        bytecode_cache=CompiledTemplates(),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return made.get_template(TEMPLATE).render(_content(folder, playable))
+    return environment.get_template(TEMPLATE).render(_content(folder, playable))
 
 
 def _content(folder: Path, playable: bool) -> dict[str, Any]:
-    """The values of the template."""
+    """Return the values of the template."""
     summary, lines = read_run(folder)
-    played = (
-        interactive(folder, summary["case"]) if playable else None
-    )  # it moves in place of the animation
-    classical = not is_flat(summary["case"]) or any(float(line["p_over_pc"]) for line in lines)
-    path = path_table(
-        lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"])
-    )
+    case = summary["case"]
+    pole = pole_of(case)
+    first_line = lines[0] if lines else {}
+    played = interactive(folder, case) if playable else None  # it replaces the animation
+    classical = not is_flat(case) or any(float(line["p_over_pc"]) for line in lines)
+    length_unit = "m" if summary["dimensions"]["units"] == "SI" else ""
+    path = path_table(lines, length_unit, pole)
+    pictured_point = _pictured_point(case, read_rows(folder / "path.csv"))
+    parameter = ""
+    if summary["sensitivities"]:
+        parameter = symbol(amplitude(lines[-1]["amplitude"]).column)
+    gradients = list[list[Markup | str]]()
+    for result, gradient in summary.get("gradients", {}).items():
+        gradients += _gradients(result, gradient)
     return {
         "name": folder.resolve().name,
         "summary": summary,
         "verdict": verdict(summary, lines),
         "groups": _groups(summary, classical),
         "dimensions": _dimensions(summary, classical),
-        "pictures": list(
-            _pictures(
-                folder, _shown(summary["case"], read_rows(folder / "path.csv")), played is None
-            )
-        ),
+        "pictures": list(_pictures(folder, pictured_point, played is None)),
         "interactive": played,
-        "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
-        "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
+        "pole": pole_head(first_line, pole),
+        "heads": {name: _head(name, first_line) for name in SOLUTION_COLUMNS},
         "instabilities": [_instability(line, summary, lines) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
-        "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column)
-        if summary["sensitivities"]
-        else "",
-        "gradients": [
-            row for of, it in summary.get("gradients", {}).items() for row in _gradients(of, it)
-        ],
-        "how_to_estimate": _how_to_estimate(summary["case"]),
+        "sensitive": parameter,
+        "gradients": gradients,
+        "how_to_estimate": _how_to_estimate(case),
         "path": path,
         "rows": list(zip(*(column.cells for column in path), strict=True)),
-        "folded": len(lines) >= FOLDED,
+        "folded": len(lines) >= MIN_FOLDED_ROWS,
         "case": yaml.safe_dump(
-            summary["case"], sort_keys=False, allow_unicode=True, default_flow_style=None, width=110
+            case, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110
         ),
         "times": [(name, summary["timing"][key]) for key, name in TIMES.items()],
         "number": number,
@@ -165,84 +165,92 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
 
 
 def _head(name: str, line: Line) -> Markup:
-    """The heading of a column with its unit, and its size where the symbol does not have it."""
+    """Return the heading of a column with its unit."""
     of_column = shown_quantity(name, line)
-    where = pole_head(line) if name == "w_pole_over_h" else head(of_column)
-    return Markup("{} ({})").format(where, of_column.shown_unit) if of_column.shown_unit else where
+    heading = pole_head(line) if name == "w_pole_over_h" else head(of_column)
+    if not of_column.shown_unit:
+        return heading
+    return Markup("{} ({})").format(heading, of_column.shown_unit)
 
 
 def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
-    """Name and value of the numbers without units; `classical`: whether p_c says something of the
-    run.
+    """Return name and value of the dimensionless groups.
+
+    `classical` is whether the classical pressure p_c says something of the run.
     """
-    of, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
+    groups, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
     if chi is not None and "remanent" not in magnetic:
         field = "|B<sup>a</sup>|/√(μ<sub>0</sub>E)"
-    named = {
-        "R/h": of["radius_to_thickness"],
-        "ν": of["poisson_ratio"],
-        f"λ<sub>m</sub> = {field}": of["lambda_m"],
-        "Λ<sub>m</sub> = λ<sub>m</sub>R/h": of["Lambda_m"],
-        **({"p<sub>c</sub>/E": of["pc_over_E"]} if classical else {}),
+    values = {
+        "R/h": groups["radius_to_thickness"],
+        "ν": groups["poisson_ratio"],
+        f"λ<sub>m</sub> = {field}": groups["lambda_m"],
+        "Λ<sub>m</sub> = λ<sub>m</sub>R/h": groups["Lambda_m"],
+        **({"p<sub>c</sub>/E": groups["pc_over_E"]} if classical else {}),
     }
     if isinstance(chi, int | float):
-        named["susceptibility χ"] = chi
-    return [(Markup(name), number(v)) for name, v in named.items()]
+        values["susceptibility χ"] = chi
+    return [(Markup(name), number(v)) for name, v in values.items()]
 
 
 def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup, str]]:
-    """Name, value and unit of the quantities that the case gives with units."""
-    dims, magnetic, measured = (
-        summary["dimensions"],
-        summary["case"].get("magnetic") or {},
-        summary.get("in_units", {}),
-    )
-    named = {
-        "radius R": (dims["radius"], "m"),
-        "thickness h": (dims["thickness"], "m"),
-        "Young’s modulus E": (dims["youngs_modulus"], "Pa"),
+    """Return name, value and unit of the quantities that the case gives with units.
+
+    `classical` is whether the classical pressure p_c says something of the run.
+    """
+    dimensions, measured = summary["dimensions"], summary.get("in_units", {})
+    magnetic = summary["case"].get("magnetic") or {}
+    classical_pressure = measured.get("classical_pressure_Pa") if classical else None
+    values_and_units = {
+        "radius R": (dimensions["radius"], "m"),
+        "thickness h": (dimensions["thickness"], "m"),
+        "Young’s modulus E": (dimensions["youngs_modulus"], "Pa"),
         "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
-        "classical pressure p<sub>c</sub>": (
-            measured.get("classical_pressure_Pa") if classical else None,
-            "Pa",
-        ),
+        "classical pressure p<sub>c</sub>": (classical_pressure, "Pa"),
         "unit of the force, 2πD/R": (measured.get("unit_force_N"), "N"),
         "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
         "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),
     }
-    in_si = dims["units"] == "SI"
+    in_si = dimensions["units"] == "SI"
     return [
         (Markup(name), number(v), unit if in_si or unit == "T" else "")
-        for name, (v, unit) in named.items()
+        for name, (v, unit) in values_and_units.items()
         if v is not None
     ]
 
 
-def _shown(case: dict[str, Any], rows: Sequence[Row]) -> str:
-    """The point at which pictures show the shell, in words."""
-    row, last = headline(case, rows), [row for row in rows if row["label"] != SOLUTION][-1]
-    return "the last point" if row is last else f"point {row['point']}, the first instability"
+def _pictured_point(case: dict[str, Any], rows: Sequence[Row]) -> str:
+    """Return the point at which pictures show the shell, in words."""
+    row, path = headline(case, rows), [row for row in rows if row["label"] != SOLUTION]
+    return "the last point" if row is path[-1] else f"point {row['point']}, the first instability"
 
 
-def _pictures(folder: Path, shown_at: str, moving: bool) -> Iterator[tuple[str, str, bool]]:
-    """Source and caption of each picture in the folder, and whether it is shown small."""
-    beside = all(
-        _narrow((folder / name).read_bytes()) for name in SMALL if (folder / name).exists()
-    )
-    for pattern, told in PICTURES.items():
-        caption = told.replace("the last point", shown_at)
-        for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
-            content = base64.b64encode(light(file.read_bytes())).decode()
-            yield (
-                f"data:image/{file.suffix[1:]};base64,{content}",
-                caption,
-                beside and pattern in SMALL,
-            )
+def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tuple[str, str, bool]]:
+    """Yield source and caption of each picture in the folder, and whether it is shown small.
+
+    Parameters
+    ----------
+    pictured_point
+        Words for the point at which pictures show the shell.
+    animated
+        Whether the animation is shown.
+    """
+    small_files = [folder / name for name in SMALL_PICTURES if (folder / name).exists()]
+    side_by_side = all(_is_narrow(file.read_bytes()) for file in small_files)
+    for pattern, template in PICTURES.items():
+        caption = template.replace("the last point", pictured_point)
+        if pattern == "animation.gif" and not animated:
+            continue
+        is_small = side_by_side and pattern in SMALL_PICTURES
+        for file in sorted(folder.glob(pattern)):
+            content = base64.b64encode(reduced_picture(file.read_bytes())).decode()
+            yield f"data:image/{file.suffix[1:]};base64,{content}", caption, is_small
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
+    """Return the cells of a row of the table of instabilities, by column."""
     return {
         "point": line["point"],
         "kind": line["label"],
@@ -254,54 +262,66 @@ def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[st
     }
 
 
-def _solution(it: dict[str, Any]) -> list[Markup | str]:
-    names = (shown_quantity(name, it).name for name in SOLUTION_COLUMNS)
-    numbers = (number(it[name]) for name in names)
+def _solution(solution: dict[str, Any]) -> list[Markup | str]:
+    """Return the cells of a row of the table of solutions."""
+    names = (shown_quantity(name, solution).name for name in SOLUTION_COLUMNS)
+    numbers = (number(solution[name]) for name in names)
     return [
-        f"{it['point']}",
-        f"{it['solution']}",
-        stability(it),
+        f"{solution['point']}",
+        f"{solution['solution']}",
+        stability(solution),
         *numbers,
-        number(it["residual"], 2),
+        number(solution["residual"], 2),
     ]
 
 
-def _frequency(it: Frequency) -> list[Markup | str]:
+def _frequency(frequency: Frequency) -> list[Markup | str]:
+    """Return the cells of a row of the table of frequencies."""
     return [
-        f"{it.point}",
-        it.wave or "–",
-        number(it.omega2),
-        "–" if isnan(it.hertz) else number(it.hertz),
+        f"{frequency.point}",
+        frequency.wave or "–",
+        number(frequency.omega2),
+        "–" if isnan(frequency.hertz) else number(frequency.hertz),
     ]
 
 
-def _gradients(of: str, it: dict[str, Any]) -> Iterator[list[Markup | str]]:
-    """Result, its value, parameter, derivative, and where that by a field is largest."""
-    first: list[Markup | str] = [of, number(it["value"])]
-    for by, slope in it["numbers"].items():
-        yield [*first, by, number(slope), "–", "–"]
-    for by, field in it["fields"].items():
-        alike = Markup(", ").join(number(v) for v in field["alike"])
-        at = ", ".join(f"{x:.3g}" for x in field["at"])
-        yield [*first, by, alike, number(field["most_per_area"]), f"({at})"]
+def _gradients(result: str, gradient: dict[str, Any]) -> Iterator[list[Markup | str]]:
+    """Yield rows of the table of gradients.
+
+    The cells are the result, its value, the parameter, the derivative, the largest derivative per
+    area of a field, and where that is.
+    """
+    first_cells: list[Markup | str] = [result, number(gradient["value"])]
+    for parameter, slope in gradient["numbers"].items():
+        yield [*first_cells, parameter, number(slope), "–", "–"]
+    for parameter, field in gradient["fields"].items():
+        components = Markup(", ").join(number(v) for v in field["alike"])
+        place = ", ".join(f"{x:.3g}" for x in field["at"])
+        yield [*first_cells, parameter, components, number(field["most_per_area"]), f"({place})"]
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:
-    """How to get an error estimate, for a run that has none."""
+    """Return how to get an error estimate, for a run that has none."""
     if "tolerance" in case["mesh"]:
-        return "mesh.tolerance was ignored because this run has no scalar result; the default mesh was used"
-    if case["model"] == "shell" and shell_of(case)["geometry"] in ADAPTED:
+        return (
+            "mesh.tolerance was ignored because this run has no scalar result; "
+            "the default mesh was used"
+        )
+    if case["model"] == "shell" and shell_of(case)["geometry"] in ADAPTIVE_GEOMETRIES:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
     finer = (
         "mesh.degree one higher"
         if shell_of(case)["geometry"] == "mesh"
         else "mesh.refinement twice as large"
     )
-    return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"
+    return (
+        f"run it again with {finer} and compare "
+        "(mesh.tolerance is not offered for this geometry or model)"
+    )
 
 
 def report_of(folder: Path) -> Path:
-    """The report of a run's folder, written if it is not there.
+    """Return the report of a run's folder, written if it is not there.
 
     Raises
     ------
@@ -315,7 +335,7 @@ def report_of(folder: Path) -> Path:
     return (folder / NAME).resolve()
 
 
-def opened(file: Path) -> bool:
+def open_in_browser(file: Path) -> bool:
     """Whether a web browser could be asked to show a file."""
     import webbrowser
 
@@ -325,32 +345,35 @@ def opened(file: Path) -> bool:
         return False
 
 
-LARGE = 250_000  # bytes
-COLUMN = 120.0  # mm
-WIDEST = 1100  # pixels: the width of the page
+LARGE_PICTURE = 250_000  # bytes
+MAX_COLUMN_WIDTH = 120.0  # mm
+DEFAULT_DPI = 200.0  # of a PNG file that does not say it
+PAGE_WIDTH = 1100  # pixels
 
 
-def _narrow(content: bytes) -> bool:
-    """Whether a PNG file has a size of one column of a paper."""
+def _is_narrow(content: bytes) -> bool:
+    """Whether a PNG file is no wider than a column of a paper; True of other files."""
     if not content.startswith(b"\x89PNG"):
         return True
     from PIL import Image
 
     with Image.open(io.BytesIO(content)) as image:
-        return bool(image.width / image.info.get("dpi", (200.0,))[0] * 25.4 < COLUMN)
+        dpi = image.info.get("dpi", (DEFAULT_DPI,))[0]
+        return bool(image.width / dpi * 25.4 < MAX_COLUMN_WIDTH)
 
 
-def light(content: bytes) -> bytes:
-    """A PNG file as it is, or if it is large with the page's width, in all its colours; other files
-    as they are.
+def reduced_picture(content: bytes) -> bytes:
+    """Return a PNG file as it is, or if it is large with the page's width, in all its colours.
+
+    Other files are returned as they are.
     """
-    if len(content) < LARGE or not content.startswith(b"\x89PNG"):
+    if len(content) < LARGE_PICTURE or not content.startswith(b"\x89PNG"):
         return content
     from PIL import Image
 
     with Image.open(io.BytesIO(content)) as image:
-        size = min(WIDEST, image.width), round(image.height * min(WIDEST / image.width, 1))
+        size = min(PAGE_WIDTH, image.width), round(image.height * min(PAGE_WIDTH / image.width, 1))
         smaller = image.convert("RGB").resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-    reduced = io.BytesIO()
-    smaller.save(reduced, "PNG", compress_level=6)
-    return min(content, reduced.getvalue(), key=len)
+    reduced_file = io.BytesIO()
+    smaller.save(reduced_file, "PNG", compress_level=6)
+    return min(content, reduced_file.getvalue(), key=len)

@@ -1,5 +1,7 @@
-"""DIR/checkpoint: the case, then every result and finding of a history, each on disk before the
-next is computed.
+"""DIR/checkpoint: the case, then every result and finding of a run, each on disk before the next.
+
+A result is a point of a path or the reason of a failure; a finding is what is computed at a point,
+see `RecordedValues`. A resumed run replays them in place of computing them.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through
 adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the other ranks wait for ever.
@@ -24,16 +26,16 @@ from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
-from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.problem.problem import Document
 
-HEAD = struct.Struct("<4sQI")  # mark, length and checksum of the content
+FRAME_HEAD = struct.Struct("<4sQI")  # mark, length and checksum of the content
 MARK = b"MSF1"
 
 
 def framed(content: bytes) -> bytes:
-    """The bytes to append for one element.
+    """Return the bytes to append for one element of the file.
 
     Examples
     --------
@@ -42,36 +44,35 @@ def framed(content: bytes) -> bytes:
     >>> read_frame(file), read_frame(file), file.tell()
     (b'whole', None, 21)
     """
-    return HEAD.pack(MARK, len(content), zlib.crc32(content)) + content
+    return FRAME_HEAD.pack(MARK, len(content), zlib.crc32(content)) + content
 
 
 def read_frame(stream: BinaryIO) -> bytes | None:
-    """The element at the stream's position; None, with the position unchanged, if there is no
-    complete one.
+    """Return the element at the stream's position.
+
+    None, with the position unchanged, if there is no complete one.
     """
     start = stream.tell()
-    head = stream.read(HEAD.size)
-    if len(head) == HEAD.size:
-        mark, length, checksum = HEAD.unpack(head)
-        left = stream.seek(0, os.SEEK_END) - stream.seek(
-            start + HEAD.size
-        )  # a damaged length may be any number
-        if (
-            mark == MARK
-            and length <= left
-            and zlib.crc32(content := stream.read(length)) == checksum
-        ):
-            return content
+    head = stream.read(FRAME_HEAD.size)
+    if len(head) == FRAME_HEAD.size:
+        mark, length, checksum = FRAME_HEAD.unpack(head)
+        end = stream.seek(0, os.SEEK_END)
+        content_start = stream.seek(start + FRAME_HEAD.size)
+        # a damaged length may be any number
+        if mark == MARK and length <= end - content_start:
+            content = stream.read(length)
+            if zlib.crc32(content) == checksum:
+                return content
     stream.seek(start)
     return None
 
 
 Array = NDArray[np.float64]
-CLOSE = 1e-9  # nodes at a smaller distance, over the mesh's size, are equal
+SAME_PLACE_TOLERANCE = 1e-9  # distance of equal nodes over the mesh's size
 
 
 class Ordering:
-    """The nodes of a function space, numbered once and identified by their positions.
+    """Order of the nodes of a function space: numbered once and identified by their positions.
 
     Parameters
     ----------
@@ -79,14 +80,14 @@ class Ordering:
         A space distributed over all ranks, or the same space on every rank.
     comm
         The communicator of all ranks.
-    known
+    places
         On rank 0, the (n, 3) positions on the affine mesh in the order to use, or None for the
         present order.
 
     Raises
     ------
     CaseError
-        On every rank, if the nodes differ from `known`.
+        On every rank, if the nodes differ from `places`.
 
     Attributes
     ----------
@@ -97,64 +98,64 @@ class Ordering:
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, places: Array | None = None) -> None:
-        self._within, self._comm = V.mesh.comm, comm
-        self._values = V.dofmap.index_map_bs
-        mine = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
-        present = self._within.allgather(mine)
+        self._space_comm, self._comm = V.mesh.comm, comm
+        self._values_per_node = V.dofmap.index_map_bs
+        own_places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
+        places_of_ranks = self._space_comm.allgather(own_places)
         places = comm.bcast(places)
         if places is None:
-            self.places: Array = np.concatenate(present)
-            first = sum(len(part) for part in present[: self._within.rank])
-            self._mine: NDArray[np.int64] = first + np.arange(len(mine))
+            self.places: Array = np.concatenate(places_of_ranks)
+            first_number = sum(len(part) for part in places_of_ranks[: self._space_comm.rank])
+            self._own_numbers: NDArray[np.int64] = first_number + np.arange(len(own_places))
         else:
-            self.places, self._mine = places, self._found(places, mine, comm)
-        self._parts = self._within.allgather(self._mine)
-        self.size, self.last = (
-            len(self._mine) * self._values,
-            self._within.rank == self._within.size - 1,
-        )
+            self.places, self._own_numbers = places, self._numbers_of(places, own_places, comm)
+        self._numbers_of_ranks = self._space_comm.allgather(self._own_numbers)
+        self.size = len(self._own_numbers) * self._values_per_node
+        self.last = self._space_comm.rank == self._space_comm.size - 1
 
-    def _found(self, places: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
-        """The numbers of this rank's nodes among the known ones."""
-        distance, number = scipy.spatial.cKDTree(places).query(mine)
-        parts = self._within.allgather(number)
-        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(places)))
-        close = np.all(distance < CLOSE * np.abs(places).max())
-        if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
+    def _numbers_of(self, places: Array, own_places: Array, comm: MPI.Comm) -> NDArray[np.int64]:
+        """Return the numbers of this rank's nodes among the places; collective."""
+        distance, number = scipy.spatial.cKDTree(places).query(own_places)
+        numbers_of_ranks = self._space_comm.allgather(number)
+        one_to_one = np.array_equal(
+            np.sort(np.concatenate(numbers_of_ranks)), np.arange(len(places))
+        )
+        all_close = np.all(distance < SAME_PLACE_TOLERANCE * np.abs(places).max())
+        if not comm.allreduce(bool(one_to_one and all_close), MPI.LAND):
             raise CaseError(
-                "--resume: the mesh differs from the checkpoint's; give another folder, or --overwrite in place of "
-                "--resume"
+                "--resume: the mesh differs from the checkpoint's; give another folder, "
+                "or --overwrite in place of --resume"
             )
         return np.asarray(number)
 
     @property
     def is_present(self) -> bool:
-        """Whether the order in use is the present one: each rank has the nodes that it had in the
-        file's run."""
-        return np.array_equal(np.concatenate(self._parts), np.arange(len(self.places)))
+        """Whether each rank has the nodes that it had in the run of the file."""
+        return np.array_equal(np.concatenate(self._numbers_of_ranks), np.arange(len(self.places)))
 
     def gather(self, u: Vector) -> Array:
-        """All values (n, components) of a displacement on rank 0 of its space; empty on other
-        ranks.
-        """
-        parts = self._within.gather(u)
-        whole = np.empty((len(self.places), self._values)) if parts else np.empty((0, self._values))
-        for where, part in zip(self._parts, parts or [], strict=False):
-            whole[where] = part.reshape(-1, self._values)
-        return whole
+        """Return all values (n, components) of a displacement on rank 0 of its space.
 
-    def scatter(self, whole: Array) -> Vector:
-        """This rank's part of values that every rank has."""
-        return np.asarray(whole.reshape(-1, self._values)[self._mine].ravel())
+        Empty on other ranks.
+        """
+        parts = self._space_comm.gather(u)
+        values = np.empty((len(self.places) if parts else 0, self._values_per_node))
+        for numbers, part in zip(self._numbers_of_ranks, parts or [], strict=False):
+            values[numbers] = part.reshape(-1, self._values_per_node)
+        return values
+
+    def scatter(self, values: Array) -> Vector:
+        """Return this rank's part of values (n, components) that every rank has."""
+        return np.asarray(values.reshape(-1, self._values_per_node)[self._own_numbers].ravel())
 
 
 NAME = "checkpoint"
-FILE = "case_file"  # key with the name of the case file, which changes no result
+CASE_FILE = "case_file"  # key with the name of the case file, which changes no result
 
 
-def begun(document: Document) -> bytes:
-    """The content of an empty checkpoint."""
-    return framed(json.dumps({**identity(document), FILE: document.name}).encode())
+def empty_content(document: Document) -> bytes:
+    """Return the content of a checkpoint without results."""
+    return framed(json.dumps({**identity(document), CASE_FILE: document.name}).encode())
 
 
 def check_resumable(file: Path, document: Document) -> None:
@@ -165,14 +166,14 @@ def check_resumable(file: Path, document: Document) -> None:
     CaseError
         If there is no checkpoint, it is damaged, or it belongs to another case or other sources.
     """
-    saved = begun_with(file)
+    saved = identity_in(file)
     if saved is None:
         raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
-    refuse_other(saved, document, file.parent)
+    refuse_other_case(saved, document, file.parent)
 
 
-def begun_with(file: Path) -> dict[str, Any] | None:
-    """The `identity` of the run that began a checkpoint; None if there is no checkpoint.
+def identity_in(file: Path) -> dict[str, Any] | None:
+    """Return the `identity` of the run that began a checkpoint; None if there is no checkpoint.
 
     Raises
     ------
@@ -194,7 +195,7 @@ def begun_with(file: Path) -> dict[str, Any] | None:
 
 
 def identity(document: Document) -> dict[str, Any]:
-    """Everything that a run depends on: the case, the files that it names, the program."""
+    """Return everything that a run depends on: the case, the files that it names, the program."""
     data = {"case": document.data, **document.outside, "sources": code_version()}
     return dict(json.loads(json.dumps(data)))  # as read back from a file
 
@@ -203,7 +204,7 @@ class OtherSources(CaseError):
     """The saved results were computed by other sources of this program."""
 
 
-def refuse_other(saved: dict[str, Any], document: Document, folder: Path) -> None:
+def refuse_other_case(saved: dict[str, Any], document: Document, folder: Path) -> None:
     """Check that saved results belong to this case and these sources.
 
     Raises
@@ -211,35 +212,41 @@ def refuse_other(saved: dict[str, Any], document: Document, folder: Path) -> Non
     CaseError
         With the first difference; `OtherSources` if only the sources differ.
     """
-    now, saved = _solved(identity(document)), _solved(saved)
-    theirs, ours = saved.get("sources", saved.get("version")), now["sources"]
-    saved_case = _of_case(saved)
-    if saved_case != _of_case(now):
+    present, saved = _without_appearance(identity(document)), _without_appearance(saved)
+    saved_sources, sources = saved.get("sources", saved.get("version")), present["sources"]
+    saved_case = _without_program(saved)
+    if saved_case != _without_program(present):
         raise CaseError(
-            f"--resume: {folder} belongs to another run: {_difference(saved_case, now)}; "
+            f"--resume: {folder} belongs to another run: {_difference(saved_case, present)}; "
             "give another folder, or --overwrite in place of --resume"
         )
-    if theirs != ours:
+    if saved_sources != sources:
         raise OtherSources(
-            f"--resume: {folder} was computed by other sources of magshell_fenicsx ({theirs}; these are {ours}); "
+            f"--resume: {folder} was computed by other sources of magshell_fenicsx "
+            f"({saved_sources}; these are {sources}); "
             "--overwrite in place of --resume computes it again"
         )
 
 
-def is_of(saved: dict[str, Any], document: Document) -> bool:
+def belongs_to(saved: dict[str, Any], document: Document) -> bool:
     """Whether saved results belong to this case, by whatever sources."""
-    return _of_case(_solved(saved)) == _of_case(_solved(identity(document)))
+    return _without_program(_without_appearance(saved)) == _without_program(
+        _without_appearance(identity(document))
+    )
 
 
-def _of_case(data: dict[str, Any]) -> dict[str, Any]:
-    """Without the program."""
+def _without_program(data: dict[str, Any]) -> dict[str, Any]:
+    """Return an identity without the program's sources."""
     return {key: value for key, value in data.items() if key not in ("sources", "version")}
 
 
-def _solved(data: dict[str, Any]) -> dict[str, Any]:
-    """Without the name of the file and how pictures look, which change no result."""
+def _without_appearance(data: dict[str, Any]) -> dict[str, Any]:
+    """Return an identity without the name of the case file and the section `output`.
+
+    They change no result.
+    """
     case = {key: value for key, value in (data.get("case") or {}).items() if key != "output"}
-    return {**{key: value for key, value in data.items() if key != FILE}, "case": case}
+    return {**{key: value for key, value in data.items() if key != CASE_FILE}, "case": case}
 
 
 class Checkpoint:
@@ -248,8 +255,8 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file of a run that begins (`begun`), or of an earlier run; an incomplete last entry is
-        cut off.
+        The file of a run that begins (`empty_content`), or of an earlier run; an incomplete last
+        entry is cut off.
     V
         The displacement's space.
     comm
@@ -265,58 +272,70 @@ class Checkpoint:
         self._file, self._comm, self.replayed = file, comm, 0
         self._writing: AppendedFile | None = None
         self._replaying = True
-        by_first(comm, self._begin, "cannot be read")
+        access_disk(comm, self._open, "cannot be read")
         self.begin(V)
 
-    def _begin(self) -> None:
+    def _open(self) -> None:
+        """Open the file for reading, after its head."""
         self._reading = open_result(self._file)
         read_frame(self._reading)
 
     def begin(self, space: fem.FunctionSpace) -> None:
-        """The results from here on have the values of this space, whose nodes come first."""
-        places = by_first(self._comm, self._places, "cannot be read") if self._replaying else None
+        """Begin results with the values of a space, whose nodes come first in the file;
+        collective.
+        """
+        places = (
+            access_disk(self._comm, self._places_in_file, "cannot be read")
+            if self._replaying
+            else None
+        )
         self._ordering = Ordering(space, self._comm, places)
         self._replaying = places is not None
         if not self._replaying:
             self._append(self._ordering.places.tobytes())
 
-    def _places(self) -> Array | None:
-        """The positions of the nodes, if the file has them."""
+    def _places_in_file(self) -> Array | None:
+        """Return the positions (n, 3) of the nodes, if the file has them."""
         content = read_frame(self._reading)
         return None if content is None else np.frombuffer(content).reshape(-1, 3)
 
     def replay(self) -> Point | str | None:
-        """The next result in the file; None at its end."""
-        content = self._next()
+        """Return the next result in the file; None at its end. Collective."""
+        content = self._next_content()
         if content is None:
             return None
         self.replayed += 1
         return self._decoded(content)
 
-    def _next(self) -> bytes | None:
-        """The next element of the file; None at its end."""
+    def _next_content(self) -> bytes | None:
+        """Return the next element of the file; None at its end. Collective."""
         if not self._replaying:
             return None
-        content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
+        content = access_disk(self._comm, lambda: read_frame(self._reading), "cannot be read")
         self._replaying = content is not None
         return content
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
-        """The next finding in the file; at its end that of `find`, which is put there."""
-        if content := self._next():
+        """Return the next finding in the file; at its end that of `find`, which is put there.
+        Collective.
+        """
+        if content := self._next_content():
             return self._read(content)
-        found = find()
-        parts = self._comm.gather(found.vector)
+        finding = find()
+        parts = self._comm.gather(finding.vector)
         vectors = [part for part in parts or () if part is not None]
         head = json.dumps(
-            {"values": found.values, "parts": [part.size for part in vectors]}, default=_plain
+            {"values": finding.values, "parts": [part.size for part in vectors]},
+            default=_python_number,
         )
         self._append(b"\n".join([head.encode(), b"".join(part.tobytes() for part in vectors)]))
-        return found
+        return finding
 
     def _read(self, content: bytes) -> RecordedValues:
-        """Return a finding, with this rank's part of its vector if the ranks have the nodes that
-        they had."""
+        """Return a finding, with this rank's part of its vector.
+
+        There is no vector if the ranks do not have the nodes that they had.
+        """
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" not in decoded)
@@ -328,12 +347,12 @@ class Checkpoint:
         )
 
     def _refuse_other_kind(self, *, is_other: bool) -> None:
-        """See that the file has a result where a result is wanted, and a finding where one is.
+        """Check that the file has a result where a result is due, and a finding where one is due.
 
         Raises
         ------
         Damaged
-            If it is the other: the history has gone another way than that of the file.
+            If it is the other: the run has taken another way than that of the file.
         """
         if is_other:
             raise Damaged(
@@ -341,82 +360,84 @@ class Checkpoint:
             )
 
     def record(self, result: Point | str) -> None:
-        """Put a result on disk."""
+        """Put a result on disk. Collective."""
         if isinstance(result, str):
             self._append(json.dumps({"failure": result}).encode())
             return
         size = self._ordering.size
-        beyond = [
-            self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1)
-            for v in (result.state.u, result.du)
+        values_beyond_nodes = [
+            self._comm.bcast(vector[size:].tolist(), root=self._comm.size - 1)
+            for vector in (result.state.u, result.du)
         ]
-        u, du = (self._ordering.gather(v[:size]) for v in (result.state.u, result.du))
-        self._append(_encoded(result, u, du, beyond))
+        u, du = (self._ordering.gather(vector[:size]) for vector in (result.state.u, result.du))
+        self._append(_encoded(result, u, du, values_beyond_nodes))
 
     def check(self, known: bool) -> None:
-        pass
+        """Do nothing: a checkpoint takes every point."""
 
     def close(self) -> None:
-        def close() -> None:
+        """Close the file. Collective."""
+
+        def close_files() -> None:
             self._reading.close()
             if self._writing:
                 self._writing.close()
 
-        by_first(self._comm, close)
+        access_disk(self._comm, close_files)
 
     def remove(self) -> None:
-        """Delete the file: the run is complete."""
-        by_first(self._comm, self._file.unlink)
+        """Delete the file of a complete run. Collective."""
+        access_disk(self._comm, self._file.unlink)
 
     def _append(self, content: bytes) -> None:
+        """Put an element on disk. Collective."""
+
         def write() -> None:
             if self._writing is None:  # cut off an incomplete last entry
                 self._writing = AppendedFile(self._file, self._reading.tell())
             self._writing.append(framed(content))
 
-        by_first(self._comm, write)
+        access_disk(self._comm, write)
 
     def _decoded(self, content: bytes) -> Point | str:
+        """Return a result from its content, with this rank's part of its vectors."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" in decoded)
         if "failure" in decoded:
             return str(decoded["failure"])
-        u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
-        beyond = decoded.pop("beyond")
+        vectors = np.split(np.frombuffer(data), 2)
+        u, du = (self._ordering.scatter(vector) for vector in vectors)
+        values_beyond_nodes = decoded.pop("beyond")
         if self._ordering.last:  # the numbers of a loading device
-            u, du = (np.concatenate([v, more]) for v, more in zip((u, du), beyond, strict=True))
+            u, du = (
+                np.concatenate([vector, further])
+                for vector, further in zip((u, du), values_beyond_nodes, strict=True)
+            )
         return Point(State(u, decoded.pop("mu")), du=du, **decoded)
 
 
-def _plain(number: Any) -> Any:
-    """A number of NumPy as one of Python."""
+def _python_number(number: Any) -> Any:
+    """Return a number of NumPy as one of Python."""
     return number.item()
 
 
-def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> bytes:
-    """A line of JSON with the numbers of a point, then its two vectors; `beyond` has their numbers
-    without a node.
+def _encoded(point: Point, u: Array, du: Array, values_beyond_nodes: list[list[float]]) -> bytes:
+    """Return the content of a point: a line of JSON with its numbers, then its two vectors.
+
+    `values_beyond_nodes` are the values of u and du that belong to no node.
     """
-    numbers = {
-        f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")
-    }
-    return (
-        json.dumps({**numbers, "mu": point.state.mu, "beyond": beyond}).encode()
-        + b"\n"
-        + u.tobytes()
-        + du.tobytes()
-    )
+    names = [field.name for field in fields(point) if field.name not in ("state", "du")]
+    numbers = {name: getattr(point, name) for name in names}
+    head = json.dumps({**numbers, "mu": point.state.mu, "beyond": values_beyond_nodes})
+    return head.encode() + b"\n" + u.tobytes() + du.tobytes()
 
 
 def _difference(saved: Any, present: Any, key: str = "") -> str:
-    """The first key with different values, and both values."""
+    """Return the first key with different values, and both values, in words."""
     if isinstance(saved, dict) and isinstance(present, dict):
         name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
-        return _difference(
-            saved.get(name),
-            present.get(name),
-            f"{key}.{name}".removeprefix(".").removeprefix("case."),
-        )
+        inner_key = f"{key}.{name}".removeprefix(".").removeprefix("case.")
+        return _difference(saved.get(name), present.get(name), inner_key)
     values = ["nothing" if value is None else json.dumps(value) for value in (saved, present)]
     return f"{key} is {values[0]} there and {values[1]} here"

@@ -1,4 +1,8 @@
-"""Files that stay readable after a kill, a crash or a full disk."""
+"""Files that stay readable after a kill, a crash or a full disk.
+
+Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`); reading refuses what is no
+regular file.
+"""
 
 import json
 import math
@@ -14,23 +18,23 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.input_files import open_regular, read_bounded
 
 # s between two waits for the disk: on a busy one each takes as long as a point of a small model
-EACH = 1.0
+SYNC_INTERVAL = 1.0
 
 
 class Damaged(CaseError):
-    """A file of results is not what the program wrote; the message names it and says what is wrong."""
+    """File of results that is not what the program wrote; the message names it and says why."""
 
 
 def read_result(file: Path) -> bytes:
-    """The content of a file of results; see `open_result`."""
+    """Return the content of a file of results; raises as `open_result`."""
     try:
         return read_bounded(file)
     except OSError as e:
-        raise _special(e) from None
+        raise _error_for(e) from None
 
 
 def open_result(file: Path) -> BinaryIO:
-    """A file of results, open for reading.
+    """Return a file of results, open for reading.
 
     Raises
     ------
@@ -42,20 +46,21 @@ def open_result(file: Path) -> BinaryIO:
     try:
         return open_regular(file)
     except OSError as e:
-        raise _special(e) from None
+        raise _error_for(e) from None
 
 
-def _special(e: OSError) -> Exception:
-    """What is raised for a file that no run has written, as a run writes regular files."""
-    return (
-        Damaged(f"{e.filename}: is damaged: {e.strerror}")
-        if e.errno in (EFBIG, EINVAL, EISDIR)
-        else e
-    )
+def _error_for(e: OSError) -> Exception:
+    """Return the exception to raise for an error of the disk.
+
+    `Damaged` for a file that no run has written: runs write regular files.
+    """
+    if e.errno in (EFBIG, EINVAL, EISDIR):
+        return Damaged(f"{e.filename}: is damaged: {e.strerror}")
+    return e
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file of results.
+    """Return the JSON object in a file of results.
 
     Raises
     ------
@@ -114,11 +119,10 @@ def sync_folder(folder: Path) -> None:
 
 
 class AppendedFile:
-    """A file that grows by complete pieces.
+    """File that grows by complete pieces.
 
-    A killed process loses none. A failure of power may lose the pieces since the disk was last
-    waited for: that is at the first piece, at later ones if `EACH` seconds have passed, and at the
-    end.
+    A killed process loses none. A failure of power may lose the pieces since the last sync: a sync
+    is at the first piece, at later ones if `SYNC_INTERVAL` seconds have passed, and at the end.
 
     Parameters
     ----------
@@ -131,8 +135,8 @@ class AppendedFile:
         self._stream = file.open("ab", buffering=0)
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
         self._stream.truncate(self._length)
-        self._waited = -math.inf  # when, in the time of the clock
-        self._on_disk = self._length
+        self._last_sync = -math.inf  # s, of the monotonic clock
+        self._synced_length = self._length
 
     def append(self, content: bytes, *, waits: bool = True) -> None:
         """Add a piece.
@@ -140,31 +144,32 @@ class AppendedFile:
         Parameters
         ----------
         waits
-            Whether the disk is waited for, where it is time.
+            Whether the disk is waited for, if `SYNC_INTERVAL` has passed.
 
         Raises
         ------
         OSError
             With the file's name; the file keeps its length, or that which was on disk.
         """
-        left = memoryview(content)
+        remaining = memoryview(content)
         try:
-            while left:
-                left = left[self._stream.write(left) :]
-            if waits and time.monotonic() - self._waited >= EACH:
-                self._wait(self._length + len(content))
+            while remaining:
+                remaining = remaining[self._stream.write(remaining) :]
+            if waits and time.monotonic() - self._last_sync >= SYNC_INTERVAL:
+                self._sync(self._length + len(content))
         except OSError as e:
             self._stream.truncate(self._length)
             raise OSError(e.errno, e.strerror, str(self._file)) from None
         self._length += len(content)
 
-    def _wait(self, length: int) -> None:
+    def _sync(self, length: int) -> None:
+        """Wait until the file's first `length` bytes are on disk."""
         try:
             os.fsync(self._stream.fileno())
         except OSError:
-            self._length = self._on_disk  # pieces between are lost
+            self._length = self._synced_length  # pieces between are lost
             raise
-        self._on_disk, self._waited = length, time.monotonic()
+        self._synced_length, self._last_sync = length, time.monotonic()
 
     def close(self) -> None:
         """Close the file, whose last pieces are on disk then.
@@ -175,8 +180,8 @@ class AppendedFile:
             With the file's name.
         """
         try:
-            if self._waited > -math.inf and self._on_disk < self._length:
-                self._wait(self._length)
+            if self._last_sync > -math.inf and self._synced_length < self._length:
+                self._sync(self._length)
         except OSError as e:
             raise OSError(e.errno, e.strerror, str(self._file)) from None
         finally:

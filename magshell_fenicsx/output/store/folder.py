@@ -16,16 +16,16 @@ if TYPE_CHECKING:  # a refused case does without
     from mpi4py import MPI
 
 T = TypeVar("T")
-MOST_NAMED = 6
-OF_POINTS = {"outcome", "evaluation", "samples"}  # keys of the files in points/
+MAX_NAMED_FILES = 6  # in a message
+KEYS_OF_POINTS = {"outcome", "evaluation", "samples"}  # of the files in points/
 
 
 class DiskError(RuntimeError):
-    """A file could not be written or read; the message has its name and the reason."""
+    """Error that a file could not be written or read; the message has its name and the reason."""
 
 
-def given_folder(out: Path | str) -> Path:
-    """The folder that a user names.
+def user_folder(out: Path | str) -> Path:
+    """Return the folder that a user names.
 
     Raises
     ------
@@ -50,8 +50,15 @@ def given_folder(out: Path | str) -> Path:
     return folder
 
 
-def refuse_foreign(folder: Path, names: Iterable[str], what: str) -> None:
+def refuse_foreign(folder: Path, names: Iterable[str], new_files: str) -> None:
     """Refuse to replace files that are not known as results.
+
+    Parameters
+    ----------
+    names
+        Names of the unknown files, relative to the folder.
+    new_files
+        Words for what would replace them.
 
     Raises
     ------
@@ -59,24 +66,28 @@ def refuse_foreign(folder: Path, names: Iterable[str], what: str) -> None:
         With their names, if there are any.
     """
     if foreign := sorted(names):
-        more = f" and {len(foreign) - MOST_NAMED} more" * (len(foreign) > MOST_NAMED)
+        further = f" and {len(foreign) - MAX_NAMED_FILES} more" * (len(foreign) > MAX_NAMED_FILES)
         raise CaseError(
-            f"{folder}: has files that {what} would replace and that none is known to have written: "
-            f"{', '.join(foreign[:MOST_NAMED])}{more}; move them away, or give another folder"
+            f"{folder}: has files that {new_files} would replace and that none is known to have "
+            f"written: {', '.join(foreign[:MAX_NAMED_FILES])}{further}; "
+            "move them away, or give another folder"
         )
 
 
-def refuse_others(
-    folder: Path, names: Sequence[str], kept: Collection[str], what: str, case: str = ""
+def refuse_other_tables(
+    folder: Path, names: Sequence[str], keys: Collection[str], new_files: str, case: str = ""
 ) -> None:
-    """Refuse a folder for the tables of many runs that has those of another case file, or files of
-    others.
+    """Refuse a folder for the tables of many runs that has tables of another case, or foreign
+    files.
 
     Parameters
     ----------
     names
-        The tables; the first is a JSON object with the keys `kept`, and the name of the case file
-        as `case`.
+        Names of the tables; the first is a JSON object.
+    keys
+        Keys of that object, besides the name of the case file as `case`.
+    new_files
+        Words for what would replace the files.
     case
         The name of the case file, if another one is refused.
 
@@ -86,19 +97,22 @@ def refuse_others(
         On the rank that calls.
     """
     content = _object(folder / names[0])
-    if content.keys() >= set(kept):
+    if content.keys() >= set(keys):
         name = content.get("case")
-        if case and isinstance(name, str) and Path(name).stem != Path(case).stem:
+        is_of_other_case = isinstance(name, str) and Path(name).stem != Path(case).stem
+        if case and is_of_other_case:
             raise CaseError(
-                f"--out {folder}: has {what} of {name}, which is kept; give another folder"
+                f"--out {folder}: has {new_files} of {name}, which is kept; give another folder"
             )
-    elif not any(_object(file).keys() & OF_POINTS for file in (folder / "points").glob("*.json")):
+    elif not any(
+        _object(file).keys() & KEYS_OF_POINTS for file in (folder / "points").glob("*.json")
+    ):
         # of an interrupted one there would be points
-        refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), what)
+        refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), new_files)
 
 
 def _object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty if there is none."""
+    """Return the JSON object in a file; empty if there is none."""
     try:
         content = json.loads(read_bounded(file))
     except (OSError, ValueError, RecursionError):
@@ -107,7 +121,7 @@ def _object(file: Path) -> dict[str, Any]:
 
 
 def _is_filled(file: Path) -> bool:
-    """Whether there is something that is no empty file."""
+    """Whether there is anything but an empty file."""
     return file.exists() and (not file.is_file() or file.stat().st_size > 0)
 
 
@@ -120,23 +134,23 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
         On every rank, if the folder cannot be made or written to.
     """
 
-    def made() -> Path:
+    def prepared() -> Path:
         try:
             make(out)
         except OSError as e:
-            within = e.filename is not None and Path(e.filename) != out
-            raise CaseError(
-                f"--out {out}: {f'{e.filename} ' * within}cannot be written: {e.strerror}"
-            ) from None
+            is_inside = e.filename is not None and Path(e.filename) != out
+            name = f"{e.filename} " if is_inside else ""
+            raise CaseError(f"--out {out}: {name}cannot be written: {e.strerror}") from None
         return out
 
-    return on_first_rank(comm, made)
+    return on_first_rank(comm, prepared)
 
 
 @contextmanager
-def held_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
-    """Lock a folder against other runs inside `with`; ranks of a killed mpirun may still be
-    writing.
+def locked_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
+    """Lock a folder against other runs inside `with`; collective.
+
+    Ranks of a killed mpirun may still be writing.
 
     Parameters
     ----------
@@ -148,37 +162,38 @@ def held_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     CaseError
         On every rank, if the folder cannot be made, or a run is writing to it.
     """
-    number: list[int] = []
+    descriptors: list[int] = []
 
-    def hold(folder: Path) -> None:
+    def lock(folder: Path) -> None:
         if make:
             folder.mkdir(parents=True, exist_ok=True)
-        number.append(os.open(folder, os.O_RDONLY))
+        descriptors.append(os.open(folder, os.O_RDONLY))
         try:
-            fcntl.flock(number[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptors[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BlockingIOError(0, "another run is writing to it") from None
         except OSError:
             pass  # a file system without locks
 
-    new = make and not out.exists()
+    is_new = make and not out.exists()
     try:
-        prepare_folder(out, comm, hold)
+        prepare_folder(out, comm, lock)
         yield
     finally:
-        for n in number:
-            os.close(n)
+        for descriptor in descriptors:
+            os.close(descriptor)
             with suppress(OSError):  # what was refused leaves no empty folder
-                if new:
+                if is_new:
                     out.rmdir()
 
 
-def by_first(
+def access_disk(
     comm: "MPI.Comm",
-    do: Callable[[], T],
+    operation: Callable[[], T],
     failed: Literal["cannot be written", "cannot be read"] = "cannot be written",
 ) -> T:
-    """Let rank 0 write or read; return its result on every rank, see `on_first_rank`. Collective.
+    """Return the result of rank 0's reading or writing on every rank; see `on_first_rank`.
+    Collective.
 
     Raises
     ------
@@ -186,10 +201,10 @@ def by_first(
         On every rank, for instance if the disk is full.
     """
 
-    def done() -> T:
+    def result() -> T:
         try:
-            return do()
+            return operation()
         except OSError as e:
             raise DiskError(f"{e.filename or 'the results'} {failed}: {e.strerror or e}") from e
 
-    return on_first_rank(comm, done)
+    return on_first_rank(comm, result)

@@ -17,38 +17,44 @@ Read = TypeVar("Read")
 POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
-LARGEST = 1e100  # no run writes a larger number
-NO_NUMBERS = (
-    "stretching",
-    "bending",
-    "energy",
-)  # a solid has no such split; an energy of one's own may be no number
+MAX_NUMBER = 1e100  # no run writes a larger one
+# columns that may be nan: a solid has no such split; a user-defined energy may be no number
+NAN_COLUMNS = ("stretching", "bending", "energy")
 
 
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
-    """The point of `w_pole_over_h`: the first named point, or what is there in place of a pole, see
-    `pole_of`.
+    """Return the name of the point of `w_pole_over_h`.
+
+    That is the first named point, or what is there in place of a pole, see `pole_of`.
     """
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), pole)
 
 
 def stability(row: Mapping[str, object]) -> str:
-    """Whether a point is stable, in words.
+    """Return in words whether a point is stable.
 
     Examples
     --------
-    >>> stability({"negative_pivots": 1, "excluded_pivots": 2}), stability({"negative_pivots": 0, "excluded_pivots": 0})
-    ('unstable in 1 direction and 2 that the model excludes', 'stable')
+    >>> stability({"negative_pivots": 1, "excluded_pivots": 2})
+    'unstable in 1 direction and 2 that the model excludes'
+    >>> stability({"negative_pivots": 0, "excluded_pivots": 0})
+    'stable'
     """
-    own, excluded = (int(str(row.get(key, 0))) for key in ("negative_pivots", "excluded_pivots"))
-    if not own + excluded:
+    symmetric, excluded = (
+        int(str(row.get(key, 0))) for key in ("negative_pivots", "excluded_pivots")
+    )
+    if not symmetric + excluded:
         return "stable"
-    first = f"unstable in {own} direction{'s' * (own != 1)}" if own else "unstable in"
-    return first + (f"{' and' * bool(own)} {excluded} that the model excludes" if excluded else "")
+    beginning = (
+        f"unstable in {symmetric} direction{'s' * (symmetric != 1)}" if symmetric else "unstable in"
+    )
+    return beginning + (
+        f"{' and' * bool(symmetric)} {excluded} that the model excludes" if excluded else ""
+    )
 
 
 class PathTable:
-    """Writes rows one by one, after the rows of an interrupted run.
+    """Writer of path.csv, row by row, after the rows of an interrupted run.
 
     Parameters
     ----------
@@ -57,7 +63,7 @@ class PathTable:
 
     Attributes
     ----------
-    kept
+    complete_rows
         The complete rows of an existing file; an incomplete last row is cut off.
     """
 
@@ -68,7 +74,7 @@ class PathTable:
         length = content.rfind(b"\n") + 1
         if length and not content.startswith(header.encode()):
             raise Damaged(f"{file}: is damaged: its columns are not those of this run")
-        self.kept = read_lines(file) if length else []
+        self.complete_rows = read_lines(file) if length else []
         self._file = AppendedFile(file, length)
         if not length:
             self._file.append(header.encode())
@@ -81,7 +87,7 @@ class PathTable:
         OSError
             If the disk is full; the file still ends with a complete row.
         """
-        if int(row["point"]) >= len(self.kept):
+        if int(row["point"]) >= len(self.complete_rows):
             self._file.append(table_text([[row[key] for key in self._columns]]).encode())
 
     def close(self) -> None:
@@ -89,12 +95,12 @@ class PathTable:
 
 
 def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
-    """Lines of a table, with numbers in full precision.
+    r"""Return lines as text of a CSV file, with numbers in full precision.
 
     Examples
     --------
-    >>> table_text([["label", "value"], ["fold, first", 0.1]], end="\\n")
-    'label,value\\n"fold, first",0.1\\n'
+    >>> table_text([["label", "value"], ["fold, first", 0.1]], end="\n")
+    'label,value\n"fold, first",0.1\n'
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator=end)
@@ -110,17 +116,17 @@ def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: P
     file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
 
 
-def read_csv(file: Path, made: Callable[[Mapping[str, str]], Read]) -> list[Read]:
-    """What a function makes of the rows of a table, by the names of its header.
+def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[Read]:
+    """Return what a function makes of each row of a table, by the names of its header.
 
     Raises
     ------
     Damaged
-        If it is no table, or the function cannot make something of a row.
+        If it is no table, or the function raises for a row.
     """
     try:
         with file.open(encoding="utf-8", newline="") as stream:
-            return [made(row) for row in csv.DictReader(stream)]
+            return [convert(row) for row in csv.DictReader(stream)]
     except (KeyError, ValueError, TypeError, csv.Error) as e:
         raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
 
@@ -135,7 +141,7 @@ def is_path(file: Path) -> bool:
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The complete rows of a path.csv, also after a kill; see `read_lines`."""
+    """Return the complete rows of a path.csv, also after a kill; see `read_lines`."""
     return [
         {key: v if key in TEXTS else _number(v) for key, v in row.items()}
         for row in read_lines(file)
@@ -143,7 +149,7 @@ def read_rows(file: Path) -> list[Row]:
 
 
 def read_lines(file: Path) -> list[dict[str, str]]:
-    """The same as text.
+    """Return the complete rows of a path.csv as text.
 
     Raises
     ------
@@ -166,29 +172,35 @@ def read_lines(file: Path) -> list[dict[str, str]]:
         rows.append(dict(zip(head, values, strict=False)))
         if len(values) != len(head):
             raise Damaged(
-                f"{file}: is damaged: line {number + 2} has {len(values)} values, its header {len(head)}"
+                f"{file}: is damaged: line {number + 2} has {len(values)} values, "
+                f"its header {len(head)}"
             )
-        if wrong := _wrong(number, rows[-1], counts):
+        if column := _wrong_column(number, rows[-1], counts):
             raise Damaged(
-                f"{file}: is damaged: line {number + 2} has {wrong} = {rows[-1][wrong]!r}"
+                f"{file}: is damaged: line {number + 2} has {column} = {rows[-1][column]!r}"
             )
     return rows
 
 
-def _wrong(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
-    """The first column whose value no run writes; empty if there is none."""
+def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
+    """Return the first column whose value no run writes; empty if there is none."""
     for key, text in row.items():
         try:
             value = 0.0 if key in TEXTS else float(text)
-            absent = isnan(value) and (key.startswith(NO_NUMBERS) or key not in COLUMNS)
-            if not (abs(value) <= LARGEST or absent) or (key in counts and not value.is_integer()):
+            absent = isnan(value) and (key.startswith(NAN_COLUMNS) or key not in COLUMNS)
+            if not (abs(value) <= MAX_NUMBER or absent):
+                return key
+            if key in counts and not value.is_integer():
                 return key
         except ValueError:
             return key
     if row["point"] != str(number):
         return "point"
-    return "amplitude" if row["amplitude"] and amplitude(row["amplitude"]).column not in row else ""
+    if row["amplitude"] and amplitude(row["amplitude"]).column not in row:
+        return "amplitude"
+    return ""
 
 
 def _number(text: str) -> float | int:
+    """Return an integer where the text is one, else a float."""
     return int(text) if text.removeprefix("-").isdecimal() else float(text)

@@ -1,7 +1,8 @@
-"""Modes and null vectors on the whole deformed shell: fields for ParaView, a table, captions.
+"""Modes and null vectors on the whole deformed shell: fields for ParaView, tables, captions.
 
 A half shell is completed by the symmetric or antisymmetric mirror image of the mode. The
-coefficients of waves are evaluated around the axis.
+coefficients of waves are evaluated around the axis. Files of gradients and of frequencies are here
+too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.output.fields.gathering import Gatherer
 from magshell_fenicsx.output.fields.ring import waves_around
-from magshell_fenicsx.output.fields.surface import Surface, turned, whole
-from magshell_fenicsx.output.fields.vtu import About, vtu_content
+from magshell_fenicsx.output.fields.surface import Surface, completed_by_symmetry, rotated_surface
+from magshell_fenicsx.output.fields.vtu import ShellData, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import read_csv, table_text
 from magshell_fenicsx.shells.modes import TORSION
@@ -30,11 +31,12 @@ if TYPE_CHECKING:  # one of them is built
 
 Array = NDArray[np.float64]
 WAVES = "m = "
+CREST_TOLERANCE = 1e-6  # relative to the largest normal component of a mode
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
-class Mode(Protocol):
-    """What a mode's files need; see `shells.modes.ShellMode`."""
+class LabelledEigenvalue(Protocol):
+    """Label and eigenvalue of a mode, as of `shells.modes.ShellMode`."""
 
     @property
     def label(self) -> str: ...
@@ -52,7 +54,7 @@ def mode_surface(
     azimuth: float = 0.0,
     mu: Mapping[str, float] | None = None,
 ) -> Surface | None:
-    """The whole shell displaced by u, with a mode as its fields; collective.
+    """Return the whole shell displaced by u, with a mode as its fields; collective.
 
     Parameters
     ----------
@@ -67,8 +69,8 @@ def mode_surface(
 
     Returns
     -------
-    On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and "mode_w" (n,), its
-    component along -n0; None on other ranks.
+    On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and
+    "mode_w" (n,), its component along -n0; None on other ranks.
     """
     if (label.startswith(WAVES) or label == TORSION) and model.axisymmetric:
         if gatherer.comm.rank:
@@ -81,20 +83,24 @@ def mode_surface(
     surface = _with_mode(base, mode.u)
     if model.multiplicity > 1:
         assert not model.axisymmetric
-        surface = whole(surface, model.mirror)
+        surface = completed_by_symmetry(surface, model.mirror)
         if label == "antisymmetric":
             for values in surface.fields.values():
                 values[len(base.r0) :] *= -1
-    return turned(surface, azimuth)
+    return rotated_surface(surface, azimuth)
 
 
 def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
-    """The file of a mode.
+    """Return the file of a mode.
 
     Parameters
     ----------
+    point
+        Number of the point on the path.
     name
         "fold" or "bifurcation" for a null vector, otherwise the number of the mode.
+    label
+        Label of the mode; empty for the model's own symmetry.
 
     Examples
     --------
@@ -105,7 +111,7 @@ def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
     return folder / "fields" / f"mode_{point:04d}_{name}{suffix}.vtu"
 
 
-def write_mode(file: Path, surface: Surface, about: About) -> None:
+def write_mode(file: Path, surface: Surface, shell_data: ShellData) -> None:
     """Write the surface of `mode_surface`; in ParaView, `Warp By Vector` with "mode" shows it.
 
     Raises
@@ -113,26 +119,26 @@ def write_mode(file: Path, surface: Surface, about: About) -> None:
     OSError
         If the disk is full; the file is not written then.
     """
-    write_whole(file, vtu_content(surface, about))
+    write_whole(file, vtu_content(surface, shell_data))
 
 
-def mode_table(by_point: Mapping[int, Sequence[Mode]]) -> bytes:
-    """stability.csv: the modes of each point, in the order of their eigenvalues over E h/R^2."""
-    listed = (
-        (point, n, mode) for point, modes in by_point.items() for n, mode in enumerate(modes, 1)
-    )
-    lines = ((point, n, mode.label, mode.eigenvalue) for point, n, mode in listed)
+def mode_table(by_point: Mapping[int, Sequence[LabelledEigenvalue]]) -> bytes:
+    """Return stability.csv: the modes of each point, ascending in eigenvalues over E h/R^2."""
+    lines = list[tuple[int, int, str, float]]()
+    for point, modes in by_point.items():
+        for number, mode in enumerate(modes, 1):
+            lines.append((point, number, mode.label, mode.eigenvalue))
     return table_text([COLUMNS, *lines], end="\n").encode()
 
 
-def mode_caption(number: int, mode: Mode) -> str:
-    """The caption of a panel: number, label and eigenvalue, in matplotlib's mathematics.
+def mode_caption(number: int, mode: LabelledEigenvalue) -> str:
+    r"""Return the caption of a panel: number, label and eigenvalue, in matplotlib's mathematics.
 
     Examples
     --------
     >>> from types import SimpleNamespace
     >>> mode_caption(2, SimpleNamespace(label="m = 7", eigenvalue=-1.5e-6))
-    '2 ($m$ = 7):  $\\\\lambda = -1.5 \\\\times 10^{-6}$'
+    '2 ($m$ = 7):  $\\lambda = -1.5 \\times 10^{-6}$'
     """
     mantissa, _, exponent = f"{mode.eigenvalue:.4g}".partition("e")
     value = rf"{mantissa} \times 10^{{{int(exponent)}}}" if exponent else mantissa
@@ -141,44 +147,41 @@ def mode_caption(number: int, mode: Mode) -> str:
 
 
 def _with_mode(base: Surface, v: Array) -> Surface:
-    """Scale a mode to a largest length of one, and inward at the first node where its normal
-    component is largest.
+    """Return the surface with a mode as its fields, scaled to a largest length of one.
+
+    The mode points inward at the first node where its normal component is largest.
     """
     inward = -np.einsum("ij,ij->i", v, base.n0)
     size = np.abs(inward)
-    first = np.argmax(
-        size > (1 - 1e-6) * size.max()
-    )  # the crests and troughs of a wave differ only by rounding
-    scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first])
+    # the crests and troughs of a wave differ only by rounding
+    first_crest = np.argmax(size > (1 - CREST_TOLERANCE) * size.max())
+    scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first_crest])
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
 
 def _revolved_wave(
     model: "MeridianModel", u: Vector, m: int, vector: Vector
 ) -> tuple[Surface, Array]:
-    """The surface with at least twelve sectors per wave, and the wave at its nodes.
+    """Return the surface with at least twelve sectors per wave, and the wave (n, 3) at its nodes.
 
-    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; of m = 0, torsion, V
+    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; torsion, m = 0, is V
     e_theta.
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
-    U_and_V, V, W = vector.reshape(-1, 3)[swept.vertices(model.excluded_modes.waves.V)].T[
-        :, :, None
-    ]
+    vertices = swept.vertices(model.excluded_modes.waves.V)
+    U_and_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
     radial, azimuthal = (U_and_V - V) * cosine, V * sine
-    x, y = (
-        radial * np.cos(theta) - azimuthal * np.sin(theta),
-        radial * np.sin(theta) + azimuthal * np.cos(theta),
-    )
+    x = radial * np.cos(theta) - azimuthal * np.sin(theta)
+    y = radial * np.sin(theta) + azimuthal * np.cos(theta)
     v = np.stack([x, y, W * cosine], axis=-1)
     return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), swept.at_nodes(v)
 
 
 def wave_number(surface: Surface) -> int | None:
-    """The number m >= 2 of waves of a mode around e3, see `ring.waves_around`.
+    """Return the number m >= 2 of waves of a mode around e3, see `ring.waves_around`.
 
     None also if the mesh does not resolve them.
     """
@@ -186,45 +189,54 @@ def wave_number(surface: Surface) -> int | None:
     return waves.number if waves and waves.resolved else None
 
 
-PREFIX = "gradients_"
+GRADIENT_PREFIX = "gradients_"
 CURVATURES = ("curvature_11", "curvature_22", "curvature_12")
 
 
-def columns_of(by: str) -> tuple[str, ...]:
-    """The names in the file of a field's gradient; that of the remanence is a vector."""
-    return CURVATURES if by == "curvature" else (by,)
+def columns_of(field_name: str) -> tuple[str, ...]:
+    """Return the names in the file of a field's gradient; the remanence is one vector."""
+    return CURVATURES if field_name == "curvature" else (field_name,)
 
 
-def gradient_file(folder: Path, of: str) -> Path:
-    """The file of a result's gradients.
+def gradient_file(folder: Path, result: str) -> Path:
+    """Return the file of a result's gradients.
 
     Examples
     --------
     >>> gradient_file(Path("out"), "knockdown").as_posix()
     'out/fields/gradients_knockdown.vtu'
     """
-    return folder / "fields" / f"{PREFIX}{of}.vtu"
+    return folder / "fields" / f"{GRADIENT_PREFIX}{result}.vtu"
 
 
 def gradient_files(folder: Path) -> dict[str, Path]:
-    """Result -> file of those in a folder."""
+    """Return the files of gradients in a run's folder, by result."""
     return {
-        file.stem.removeprefix(PREFIX): file
-        for file in sorted((folder / "fields").glob(f"{PREFIX}*.vtu"))
+        file.stem.removeprefix(GRADIENT_PREFIX): file
+        for file in sorted((folder / "fields").glob(f"{GRADIENT_PREFIX}*.vtu"))
     }
 
 
 NAME = "frequencies.csv"
 NUMBERS = ("point", "wave", "omega2", "hertz")
-CONTACT_CHANGE = (
-    "contact_change"  # of omega2, relative, if the bodies that touch are four times as stiff
-)
+# relative change of omega2 if the bodies in contact are four times as stiff
+CONTACT_CHANGE = "contact_change"
 
 
 @dataclass(frozen=True)
 class Frequency:
-    """A row: omega2 is ω² ρ R²/E; hertz is nan without a density, and of an unstable mode, which
-    does not vibrate.
+    """A row of frequencies.csv.
+
+    Attributes
+    ----------
+    point
+        Number of the point on the path.
+    wave
+        Circumferential wave number or symmetry of the mode, see `wave_of`.
+    omega2
+        ω² ρ R²/E.
+    hertz
+        nan without a density, and of an unstable mode, which does not vibrate.
     """
 
     point: int
@@ -233,51 +245,65 @@ class Frequency:
     hertz: float
 
 
-def wave_of(label: str, own: str) -> str:
-    """The circumferential number or the symmetry of a mode; `own` is that of the model's own modes.
+def wave_of(label: str, symmetric_wave: str) -> str:
+    """Return the circumferential wave number or the symmetry of a mode.
+
+    `symmetric_wave` is the result for modes with the model's own symmetry.
 
     Examples
     --------
     >>> wave_of("m = 7", "0"), wave_of("", "0"), wave_of("antisymmetric", "symmetric")
     ('7', '0', 'antisymmetric')
     """
-    return label.removeprefix(WAVES) if label else own
+    return label.removeprefix(WAVES) if label else symmetric_wave
 
 
 def hertz(omega2: float, time_unit: float | None) -> float | None:
-    """The frequency, with `time_unit` R √(ρ/E); None without it, and of an unstable mode."""
+    """Return a frequency in Hz, with `time_unit` R √(ρ/E) in s.
+
+    None without the unit, and for an unstable mode.
+    """
     return sqrt(omega2) / (2 * pi * time_unit) if time_unit and omega2 >= 0 else None
 
 
 def frequency_table(
-    by_point: Mapping[int, Sequence[Mode]],
-    own: Mapping[int, str],
+    by_point: Mapping[int, Sequence[LabelledEigenvalue]],
+    symmetric_waves: Mapping[int, str],
     time_unit: float | None,
     contact_changes: Mapping[int, Sequence[float]],
 ) -> bytes:
-    """The file: modes of each point, ascending; `own` is the wave of its model's own modes.
+    """Return frequencies.csv: modes of each point, ascending.
 
-    `contact_changes` is a column where there are bodies.
+    Parameters
+    ----------
+    by_point
+        Number of a point -> its modes, whose eigenvalues are omega2.
+    symmetric_waves
+        Number of a point -> the wave of modes with the model's own symmetry.
+    time_unit
+        R √(ρ/E) in s; None without a density.
+    contact_changes
+        Number of a point -> value of the column `CONTACT_CHANGE`, which is there with bodies alone.
     """
     lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
     for point, modes in by_point.items():
-        for n, mode in enumerate(modes):
+        for number, mode in enumerate(modes):
             row = (
                 point,
-                wave_of(mode.label, own[point]),
+                wave_of(mode.label, symmetric_waves[point]),
                 mode.eigenvalue,
                 hertz(mode.eigenvalue, time_unit),
             )
-            lines.append((*row, contact_changes[point][n]) if contact_changes else row)
+            lines.append((*row, contact_changes[point][number]) if contact_changes else row)
     return table_text(lines, end="\n").encode()
 
 
 def read_frequencies(folder: Path) -> list[Frequency]:
-    """The rows of a run's folder; none without the file."""
+    """Return the rows of frequencies.csv in a run's folder; none without the file."""
 
-    def made(line: Mapping[str, str]) -> Frequency:
+    def frequency_of(line: Mapping[str, str]) -> Frequency:
         return Frequency(
             int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan")
         )
 
-    return read_csv(folder / NAME, made) if (folder / NAME).exists() else []
+    return read_csv(folder / NAME, frequency_of) if (folder / NAME).exists() else []

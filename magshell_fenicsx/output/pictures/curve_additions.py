@@ -1,0 +1,270 @@
+"""Additions to a curve: the curves of several runs in one picture, and the shell at some points."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.animation import edge_of, magnification
+from magshell_fenicsx.output.pictures.curve import MARK_SIZE, draw_lines, drawn_points, legend
+from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, drawing
+from magshell_fenicsx.output.pictures.lines import (
+    CurveStep,
+    axes_for,
+    curve_coordinates,
+    curve_steps,
+    with_point_name,
+)
+from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
+from magshell_fenicsx.output.pictures.scales import number_format
+from magshell_fenicsx.output.store.stored_results import case_in, pole_of
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
+from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.registry import QUANTITIES
+
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+MAX_KEYS = 2  # of a case in the label of its run
+MAX_WIDTH, MAX_HEIGHT = 0.26, 0.34  # of a shell on a curve, over the axes
+GREY = 0.8
+EDGE_GREY, EDGE_OPACITY = 0.3, 0.8  # of the line around a shell
+PLACES_PER_SIDE = 9  # that are tried for a shell
+MARGIN = 0.02  # around these places, over the axes
+# costs of covering all of the curve, and another shell; a distance of one width of the axes costs 1
+COST_OF_CURVE, COST_OF_SHELL = 12.0, 50.0
+OPAQUE = 127  # of 255: pixels with a larger opacity belong to a shell
+
+
+def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Figure":
+    """Return the last curve of each run in one picture; labels say in what their cases differ.
+
+    Parameters
+    ----------
+    runs
+        Folder -> the rows of its path.
+
+    Raises
+    ------
+    CaseError
+        If they have no curve, or curves over different quantities.
+    """
+    from matplotlib.figure import Figure
+
+    steps = {folder: _last_step(folder, rows) for folder, rows in runs.items()}
+    axes_names = {folder: tuple(q.name for q in axes_for(step)) for folder, step in steps.items()}
+    first_folder = next(iter(steps))
+    first_step = steps[first_folder]
+    for folder, names in axes_names.items():
+        if names != axes_names[first_folder]:
+            curve = " over ".join(reversed(names))
+            first_curve = " over ".join(reversed(axes_names[first_folder]))
+            raise CaseError(
+                f"{folder}: its curve is {curve}, that of {first_folder} {first_curve}: "
+                "draw them alone"
+            )
+    cases = {folder: case_in(folder) for folder in steps}
+    width = (style.width or ONE_COLUMN) / INCH
+    with drawing(style):
+        figure = Figure(figsize=(width, 0.8 * width), dpi=style.dpi, layout="constrained")
+        axes = figure.subplots()
+        for i, (name, step) in enumerate(zip(labels(cases), steps.values(), strict=True)):
+            number = i % 10
+            colour = f"C{number if number < 3 else number + 1}"  # C3 is that of the marks
+            draw_lines(axes, step, colour)
+            axes.plot([], [], color=colour, lw=1.2, label=name)
+        pole = pole_of(cases[first_folder])
+        x_label, y_label = (
+            with_point_name(axis_quantity, first_step.rows[0], pole, r"\$").label
+            for axis_quantity in axes_for(first_step)
+        )
+        axes.set(xlabel=x_label, ylabel=y_label)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(number_format())
+        axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+        legend(figure, 2)
+    return figure
+
+
+def _last_step(folder: Path, rows: Sequence[Row]) -> CurveStep:
+    """Return the last step of a run's path; CaseError if nothing has varied."""
+    path = [row for row in rows if row["label"] != SOLUTION]
+    if not path or not path[-1]["amplitude"]:
+        raise CaseError(f"{folder}: has no curve: nothing has varied")
+    return curve_steps(path, str(path[-1]["amplitude"]))[-1]
+
+
+def labels(cases: Mapping[Path, Mapping[str, Any]]) -> list[str]:
+    """Return for each run the values of the keys in which the cases differ, or its folder's name.
+
+    Examples
+    --------
+    >>> a, b = {"shell": {"h": 1.0}, "x": 2}, {"shell": {"h": 0.5}, "x": 2}
+    >>> labels({Path("a"): a, Path("b"): b})
+    ['h = 1', 'h = 0.5']
+    """
+    flat_cases = [dict(_flat(case)) for case in cases.values()]
+    all_keys = dict.fromkeys(key for case in flat_cases for key in case)
+    differing = [key for key in all_keys if len({str(case.get(key)) for case in flat_cases}) > 1]
+    if not 0 < len(differing) <= MAX_KEYS:
+        return [folder.name.replace("$", r"\$") for folder in cases]
+    names = []
+    for case in flat_cases:
+        values = [f"{_key_words(key)} = {_value_words(case.get(key))}" for key in differing]
+        names.append(", ".join(values))
+    return names
+
+
+def _flat(section: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield key with its path and value, of all values of a case but those of its pictures."""
+    items = section.items() if isinstance(section, Mapping) else enumerate(section)
+    for key, value in items:
+        name = f"{path}.{key}" if path else str(key)
+        if name == "output":
+            continue
+        if isinstance(value, Mapping | list):
+            yield from _flat(value, name)
+        else:
+            yield name, value
+
+
+def _key_words(key: str) -> str:
+    """Return the symbol or the words of a key."""
+    name = key.rpartition(".")[2]
+    return QUANTITIES[name].latex if name in QUANTITIES else name.replace("_", " ")
+
+
+def _value_words(value: Any) -> str:
+    """Return a value of a case as text."""
+    if isinstance(value, float | int):
+        return f"{value:.6g}".replace("-", "−")
+    return str(value).replace("$", r"\$")
+
+
+def add_shapes(
+    figure: "Figure",
+    steps: Sequence[CurveStep],
+    shapes: Sequence[tuple[Row, Surface]],
+    style: OutputSection,
+    camera: Camera,
+) -> None:
+    """Put the shell at some points on the curves of a figure, with a line from each to its point.
+
+    Each shell is where it covers least. All have one scale; displacements that would not be seen
+    are drawn larger, which the title says.
+    """
+    numbers = [
+        next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
+        for row, _ in shapes
+    ]
+    factor = magnification([surface for _, surface in shapes])
+    magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]
+    if factor > 1:
+        for number in dict.fromkeys(i for i in numbers if i is not None):
+            axes = figure.axes[number]
+            title = f"{axes.get_title()}; " if axes.get_title() else ""
+            axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
+    figure.draw_without_rendering()
+    places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
+    occupied = dict[int, list[Array]]()
+    for number, (row, _), surface in zip(numbers, shapes, magnified, strict=True):
+        if number is None:
+            continue
+        axes = figure.axes[number]
+        box = axes.get_window_extent()
+        height_over_width = Window.around(places, 1000).shape[0] / 1000
+        room = min(MAX_WIDTH * box.width, MAX_HEIGHT * box.height / height_over_width)
+        width = max(int(room), 8)
+        window = Window.around(places, width)
+        image = _cropped(Background(surface, camera, width, window).grey_image(GREY))
+        size = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
+        point = np.array(curve_coordinates(row, steps[number].amplitude))
+        corner = _free_corner(axes, point, size, occupied.setdefault(number, []))
+        occupied[number].append(np.array([corner, corner + size]))
+        _add_shape(axes, image, point, corner, size)
+        if row["label"] not in LOCATED:  # those have marks
+            axes.plot(*point, "o", color="k", markersize=MARK_SIZE, zorder=5)
+
+
+def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Array) -> None:
+    """Put an image at a corner of the axes, with a line to a point of the data."""
+    from matplotlib.offsetbox import AnnotationBbox, OffsetImage
+
+    line = {
+        "arrowstyle": "-",
+        "color": "0.5",
+        "linewidth": 0.6,
+        "shrinkA": 0,
+        "shrinkB": MARK_SIZE / 2,
+    }
+    end = _nearest(axes, image, point, corner, size)
+    begin, (x, y) = (float(point[0]), float(point[1])), corner + size / 2
+    axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line, zorder=3)
+    offset_image = OffsetImage(image, zoom=72 / axes.figure.dpi, resample=True)
+    options: dict[str, Any] = {"xycoords": "axes fraction", "frameon": False, "pad": 0, "zorder": 3}
+    axes.add_artist(AnnotationBbox(offset_image, (float(x), float(y)), **options))
+
+
+def _cropped(image: Image) -> Image:
+    """Return the drawn part of an image, with a line around what is drawn."""
+    opacity = image[..., 3:] / 255
+    edge = EDGE_OPACITY * edge_of(opacity)
+    lined = image.copy()
+    lined[..., :3] = np.rint((1 - edge) * image[..., :3] + edge * 255 * EDGE_GREY)
+    rows, columns = (np.flatnonzero(opacity[..., 0].any(axis=axis)) for axis in (1, 0))
+    return lined[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+def _nearest(
+    axes: "Axes", image: Image, point: Array, corner: Array, size: Array
+) -> tuple[float, float]:
+    """Return where in the axes an image at a corner is nearest to a point of the data."""
+    down, right = np.nonzero(image[..., 3] > OPAQUE)
+    pixels = corner + size * np.column_stack(
+        [(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]]
+    )
+    box = axes.get_window_extent()
+    target = axes.transAxes.inverted().transform(axes.transData.transform(point))
+    x, y = pixels[np.linalg.norm((pixels - target) * [box.width, box.height], axis=1).argmin()]
+    return float(x), float(y)
+
+
+def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Array]) -> Array:
+    """Return the lower left corner (2,) of a box that covers little and is near its point.
+
+    Parameters
+    ----------
+    point
+        (2,) in the data.
+    size
+        (2,) of the box, over the axes.
+    occupied
+        Lower left and upper right corners (2, 2) of other boxes, over the axes.
+    """
+    in_axes = axes.transAxes.inverted().transform
+    points = in_axes(axes.transData.transform(drawn_points(axes)))
+    target = in_axes(axes.transData.transform(point))
+
+    def cost(low: Array) -> float:
+        high = low + size
+        covered = ((points > low) & (points < high)).all(axis=1).mean()
+        overlap = sum(
+            float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None)))
+            for a, b in occupied
+        )
+        distance = np.linalg.norm(low + size / 2 - target)
+        return float(COST_OF_CURVE * covered + COST_OF_SHELL * overlap + distance)
+
+    positions = (
+        np.linspace(MARGIN, max(1 - MARGIN - length, MARGIN), PLACES_PER_SIDE) for length in size
+    )
+    return np.asarray(min((np.array(corner) for corner in product(*positions)), key=cost))

@@ -1,0 +1,355 @@
+"""Pictures of modes and of further solutions as small panels, and of gradients.
+
+gradients.png shows where a result would change most with more of a field.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.fields.mode_fields import mode_caption, mode_file, wave_number
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import read_vtu
+from magshell_fenicsx.output.pictures.captions import named_value
+from magshell_fenicsx.output.pictures.colours import ColouredField
+from magshell_fenicsx.output.pictures.layout import (
+    GAP,
+    INCH,
+    LINE_HEIGHT,
+    ONE_COLUMN,
+    TWO_COLUMNS,
+    Arrow,
+    FigureBoxes,
+    Panel,
+    columns,
+    directions,
+    draw_panel,
+    drawing,
+    panel_width,
+    panels_figure,
+)
+from magshell_fenicsx.output.pictures.lines import instability_numbers
+from magshell_fenicsx.output.pictures.picture import Background, spread_points
+from magshell_fenicsx.output.pictures.rendering import Camera, Window
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
+from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown_quantity
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Array = NDArray[np.float64]
+# the limit of colours is at most PEAK times this quantile of the nodes
+QUANTILE, PEAK = 0.995, 1.3
+MIN_ARROW_LENGTH = 0.15  # of a vector that is drawn, over the longest one
+ARROW_DISTANCE = 0.16  # of arrows, over the extent of the places of drawn vectors
+DEPTH_TOLERANCE = 0.03  # over the shell's extent: depth at which places of arrows are visible
+# over the largest load on the path: a smaller load is zero, up to the error of where a path ends
+ZERO_LOAD = 1e-4
+# over the largest displacements: distance of instabilities that are the same one
+SAME_INSTABILITY_TOLERANCE = 5e-3
+NOTE = "Change of a result per area by the change of a field there."
+WORDS = {
+    "remanence": "more remanence, along arrows",
+    "magnitude": "stronger magnet",
+    "thickness": "more thickness",
+    "curvature_11": r"natural curvature $\kappa_{11}$",
+    "curvature_22": r"natural curvature $\kappa_{22}$",
+    "curvature_12": r"natural twist $\kappa_{12}$",
+    "deviation": r"shape moved outwards, $w_0/R$",
+}
+
+
+def small_panels(
+    surfaces: Sequence[Surface],
+    layers: Sequence[ColouredField],
+    captions: Sequence[str],
+    style: OutputSection,
+    camera: Camera,
+    note: str = "",
+) -> "Figure":
+    """Return small panels in one window, with captions above them and a note at the foot.
+
+    The layers have the same limits, and one colour bar.
+    """
+    from matplotlib.figure import Figure
+
+    count, line, gap = len(surfaces), LINE_HEIGHT * style.font_size, GAP / INCH
+    per_row = columns(count) if count < 10 else 4
+    width = (style.width or (ONE_COLUMN if count == 1 else TWO_COLUMNS)) / INCH
+    cell_width = width / per_row
+    places = [camera(np.concatenate([surface.r0, surface.r0 + surface.u])) for surface in surfaces]
+    pixels = max(int((cell_width - gap) * style.dpi), 50)
+    window = Window.around(np.concatenate(places), pixels)
+    image_height = window.shape[0] / style.dpi
+    caption_lines = max(caption.count("\n") + 1 for caption in captions)
+    cell_height, below = image_height + caption_lines * line + gap / 2, 4.4 * line
+    foot = line if note else 0.0
+    height = -(-count // per_row) * cell_height + below + foot
+    figure = Figure(figsize=(width, height), dpi=style.dpi)
+    boxes = FigureBoxes(figure)
+    place = boxes.place(gap / 2, 0.5 * line)
+    figure.text(*place, note, va="center", fontsize=0.9 * style.font_size)
+    for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
+        panel = Background(surface, camera, 0, window).panel(layer, style)
+        left, low = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
+        axes = boxes.axes(left + gap / 2, low, cell_width - gap, image_height)
+        draw_panel(axes, panel, style)
+        place = boxes.place(left + cell_width / 2, low + image_height + caption_lines * line / 2)
+        figure.text(*place, caption, ha="center", va="center")
+    length = min(width - gap - 8 * line, 4.0)
+    box = boxes.axes((width - length) / 2, foot + 1.7 * line, length, 0.65 * line)
+    colour_bar(figure, box, panel.scale, room=length)
+    directions(boxes.axes(gap / 2, foot + 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
+    return figure
+
+
+def solution_rows(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of all solutions, and before those of a step the last point of its path."""
+    rows_of_solutions: list[Row] = []
+    for number_of_row, row in enumerate(rows):
+        if row["label"] == SOLUTION:
+            previous = rows[number_of_row - 1]
+            if previous["label"] != SOLUTION or previous["step"] != row["step"]:
+                path = [earlier for earlier in rows[:number_of_row] if earlier["branch"] == 0]
+                rows_of_solutions.append(path[-1])
+            rows_of_solutions.append(row)
+    return rows_of_solutions
+
+
+def solutions_figure(
+    surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
+) -> "Figure":
+    """Return the figure of the deformed shells of some rows, with the same colours."""
+    lowest = min(float(surface.w.min()) for surface in surfaces)
+    highest = max(float(surface.w.max()) for surface in surfaces)
+    limits, caption = from_zero(lowest / h, highest / h), "inward normal displacement $w/h$"
+    layers = [
+        ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, caption)
+        for surface in surfaces
+    ]
+    captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
+    with drawing(style):
+        return small_panels(surfaces, layers, captions, style, camera)
+
+
+def _name(row: Row) -> str:
+    """Return words for a row of `solution_rows`."""
+    return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
+
+
+MODE_SIZE = 0.05  # drawn size of a mode's largest displacement, over R
+MAX_PANELS = 12
+CAPTION = "$w$ of the mode over its largest, of any sign"
+
+
+def modes_figure(
+    surfaces: Sequence[Surface],
+    captions: Sequence[str],
+    style: OutputSection,
+    camera: Camera,
+    max_panels: int = MAX_PANELS,
+) -> "Figure":
+    """Return the figure with one small panel per mode.
+
+    A panel shows the deformed shell plus the mode, coloured by the mode's normal displacement.
+
+    Parameters
+    ----------
+    surfaces
+        Surfaces with the fields "mode" and "mode_w"; see `fields.mode_fields`.
+    captions
+        Captions of the panels, in matplotlib's mathematics.
+    max_panels
+        Largest number of panels; the picture says how many modes it leaves out.
+    """
+    note = f"The first {max_panels} of {len(captions)} modes." if len(captions) > max_panels else ""
+    surfaces, captions = surfaces[:max_panels], captions[:max_panels]
+    with_modes = [
+        replace(surface, u=surface.u + MODE_SIZE * surface.fields["mode"]) for surface in surfaces
+    ]
+    layers = []
+    for surface in surfaces:
+        w = surface.fields["mode_w"]
+        layers.append(
+            ColouredField("mode_w", w / (np.abs(w).max() or 1.0), (-1.0, 1.0), SIGNED, CAPTION)
+        )
+    with drawing(style):
+        return small_panels(with_modes, layers, captions, style, camera, note)
+
+
+@dataclass(frozen=True)
+class StoredMode:
+    """Mode of stability.csv."""
+
+    label: str
+    eigenvalue: float
+
+
+def mode_figures(
+    folder: Path, rows: Sequence[Row], style: OutputSection, camera: Camera
+) -> Iterator[tuple[str, "Figure"]]:
+    """Yield names and figures of the modes of a run.
+
+    `instabilities` has the null vectors, `modes_NNNN` the modes of a point in stability.csv.
+    """
+    numbers = instability_numbers(rows)
+    singular = [row for row in rows if row["label"] in LOCATED]
+    occurrences = _occurrences(singular)
+    distinct = [row for row in singular if int(row["point"]) in occurrences]
+    null_vectors = [_null_vector(folder, row, rows, numbers, occurrences) for row in distinct]
+    if panels := [panel for panel in null_vectors if panel]:
+        yield "instabilities", _figure(panels, style, camera)
+    table = folder / "stability.csv"
+    if not table.exists():
+        return
+    modes_of_points = read_csv(
+        table,
+        lambda line: (int(line["point"]), StoredMode(line["mode"], float(line["eigenvalue"]))),
+    )
+    for row in rows:
+        point = int(row["point"])
+        modes = [mode for number, mode in modes_of_points if number == point]
+        panels = list[tuple[Surface, str]]()
+        for rank, mode in enumerate(modes, 1):
+            file = mode_file(folder, point, str(rank), mode.label)
+            if file.exists():
+                panels.append((read_vtu(file)[0], mode_caption(rank, mode)))
+        if panels:
+            yield f"modes_{point:04d}", _figure(panels, style, camera)
+
+
+def _figure(
+    panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera
+) -> "Figure":
+    """Return the figure of surfaces with modes, and their captions."""
+    surfaces, captions = zip(*panels, strict=True)
+    return modes_figure(surfaces, captions, style, camera)
+
+
+def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
+    """Return the distinct instabilities of a path, each with all rows at which the path meets it.
+
+    The key is the number of the first point; the path may come back to an instability.
+    """
+    occurrences: dict[int, list[Row]] = {}
+    columns_here = singular[0] if singular else {}
+    displacements = [
+        name for name in columns_here if quantity(name).kind in ("displacement", "place")
+    ]
+    sizes = {name: max(abs(float(row[name])) for row in singular) for name in displacements}
+
+    def are_same(row: Row, other: Row) -> bool:
+        if any(row[name] != other[name] for name in ("label", "mode", "amplitude")):
+            return False
+        return all(
+            abs(float(row[name]) - float(other[name])) <= SAME_INSTABILITY_TOLERANCE * size
+            for name, size in sizes.items()
+        )
+
+    for row in singular:
+        earlier = next((rows for rows in occurrences.values() if are_same(rows[0], row)), None)
+        if earlier is None:
+            occurrences[int(row["point"])] = [row]
+        else:
+            earlier.append(row)
+    return occurrences
+
+
+def _null_vector(
+    folder: Path,
+    row: Row,
+    rows: Sequence[Row],
+    numbers: dict[int, int],
+    occurrences: Mapping[int, Sequence[Row]],
+) -> tuple[Surface, str] | None:
+    """Return the surface with a null vector, and its caption; None without a file.
+
+    The caption has the numbers of the instability, its kind, and the load.
+
+    Parameters
+    ----------
+    row, rows
+        The row of the instability, and all rows of the path.
+    numbers
+        Number of a point -> number of its instability.
+    occurrences
+        Number of a point -> the rows of the same instability.
+    """
+    label = "" if row["mode"] in OWN_MODES else str(row["mode"])
+    file = mode_file(folder, int(row["point"]), str(row["label"]), label)
+    if not file.exists():
+        return None
+    surface, _ = read_vtu(file)
+    details = [str(row["mode"])] if row["mode"] else []
+    if not label and (waves := wave_number(surface)):
+        details.append(f"m = {waves}")
+    details = [detail.replace("m = ", "$m$ = ") for detail in details]
+    kind = f" ({', '.join(details)})" if details else ""
+    load_words = ""
+    if row["amplitude"]:
+        column = amplitude(str(row["amplitude"])).column
+        largest = max(abs(float(other_row[column])) for other_row in rows)
+        is_zero = abs(float(row[column])) <= ZERO_LOAD * largest
+        rounded = {**row, column: 0.0} if is_zero else row
+        if rounded is not row:
+            rounded[shown_quantity(column, row).name] = 0.0
+        load_words = f"\n{named_value(column, rounded, 5)}"
+    same = occurrences[int(row["point"])]
+    number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in same)
+    return surface, f"{number_words}: {row['label']}{kind}{load_words}"
+
+
+def gradients_figure(
+    by_result: Mapping[str, Surface], style: OutputSection, camera: Camera
+) -> "Figure":
+    """Return the figure of gradients, one panel for each result and field.
+
+    Red raises the result, blue lowers it; of vectors the length and arrows are shown.
+    """
+    count = sum(name in surface.fields for surface in by_result.values() for name in WORDS)
+    width = panel_width(style, columns(count))
+    with drawing(style):
+        panels = list[Panel]()
+        for result, surface in by_result.items():
+            panels += _panels(result, surface, style, camera, width)
+        return panels_figure(panels, style, NOTE)
+
+
+def _panels(
+    result: str, surface: Surface, style: OutputSection, camera: Camera, width: int
+) -> Iterator[Panel]:
+    """Yield the panels of a result's gradients."""
+    view = Background(surface, camera, width)
+    for name in (name for name in WORDS if name in surface.fields):
+        caption, values = f"{result.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
+        if values.ndim == 1:
+            limit = _limit(np.abs(values))
+            limits = from_zero(max(float(values.min()), -limit), min(float(values.max()), limit))
+            yield view.panel(ColouredField(name, values, limits, SIGNED, caption), style)
+            continue
+        size = np.asarray(np.linalg.norm(values, axis=1))
+        panel = view.panel(ColouredField(name, size, (0.0, _limit(size)), "Reds", caption), style)
+        yield replace(panel, arrows=(_arrows(surface, values, view, camera),))
+
+
+def _limit(sizes: Array) -> float:
+    """Return the largest of some sizes, without peaks at few nodes; one if all are zero."""
+    return float(min(sizes.max(), PEAK * np.quantile(sizes, QUANTILE))) or 1.0
+
+
+def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
+    """Return arrows of vectors (n, 3) at nodes, at some visible places."""
+    r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
+    longest, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())
+    visible = view.seen.shows(r, DEPTH_TOLERANCE * extent)
+    nodes = np.flatnonzero((length >= MIN_ARROW_LENGTH * longest) & visible)
+    distance = ARROW_DISTANCE * float(np.ptp(r[nodes], axis=0).max())
+    feet = nodes[spread_points(r[nodes], distance)]
+    return Arrow(camera(r[feet]), camera(distance / longest * vectors[feet]), "0.15", "")

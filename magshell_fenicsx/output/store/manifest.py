@@ -1,0 +1,126 @@
+"""Manifest of a folder: which files a run has written, so that another run replaces these alone."""
+
+import re
+import stat
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.output.pictures.picture import PICTURES
+from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, write_whole
+from magshell_fenicsx.output.store.folder import refuse_foreign
+from magshell_fenicsx.output.store.table import is_path
+
+NAME = "written.txt"
+HEADER = "# files that magshell_fenicsx has written here: another run replaces these alone\n"
+MESH = "mesh.json"  # the mesh chosen for a tolerance
+FILES_OF_PATH = (checkpoint.NAME, "path.csv", MESH)
+NEW_CHECKPOINT = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
+PICTURE_NAMES = (
+    *PICTURES,
+    "curve",
+    "sensors",
+    "field_maps",
+    "instabilities",
+    "modes",
+    "frequencies",
+    "solutions",
+    "gradients",
+)
+# every name that a run, or `plot` after it, may write, also while it writes
+RUN_NAMES = re.compile(
+    r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json"
+    r"|report\.html|animation\.gif|written\.txt"
+    rf"|({'|'.join(PICTURE_NAMES)})(_\d{{4,}})?\.(png|svg|pdf)"
+    r"|fields(/((path|whole)\.pvd|outlines(_\d{4,})?\.vtp|map_.+\.pvd"
+    r"|((point|whole|map_.+)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
+)
+
+
+def files_with_run_names(folder: Path) -> set[str]:
+    """Return what a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`.
+
+    No link is followed.
+    """
+    files = list(folder.iterdir())
+    has_fields = _irregular_kind(folder / "fields") == "a folder"
+    if has_fields:
+        files += (folder / "fields").iterdir()
+    relative = {file.relative_to(folder).as_posix() for file in files}
+    names = {name for name in relative if RUN_NAMES.fullmatch(name)}
+    return names - {"fields"} if has_fields else names
+
+
+def _irregular_kind(file: Path) -> str:
+    """Return words for what is there, empty if it is nothing or a regular file."""
+    kinds = {stat.S_IFREG: "", stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}
+    with suppress(FileNotFoundError):
+        return kinds.get(stat.S_IFMT(file.lstat().st_mode), "a device or a pipe")
+    return ""
+
+
+def files_of_runs(folder: Path) -> set[str]:
+    """Return the names of `files_with_run_names` that a run is known to have written.
+
+    They are listed in written.txt at the end of a run. Without it they are all, if summary.json is
+    a run's, as of earlier versions. The files of a path are, if checkpoint is, also after a kill,
+    or without the list path.csv. What is no regular file is no run's.
+    """
+    present = {name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)}
+    names = {name for name in present if name.endswith(".unfinished")}  # left by a kill
+    text = read_result(folder / NAME).decode(errors="replace") if NAME in present else ""
+    if is_replacement_unfinished(folder):
+        names.add(NEW_CHECKPOINT)
+    if text.startswith(HEADER):
+        names |= present & {NAME, *text.splitlines()}
+    elif _is_of_run(lambda: read_object(folder / "summary.json")):
+        return present
+    has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
+    if has_checkpoint or (NAME not in names and is_path(folder / "path.csv")):
+        names |= {name for name in present if name in FILES_OF_PATH or name.startswith("fields/")}
+    return names
+
+
+def is_replacement_unfinished(folder: Path) -> bool:
+    """Whether a new run was killed while it removed the files of an earlier one."""
+    return _is_of_run(lambda: checkpoint.identity_in(folder / NEW_CHECKPOINT))
+
+
+def _is_of_run(read_content: Callable[[], dict[str, Any] | None]) -> bool:
+    """Whether a file has the case and the program of a run."""
+    with suppress(OSError, Damaged):
+        content = read_content() or {}
+        has_program = bool(content.keys() & {"sources", "versions"})
+        return isinstance(content.get("case"), dict) and has_program
+    return False
+
+
+def refuse_unwritten(folder: Path) -> None:
+    """Refuse to write where a file that no run has written has a name that runs use.
+
+    Raises
+    ------
+    CaseError
+        With the names of these files.
+    """
+    foreign = files_with_run_names(folder) - files_of_runs(folder)
+    kinds = {name: _irregular_kind(folder / name) for name in foreign}
+    names = [f"{name} ({kind})" if kind else name for name, kind in kinds.items()]
+    refuse_foreign(folder, names, "a run")
+
+
+def write_manifest(folder: Path, added: Iterable[str] = ()) -> None:
+    """List what a run has written, and what `plot` has added."""
+    names = {*files_of_runs(folder), NAME, *added}
+    lines = "".join(f"{name}\n" for name in sorted(names))
+    write_whole(folder / NAME, (HEADER + lines).encode())
+
+
+def remove(folder: Path, names: Iterable[str]) -> None:
+    """Delete files that a run has written, the manifest last; and fields/ if it is empty then."""
+    for name in sorted(names, key=lambda name: name == NAME):
+        (folder / name).unlink(missing_ok=True)
+    with suppress(OSError):  # it is not there, or has files of others
+        (folder / "fields").rmdir()

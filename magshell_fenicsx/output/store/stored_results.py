@@ -1,0 +1,187 @@
+"""Stored results of a run: its case and summary.json, checked; the row that pictures show.
+
+Runs may be finished or interrupted.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.durable import Damaged, read_object
+from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
+from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.shape.shell_sections import FLAT_GEOMETRIES
+
+SUMMARY = "summary.json"
+NUMBER_TYPES, NONE_TYPE = (int, float), type(None)
+PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
+GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
+ALL_NUMBERS = {"*": NUMBER_TYPES}
+MAGNETIC_SECTIONS = {"remanent?": dict, "applied?": dict}
+# types of what is read from summary.json; a key with ? may be absent, * is every key, [...] a list
+# of such items
+SUMMARY_TYPES: dict[str, Any] = {
+    "case": {
+        "model": str,
+        "shell?": {"geometry": str},
+        **dict.fromkeys(("mesh", "output?"), dict),
+        "magnetic?": MAGNETIC_SECTIONS,
+        "loading?": (dict, list),
+    },
+    "dimensionless": dict.fromkeys(GROUPS, NUMBER_TYPES),
+    "dimensions": {
+        **dict.fromkeys(("radius", "thickness", "youngs_modulus"), (*NUMBER_TYPES, NONE_TYPE)),
+        "units": str,
+    },
+    "in_units?": ALL_NUMBERS,
+    "model": {"included": [str], "left_out": [str]},
+    "stopped": (str, NONE_TYPE),
+    "limit_points?": [{"mode_at?": [NUMBER_TYPES]}],
+    "sensitivities": ALL_NUMBERS,
+    "gradients?": {"*": {"value": NUMBER_TYPES, "numbers": ALL_NUMBERS, "fields": dict}},
+    "knockdown": (*NUMBER_TYPES, NONE_TYPE),
+    "barrier?": (*NUMBER_TYPES, NONE_TYPE),
+    "snaps?": [dict.fromkeys(("time", "departure?", "jump?", "overshoot"), NUMBER_TYPES)],
+    **dict.fromkeys(("snap_time_ms?", "snap_departure_ms?", "snap_jump_ms?"), NUMBER_TYPES),
+    "solutions?": [{"point": int, "stable": bool, "residual": NUMBER_TYPES}],
+    "points": int,
+    "mesh": dict.fromkeys(("cells", "dofs", "degree"), int),
+    "tolerance?": {
+        "tolerance": NUMBER_TYPES,
+        "error_estimate": (*NUMBER_TYPES, NONE_TYPE),
+        "rounds": [{"result": NUMBER_TYPES}],
+    },
+    "timing": dict.fromkeys(PHASES, NUMBER_TYPES),
+    **dict.fromkeys(("factorisations", "iterations", "ranks"), int),
+    "blas": str,
+    "versions": {"magshell_fenicsx": str},
+}
+# geometry -> words for the point of w_pole_over_h
+POLE_NAMES = {
+    "hemisphere": POLE,
+    "disc": "the centre",
+    "strip": "the tip",
+    "mesh": "the highest vertex",
+}
+
+
+def case_in(folder: Path) -> dict[str, Any]:
+    """Return the resolved case of a folder's summary.json or checkpoint; empty without both."""
+    if (folder / SUMMARY).exists():
+        return dict(read_summary(folder)["case"])
+    return dict((checkpoint.identity_in(folder / checkpoint.NAME) or {}).get("case") or {})
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Return the content of summary.json.
+
+    Raises
+    ------
+    Damaged
+        If it lacks something that reports and comparisons read.
+    """
+    summary = read_object(folder / SUMMARY)
+    if wrong := _first_error(summary, SUMMARY_TYPES):
+        raise Damaged(f"{folder / SUMMARY}: is damaged, or of an earlier version: {wrong}")
+    return summary
+
+
+def _first_error(value: Any, kind: Any, key: str = "") -> str:
+    """Return the first place where a value is none that a run writes, in words.
+
+    Empty if there is none. `kind` is a type or a structure as `SUMMARY_TYPES`.
+    """
+    inner_values: list[tuple[Any, Any, str]] = []
+    if isinstance(kind, list) and isinstance(value, list):
+        inner_values = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
+    elif isinstance(kind, dict) and isinstance(value, dict):
+        inner = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
+        missing = [name for name in inner if not name.endswith("?") and name not in value]
+        for name in missing:
+            return f"it has no {key}.{name}".replace(" .", " ")
+        names = {name: name.removesuffix("?") for name in inner}
+        inner_values = [
+            (value[inner_key], inner[name], f"{key}.{inner_key}")
+            for name, inner_key in names.items()
+            if inner_key in value
+        ]
+    elif isinstance(kind, list | dict) or not isinstance(value, kind):
+        return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
+    errors = (_first_error(*entry) for entry in inner_values)
+    return next((error for error in errors if error), "")
+
+
+class _Options(BaseModel):
+    """Section of a case that options of `plot` may change."""
+
+    output: OutputSection
+
+
+def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) -> OutputSection:
+    """Return the section `output` of a resolved case, with options in place of its keys.
+
+    Raises
+    ------
+    CaseError
+        If an option is wrong: the option, the value, what is allowed.
+    """
+    section, options = case.get("output") or {}, options or {}
+    source = Source("options", {"output": {**section, **options}})
+    for key in options:
+        source.places["output", key] = f"--{key.replace('_', '-')}"
+    try:
+        return _Options.model_validate(source.data).output
+    except ValidationError as e:
+        raise CaseError(explained(e.errors(), source, _Options)) from None
+
+
+def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
+    """Return the row that a run is about, at which its pictures show the shell.
+
+    With `until: limit` at its end that is the first instability, even if the path goes on from
+    there.
+    """
+    path = [row for row in rows if row["label"] != SOLUTION]
+    loading = case.get("loading") or {}
+    last = loading[-1] if isinstance(loading, list) else loading
+    goes_on = last.get("then") or last.get("branches")
+    ends_at_limit = last.get("until") == "limit" and not goes_on
+    instabilities = (row for row in path if row["label"] in LOCATED and not row["branch"])
+    return next(instabilities, path[-1]) if ends_at_limit else path[-1]
+
+
+def shell_of(case: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the section of the shell in a case; several shells are one of geometry: mesh."""
+    return case.get("shell") or ({"geometry": "mesh"} if case.get("shells") else {})
+
+
+def is_flat(case: Mapping[str, Any]) -> bool:
+    """Whether the shell of a case is drawn flat.
+
+    The pressure p_c of a sphere says nothing of such a shell.
+    """
+    return shell_of(case).get("geometry") in FLAT_GEOMETRIES
+
+
+def pole_of(case: Mapping[str, Any]) -> str:
+    """Return words for the point of `w_pole_over_h` on a shape, where the case names no point.
+
+    Examples
+    --------
+    >>> [pole_of({"shell": {"geometry": name}}) for name in ("hemisphere", "strip", "torus")]
+    ['the pole', 'the tip', 'the watched point']
+    """
+    shell = shell_of(case) or {"geometry": "hemisphere"}
+    geometry = shell.get("geometry")
+    if geometry == "cap" and shell.get("hole") is None:
+        return POLE
+    points = (shell.get("profile") or {}).get("points") or []
+    if geometry == "revolution" and points and points[-1][0] == 0:
+        return POLE
+    return POLE_NAMES.get(str(geometry), "the watched point")
