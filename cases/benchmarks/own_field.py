@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from magshell_fenicsx.parts.magnetism.coulomb import Charged
+from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 
@@ -23,12 +23,12 @@ CASE = Path(__file__).parents[1] / "own_field.yaml"
 
 
 class AngleTerm:
-    """Stands for `Charged.evaluate`, and counts its calls."""
+    """Stands for `InteractingCharges.evaluate`, and counts its calls."""
 
     def __init__(self) -> None:
-        self.count, self._evaluate = 0, Charged.evaluate
+        self.count, self._evaluate = 0, InteractingCharges.evaluate
 
-    def __get__(self, charged: Charged, _: type[Charged]) -> Any:
+    def __get__(self, charged: InteractingCharges, _: type[InteractingCharges]) -> Any:
         def evaluate(*given: Any) -> Any:
             self.count += 1
             return self._evaluate(charged, *given)
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--refinement", type=float, default=0.56)
     parser.add_argument("--points", type=int, default=6)
     given, counted = parser.parse_args(), AngleTerm()
-    Charged.evaluate = counted  # type: ignore[method-assign,assignment]
+    InteractingCharges.evaluate = counted  # type: ignore[method-assign,assignment]
     case = yaml.safe_load(CASE.read_text(encoding="utf-8"))
     case |= {"symmetry": "none", "mesh": case["mesh"] | {"refinement": given.refinement}}
     alone = {key: value for key, value in case.items() if key != "magnetic"}

@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
-from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
 REDUCED = 3  # quadrature degree: two points in each direction
 VALUE, GRADIENT, ON_FACE = (
@@ -156,7 +156,7 @@ class TermFactory:
             self.soft(of, of.soft, applied),
         ]
 
-    def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> SolidTerm:
+    def soft(self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
         law, n0, *given = self._of_sheet(sheet, soft, applied)
@@ -177,7 +177,7 @@ class TermFactory:
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
     def _of_sheet(
-        self, sheet: Sheet, soft: Soft, applied: AppliedField | None
+        self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
         """The susceptibility, or what is known of what saturates; normals of layers, amplitudes,
         parts of the field.

@@ -48,7 +48,7 @@ from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
-from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
 Array = NDArray[np.float64]
@@ -213,7 +213,7 @@ class EnergyFactory:
             self.soft(field, field.soft, applied),
         ]
 
-    def soft(self, field: Magnetisation, soft: Soft, applied: AppliedField | None) -> Energy:
+    def soft(self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
         sheet, scale = Sheet(field), self._constant(soft.scale)
         law, *given = self._of_sheet(sheet, soft, applied)
@@ -237,7 +237,7 @@ class EnergyFactory:
             for name, density in by_name.items()
         }
 
-    def _of_sheet(self, sheet: Sheet, soft: Soft, applied: AppliedField | None) -> list[Parameter]:
+    def _of_sheet(self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None) -> list[Parameter]:
         """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of
         the field.
         """

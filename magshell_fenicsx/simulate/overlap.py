@@ -74,7 +74,7 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
         In the words of a scene, which sees more: parts too near for the size of their cells.
     """
     from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
-    from magshell_fenicsx.parts.magnetism.stacked_faces import INSIDE
+    from magshell_fenicsx.parts.magnetism.stacked_faces import OVERLAP_DISTANCE
 
     surfaces, V = Surfaces.of(r0), r0.function_space
     nodes = surfaces.cells.nodes
@@ -82,5 +82,5 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     for number in np.unique(part)[1:]:
         own = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)
-        if surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf) < INSIDE * h:
+        if surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf) < OVERLAP_DISTANCE * h:
             raise CaseError(TOO_NEAR)

@@ -124,7 +124,8 @@ class Lengths:
             return self.h if name == "w0" else 1 / self.R
         if not self.si:
             raise TableError(
-                f"column {name}: has the unit {unit}, but the shell's lengths have none; h and R are allowed"
+                f"column {name}: has the unit {unit}, but the shell's lengths have none; h and R "
+                "are allowed"
             )
         return column_size(name, unit, "metre") / self.R
 
@@ -160,7 +161,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     )
     if wanted is None:
         raise TableError(
-            f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, w0, or x, y, z of the "
+            f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, "
+            "w0, or x, y, z of the "
             "real surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
         )
     names = [*wanted, *(["w0"] if "w0" in columns else [])]
@@ -170,7 +172,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         and any(units[name] for name in wanted if name not in ANGLES)
     ):
         raise TableError(
-            "column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]"
+            "column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 "
+            "[um]"
         )
     return _finite_rows(
         names, [columns[name] * _factor(units[name], name, lengths) for name in names]
@@ -192,12 +195,14 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
         raise TableError("its arrays have different lengths") from None
     if len(rows) > MOST_ROWS:
         raise TableError(
-            f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average neighbours"
+            f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average "
+            "neighbours"
         )
     good = np.isfinite(rows).all(axis=1)
     if good.sum() < max(20, len(rows) // 2):
         raise TableError(
-            f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of the rows"
+            f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of "
+            "the rows"
         )
     return Scan(dict(zip(names, rows[good].T, strict=True)), int((~good).sum()))
 
@@ -226,7 +231,8 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
             else ": are they in the shell's frame?"
         )
         raise TableError(
-            f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most {min(MOST_H, MOST_R / h):.4g}{unit}"
+            f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most "
+            f"{min(MOST_H, MOST_R / h):.4g}{unit}"
         )
     given = len(w0)
     tree = scipy.spatial.cKDTree(places)
@@ -235,7 +241,8 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
     if gaps.max() > max(HOLE * sqrt(h), GAPS * spacing):
         where = place_text(surface[np.argmax(gaps)])
         raise TableError(
-            f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole is too large to "
+            f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole "
+            "is too large to "
             "guess; give values there, w0 = 0 where the shell is perfect"
         )
     places, w0 = _merged(places, w0, SAME * spacing)
@@ -244,7 +251,8 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
     estimated = "estimated" if noise is None else "given"
     account = (
         f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, "
-        f"residual of the fit {function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), "
+        f"residual of the fit {function.residual / h:.3g} h, noise {function.noise / h:.3g} h "
+        f"({estimated}), "
         f"largest gap {gaps.max():.3g} R"
     )
     lost = f", {scan.lost} rows without a number left out" if scan.lost else ""
@@ -277,7 +285,8 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
     if away.max() > FAR:
         row = int(np.argmax(away))
         raise TableError(
-            f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the columns their unit, "
+            f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the "
+            "columns their unit, "
             "such as x [mm], or turn and move them to the shell's frame"
         )
     places, heights = feet(ground.perfect, x)
@@ -286,8 +295,10 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():
         row = int(np.argmax(np.abs(heights)))
         raise TableError(
-            f"the place {place_text(x[row])} over R is {abs(heights[row]):.3g} R from the shell, but w0 there "
-            f"is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another shell"
+            f"the place {place_text(x[row])} over R is {abs(heights[row]):.3g} R from the shell, "
+            "but w0 there "
+            f"is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another "
+            "shell"
         )
     return places, w0
 

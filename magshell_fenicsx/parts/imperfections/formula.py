@@ -46,7 +46,8 @@ class FormulaSection(ImperfectionSection):
         if len(bad):
             place = ", ".join(f"{c:.3g}" for c in bad[0])
             raise CaseError(
-                f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a radius, at (x, y, z)/R = "
+                f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
+                "radius, at (x, y, z)/R = "
                 f"({place})"
             )
         largest, derived = (

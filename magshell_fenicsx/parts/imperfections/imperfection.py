@@ -145,7 +145,8 @@ def over(scale: Literal["h", "width"]) -> BeforeValidator:
         sizes = (info.context or {}).get(CONTEXT)
         if not sizes:
             raise ValueError(
-                f"has a unit: that needs lengths of the shell with units; a number is in {UNITS[scale]}"
+                "has a unit: that needs lengths of the shell with units; a number is in "
+                f"{UNITS[scale]}"
             )
         return exact / sizes[scale]
 
@@ -307,7 +308,8 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
         shell = context.shell
         if getattr(shell, "defect", None) and shell.imperfections:
             raise ValueError(
-                "shell.imperfections: give these or defect; a dimple of the list is the same as defect"
+                "shell.imperfections: give these or defect; a dimple of the list is the same as "
+                "defect"
             )
         edge = None if shell.edge_polar is None else radians(shell.edge_polar)
         for key, section in self.given.items():

@@ -50,7 +50,8 @@ class ModesSection(FileKeys, ImperfectionSection):
     def _one_mode_in_a_file(self) -> Self:
         if self.file is not None and len(self.amplitudes) > 1:
             raise ValueError(
-                "amplitudes: a file has one mode: give one amplitude, and an item of the list for each file"
+                "amplitudes: a file has one mode: give one amplitude, and an item of the list for "
+                "each file"
             )
         return self
 
@@ -97,7 +98,8 @@ class ModesSection(FileKeys, ImperfectionSection):
         ]
         if counted and not any(counted):
             raise ValueError(
-                f"amplitudes: of the {len(parts)} lowest modes of all shells together those with an amplitude do not "
+                f"amplitudes: of the {len(parts)} lowest modes of all shells together those with "
+                "an amplitude do not "
                 "move it: give more, and 0 for those of other shells"
             )
         self._shapes = tuple(part or _still for part in parts)

@@ -282,7 +282,8 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     outside = beyond(np.tile(tried[:, None], CORNERS)) >= 0
     if not outside.any(axis=0).all():
         raise CaseError(
-            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: it would reach "
+            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: "
+            "it would reach "
             "around the shell or its axis"
         )
     high = tried[outside.argmax(axis=0)]

@@ -22,7 +22,12 @@ from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
-from magshell_fenicsx.parts.magnetism.moving_source import Driven, FieldInSpace, Here, carried
+from magshell_fenicsx.parts.magnetism.moving_source import (
+    FieldAtPlaces,
+    FieldInSpace,
+    MovingField,
+    combined_motion,
+)
 
 Array = NDArray[np.float64]
 HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the places of a path
@@ -85,7 +90,7 @@ class AppliedField:
         r0: fem.Function,
         u: fem.Function,
         degree: int,
-        driven: Sequence[Driven] = (),
+        driven: Sequence[MovingField] = (),
     ) -> None:
         V = u.function_space
         self._degree = degree
@@ -93,7 +98,7 @@ class AppliedField:
         self._of, self._driven, self._u = of, driven, u
         self.mu = {name: 0.0 for each in driven for name in each.names}
         self.lost = ""
-        self._here: list[Here] = []
+        self._here: list[FieldAtPlaces] = []
         points = self.polynomial.points
         self._r0 = Memo(lambda: at_quadrature(r0, points), lambda: (r0.x.array,))
         self._moved = Memo(lambda: at_quadrature(u, points), lambda: (u.x.array,))
@@ -159,14 +164,16 @@ class AppliedField:
         """Through what a point has moved between two states, from their places and amplitudes; ""
         if through none.
         """
-        still: list[tuple[FieldInSpace, Driven]] = [
-            (part, Driven(part)) for part in getattr(self._of, "parts", [])
+        still: list[tuple[FieldInSpace, MovingField]] = [
+            (part, MovingField(part)) for part in getattr(self._of, "parts", [])
         ]
         for of, driven in [*still, *((each.of, each) for each in self._driven)]:
             if distance := getattr(of, "distance", None):
                 ways = [
                     (x - t) @ Q
-                    for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))
+                    for x, (Q, t) in (
+                        (x, combined_motion(driven.motions, mu)) for x, mu in (before, after)
+                    )
                 ]
                 if crossing(distance, *ways) is not None:
                     said = getattr(of, "nowhere", "is inside a source")

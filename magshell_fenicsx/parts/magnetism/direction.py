@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.device import Curve
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
-from magshell_fenicsx.parts.magnetism.moving_source import carried
+from magshell_fenicsx.parts.magnetism.moving_source import combined_motion
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: flo
     """
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
-        now = carried(field.turns, mu)[0] @ first
+        now = combined_motion(field.turns, mu)[0] @ first
         normal = np.cross(first, now)
         planar = all(np.abs(np.cross(axis, one.turn)).max() < 1e-9 for one in field.turns)
         across = float(normal @ axis) if planar else float(np.linalg.norm(normal))

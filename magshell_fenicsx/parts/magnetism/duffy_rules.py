@@ -1,8 +1,7 @@
-"""Rules for the charges of two cells that touch, or of one with itself: points where 1/distance is
-nearly singular.
+"""Quadrature of 1/distance over two adjacent cells, or one cell twice, where it is nearly singular.
 
-Each point of the first cell sees the second along rays from where it is itself, or from where the
-plane of the second would have it. With polar coordinates and r = s sinh v a rule is exact for
+Each point of the first cell sees the second along rays from its own place, or from where it would
+be in the plane of the second. With polar coordinates and r = s sinh v a rule is exact for
 charges in one surface, where the area r dr dangle takes the pole away, and for those in two at a
 distance s: both faces, with the same points.
 """
@@ -18,53 +17,56 @@ from magshell_fenicsx.parts.magnetism.charges import gauss
 Array = NDArray[np.float64]
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 ENDS = ((1, 2), (2, 0), (0, 1))  # corners of the local edges, with the surface on the left
-ALONG, RADIAL = 5, 7  # points over a sector of rays, more over wide ones, and along a ray
-INNER = 6  # degree of the rule on the first cell
-FROM_EDGE, BESIDE = 7, 4  # its points off and along a free edge
-STRIP = (8, 5)  # points along an edge and through the thickness
-APART = 10  # degree on cells that touch the other only with another side
-THIN = 1e-9
-SPLIT = 0.15  # of the thickness: from points on an edge strip to the faces
+SECTOR_POINTS = 5  # over a sector of rays, more over wide ones
+RAY_POINTS = 7  # along a ray
+INNER_DEGREE = 6  # of the rule on the first cell
+POINTS_FROM_FREE_EDGE, POINTS_ALONG_FREE_EDGE = 7, 4  # of the first cell
+STRIP_POINTS = (8, 5)  # along an edge and through the thickness
+REGULAR_DEGREE = 10  # on cells that touch the other only with another side
+AREA_TOLERANCE = 1e-9  # over the area of the reference triangle
+STRIP_SCALE = 0.15  # scale of rules from an edge strip to the faces, over the thickness
 
 
 def graded(n: int, s: float, end: float = 1.0) -> tuple[Array, Array]:
-    """Points in [0, end] and weights, dense at 0 on the scale s."""
+    """Return n points in [0, end] and weights, dense at 0 on the scale s."""
     x, w = gauss(n)
     top = np.arcsinh(end / s)
     return s * np.sinh(top * x), w * top * s * np.cosh(top * x)
 
 
-def _turn(a: Array, b: Array) -> float:
-    """The area that two vectors in the plane span, with its sign."""
+def _spanned_area(a: Array, b: Array) -> float:
+    """Return the signed area that two vectors in the plane span."""
     return float(a[0] * b[1] - a[1] * b[0])
 
 
 def barycentric(X: Array) -> Array:
+    """Return barycentric coordinates (n, 3) of points (n, 2) of the reference triangle."""
     return np.column_stack([1 - X.sum(axis=-1), X])
 
 
 def polar(apex: Array, s: float) -> tuple[Array, Array]:
-    """Points (n, 2) and weights of the reference triangle as seen from a place (2,) in its plane,
-    with the scale s.
+    """Return a rule of the reference triangle, points (n, 2) and weights, in polar coordinates.
+
+    The pole is a place `apex` (2,) in its plane; points are dense there on the scale s.
     """
     V = CORNERS - apex
-    inside = min(_turn(V[i], V[j]) for i, j in ENDS) > -THIN
+    is_inside = min(_spanned_area(V[i], V[j]) for i, j in ENDS) > -AREA_TOLERANCE
     lines = np.array([V[j] - V[i] for i, j in ENDS])
     points, weights = list[Array](), list[Array]()
-    v, wv = gauss(RADIAL)
-    for A, B in _sectors(V, inside):
-        middle = A / np.linalg.norm(A) + B / np.linalg.norm(B)
-        entry = int(np.argmin(_cuts(lines, V, middle[None])[0]))
-        along = lines[entry] / np.linalg.norm(lines[entry])
+    v, wv = gauss(RAY_POINTS)
+    for A, B in _sectors(V, is_inside):
+        bisector = A / np.linalg.norm(A) + B / np.linalg.norm(B)
+        entry = int(np.argmin(_ray_lengths(lines, V, bisector[None])[0]))
+        direction = lines[entry] / np.linalg.norm(lines[entry])
         start = V[ENDS[entry][0]]
-        normal = start - (start @ along) * along
+        normal = start - (start @ direction) * direction
         normal = normal / np.linalg.norm(normal)
-        ends = [np.arcsinh((C @ along) / (C @ normal)) for C in (A, B)]
-        x, w = gauss(ALONG + int(abs(ends[1] - ends[0])))
+        ends = [np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B)]
+        x, w = gauss(SECTOR_POINTS + int(abs(ends[1] - ends[0])))
         mu = ends[0] + (ends[1] - ends[0]) * x
-        rays = (normal[None] + np.sinh(mu)[:, None] * along) / np.cosh(mu)[:, None]
-        cuts = _cuts(lines, V, rays)
-        low = np.zeros(len(x)) if inside else cuts.min(axis=1)
+        rays = (normal[None] + np.sinh(mu)[:, None] * direction) / np.cosh(mu)[:, None]
+        cuts = _ray_lengths(lines, V, rays)
+        low = np.zeros(len(x)) if is_inside else cuts.min(axis=1)
         high = np.where(np.isfinite(cuts), cuts, 0.0).max(axis=1)
         bottom, top = (np.arcsinh(each / s)[:, None] for each in (low, high))
         r = s * np.sinh(bottom + (top - bottom) * v)
@@ -74,40 +76,47 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
     return np.concatenate(points), np.concatenate(weights)
 
 
-def _sectors(V: Array, inside: bool) -> list[tuple[Array, Array]]:
-    """Pairs of rays between which the corners (3, 2) of a triangle around or beside the origin have
-    no other.
+def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
+    """Return pairs of rays through corners V (3, 2) of a triangle with no corner between them.
+
+    The rays start in the origin, which is inside the triangle or beside it.
     """
-    if inside:
-        return [(V[i], V[j]) for i, j in ENDS if _turn(V[i], V[j]) > THIN]
-    towards = V.mean(axis=0)
-    angle = [np.arctan2(_turn(towards, v), towards @ v) for v in V]
+    if is_inside:
+        return [(V[i], V[j]) for i, j in ENDS if _spanned_area(V[i], V[j]) > AREA_TOLERANCE]
+    to_middle = V.mean(axis=0)
+    angle = [np.arctan2(_spanned_area(to_middle, v), to_middle @ v) for v in V]
     order = np.argsort(angle)
-    return [(V[i], V[j]) for i, j in pairwise(order) if angle[j] - angle[i] > THIN]
+    return [(V[i], V[j]) for i, j in pairwise(order) if angle[j] - angle[i] > AREA_TOLERANCE]
 
 
-def _cuts(lines: Array, starts: Array, rays: Array) -> Array:
-    """Where rays (n, 2) from the origin cut the sides of a triangle, (n, 3); infinite where they do
-    not.
+def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
+    """Return the lengths (n, 3) of rays (n, 2) from the origin to the sides of a triangle.
+
+    They are infinite where a ray does not meet a side.
     """
     starts = starts[[i for i, _ in ENDS]]
     det = rays[:, :1] * lines[:, 1] - rays[:, 1:] * lines[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         r = (starts[:, 0] * lines[:, 1] - starts[:, 1] * lines[:, 0]) / det
         t = (starts[:, 0] * rays[:, 1:] - starts[:, 1] * rays[:, :1]) / det
-    met = (np.abs(det) > THIN) & (r > THIN) & (t > -THIN) & (t < 1 + THIN)
-    return np.where(met, r, np.inf)
+    is_met = (
+        (np.abs(det) > AREA_TOLERANCE)
+        & (r > AREA_TOLERANCE)
+        & (t > -AREA_TOLERANCE)
+        & (t < 1 + AREA_TOLERANCE)
+    )
+    return np.where(is_met, r, np.inf)
 
 
-def around(mask: tuple[bool, bool, bool], s: float) -> tuple[Array, Array]:
-    """A rule of the reference triangle that is dense at some of its sides."""
-    if not any(mask):
-        X, w = basix.make_quadrature(basix.CellType.triangle, INNER)
+def rule_along_sides(dense_sides: tuple[bool, bool, bool], s: float) -> tuple[Array, Array]:
+    """Return a rule of the reference triangle that is dense at some of its sides."""
+    if not any(dense_sides):
+        X, w = basix.make_quadrature(basix.CellType.triangle, INNER_DEGREE)
         return np.asarray(X), np.asarray(w)
     points, weights, centre = list[Array](), list[Array](), CORNERS.mean(axis=0)
-    for (i, j), free in zip(ENDS, mask, strict=True):
-        a, wa = graded(FROM_EDGE, 3 * s) if free else gauss(3)
-        b, wb = gauss(BESIDE if free else 3)
+    for (i, j), is_free in zip(ENDS, dense_sides, strict=True):
+        a, wa = graded(POINTS_FROM_FREE_EDGE, 3 * s) if is_free else gauss(3)
+        b, wb = gauss(POINTS_ALONG_FREE_EDGE if is_free else 3)
         side = CORNERS[i] + b[:, None] * (CORNERS[j] - CORNERS[i])
         points.append(((1 - a)[:, None, None] * side + a[:, None, None] * centre).reshape(-1, 2))
         weights.append(np.outer(wa * (1 - a), wb).ravel() / 3)
@@ -115,7 +124,7 @@ def around(mask: tuple[bool, bool, bool], s: float) -> tuple[Array, Array]:
 
 
 def at_corner(corner: int) -> tuple[Array, Array]:
-    """A rule of the reference triangle for what is nearly singular at a corner."""
+    """Return a rule of the reference triangle for integrands nearly singular at a corner."""
     (a, wa), (b, wb) = gauss(6), gauss(5)
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
     side = A - V + b[:, None] * (B - A)
@@ -125,56 +134,66 @@ def at_corner(corner: int) -> tuple[Array, Array]:
 
 
 def on_edge(edge: int, t: Array) -> Array:
+    """Return points (n, 2) of a local edge of the reference triangle, t (n,) in [0, 1] along it."""
     i, j = ENDS[edge]
     return np.asarray(CORNERS[i] + t[:, None] * (CORNERS[j] - CORNERS[i]))
 
 
-def beyond(X: Array, sides: tuple[int, int], flip: bool) -> Array:
-    """Where points of a triangle are in the plane of the next one, behind the side that both have."""
+def continued_across_side(X: Array, sides: tuple[int, int], flip: bool) -> Array:
+    """Return points X (n, 2) of a triangle in coordinates of its neighbour, continued there.
+
+    Both share a side, with local numbers `sides`; `flip` if it runs the other way in the second.
+    """
     bary, (i, j), (m, n) = barycentric(X), ENDS[sides[0]], ENDS[sides[1]]
     m, n = (n, m) if flip else (m, n)
-    beyond_side = np.zeros_like(bary)
-    rest = bary[:, 3 - i - j]
-    beyond_side[:, m], beyond_side[:, n], beyond_side[:, 3 - m - n] = (
-        bary[:, i] + rest,
-        bary[:, j] + rest,
-        -rest,
+    continued = np.zeros_like(bary)
+    opposite = bary[:, 3 - i - j]
+    continued[:, m], continued[:, n], continued[:, 3 - m - n] = (
+        bary[:, i] + opposite,
+        bary[:, j] + opposite,
+        -opposite,
     )
-    return np.asarray(beyond_side[:, 1:])
+    return np.asarray(continued[:, 1:])
 
 
 def strip() -> tuple[Array, Array, Array]:
-    """Coordinates along an edge and through the thickness, in [0, 1], and weights."""
-    (x, wt), (eta, we) = (gauss(n) for n in STRIP)
+    """Return a rule of an edge strip: coordinates along and across it, in [0, 1], and weights."""
+    (x, wt), (eta, we) = (gauss(n) for n in STRIP_POINTS)
     t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends
     a, b = (each.ravel() for each in np.meshgrid(t, eta, indexing="ij"))
     return a, b, np.asarray(np.outer(wt, we).ravel(), dtype=np.float64)
 
 
-def along_strip(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
-    """The same of a strip seen from a place on it, or beyond one of its ends."""
-    x, w = gauss(STRIP[1])
-    v, wv = gauss(RADIAL)
-    beyond_it = (
-        not 0 <= t <= 1
-    )  # where normals may differ, so that no points come too near each other
-    power, least = (1, 0.1) if beyond_it else (3, 0.02)
-    ways = (
+def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
+    """Return a rule of an edge strip, dense at a place (t, eta) on it or beyond one of its ends.
+
+    `s` is the scale: the thickness over the length of the edge.
+    """
+    x, w = gauss(STRIP_POINTS[1])
+    v, wv = gauss(RAY_POINTS)
+    # beyond an end normals may differ, so that no points come too near each other
+    is_beyond = not 0 <= t <= 1
+    power, min_scale = (1, 0.1) if is_beyond else (3, 0.02)
+    segments = (
         [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]
-        if not beyond_it
+        if not is_beyond
         else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
     )
     pieces = list[tuple[Array, Array, Array]]()
     for high in (-eta, 1 - eta):
-        for e, we in zip(
+        for height, weight in zip(
             eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True
         ):
-            scale = s * max(abs(e - eta), least)
-            for near, far, way in ways:
-                bottom, top = np.arcsinh(near / scale), np.arcsinh(far / scale)
+            scale = s * max(abs(height - eta), min_scale)
+            for start, end, sign in segments:
+                bottom, top = np.arcsinh(start / scale), np.arcsinh(end / scale)
                 r = bottom + (top - bottom) * v
-                along = t + way * scale * np.sinh(r)
+                places = t + sign * scale * np.sinh(r)
                 pieces.append(
-                    (along, np.full_like(r, e), we * wv * (top - bottom) * scale * np.cosh(r))
+                    (
+                        places,
+                        np.full_like(r, height),
+                        weight * wv * (top - bottom) * scale * np.cosh(r),
+                    )
                 )
-    return tuple(np.concatenate(each) for each in zip(*pieces, strict=True))
+    return tuple(np.concatenate(part) for part in zip(*pieces, strict=True))

@@ -55,7 +55,8 @@ class FieldMapSection(Section):
     def _is_a_grid(self) -> "FieldMapSection":
         if len(self.points) != len(self.sides):
             raise ValueError(
-                f"points: {len(self.points)} numbers for {len(self.sides)} sides: give one for each side, "
+                f"points: {len(self.points)} numbers for {len(self.sides)} sides: give one for "
+                "each side, "
                 "as [41, 41] for two"
             )
         if np.prod(self.points) > MOST:
@@ -139,7 +140,8 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
         for name in self.given:
             if not (name.isascii() and name.isidentifier() and len(name) <= LONGEST):
                 raise ValueError(
-                    f"field_maps: {name}: a name is made of at most {LONGEST} letters, digits and _, as it is in names "
+                    f"field_maps: {name}: a name is made of at most {LONGEST} letters, digits and "
+                    "_, as it is in names "
                     "of files"
                 )
 

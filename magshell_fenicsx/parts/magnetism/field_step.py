@@ -81,7 +81,8 @@ class FieldSection(FactorStep):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not strength(context):
             raise ValueError(
-                f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction"
+                f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or "
+                "direction"
             )
 
     def unstable_alone(self, value: float, course: Course, what: str) -> str:
@@ -122,7 +123,9 @@ class RotationSection(Step):
             where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
             raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         return [SymmetryConstraint("the field turns", [self.to.vector()])]
 
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:

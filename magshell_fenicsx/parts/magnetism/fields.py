@@ -66,7 +66,8 @@ class AppliedSection(Direction):
         others = {"polar", "azimuth", "uniform", "gradient", "components"} & self.model_fields_set
         if self.sources and self.flux_density is None and others:
             raise ValueError(
-                f"{', '.join(sorted(others))}: of a field beside the sources: give its flux_density too"
+                f"{', '.join(sorted(others))}: of a field beside the sources: give its "
+                "flux_density too"
             )
         names = [source.name for source in self.sources or [] if source.name is not None]
         if twice := next((name for name in names if names.count(name) > 1), None):
@@ -117,7 +118,8 @@ def _of_places(value: Any) -> Any:
                 or not 0 <= each <= MOST_SOFT
             ):
                 raise ValueError(
-                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, z"
+                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, "
+                    "z"
                 )
     return value
 
@@ -176,22 +178,26 @@ class MagneticSection(Section, Ability):
     def _what_is_soft(self) -> Self:
         if self.remanent is None and self.susceptibility is None:
             raise ValueError(
-                "remanent: none is of a shell with a susceptibility: give that, or leave remanent out"
+                "remanent: none is of a shell with a susceptibility: give that, or leave remanent "
+                "out"
             )
         if self.saturation is not None and (
             self.susceptibility is None or self.lambda_m is not None
         ):
             raise ValueError(
-                "saturation: is of a shell with a susceptibility in a field in tesla: give susceptibility and "
+                "saturation: is of a shell with a susceptibility in a field in tesla: give "
+                "susceptibility and "
                 "applied.flux_density (or sources), without lambda_m"
             )
         if self.susceptibility is not None and self.energy != "full":
             raise ValueError(
-                f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs full"
+                f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs "
+                "full"
             )
         if self.susceptibility is not None and self.remanent and self.lambda_m is not None:
             raise ValueError(
-                "susceptibility: beside a remanence lambda_m does not say how strong the field is: give "
+                "susceptibility: beside a remanence lambda_m does not say how strong the field is: "
+                "give "
                 "remanent.flux_density and applied.flux_density"
             )
         return self
@@ -209,7 +215,8 @@ class MagneticSection(Section, Ability):
         }
         if bad := next((key for key, given in beside.items() if given), None):
             raise ValueError(
-                f"interaction: {self.interaction}: not with {bad}: it is that of parts with a remanence alone, with "
+                f"interaction: {self.interaction}: not with {bad}: it is that of parts with a "
+                "remanence alone, with "
                 "remanence: deformation and energy: full"
             )
         return self
@@ -230,7 +237,8 @@ class MagneticSection(Section, Ability):
             )
         if self.model_fields_set == {"remanence"}:
             raise ValueError(
-                "remanence: is a law of a field, and there is none: give lambda_m or flux densities too"
+                "remanence: is a law of a field, and there is none: give lambda_m or flux "
+                "densities too"
             )
         if self.lambda_m is None and None in densities and not self.without_field:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
@@ -240,7 +248,8 @@ class MagneticSection(Section, Ability):
             )
         if not self.applied.is_uniform and self.energy != "full":
             raise ValueError(
-                "the approximate energies are of uniform fields; gradient, components and sources need energy: full"
+                "the approximate energies are of uniform fields; gradient, components and sources "
+                "need energy: full"
             )
         return self
 
@@ -292,12 +301,14 @@ class MagneticSection(Section, Ability):
         self.amplitude(shell.youngs_modulus)
         if self.applied.sources and not shell.with_units:
             raise ValueError(
-                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
+                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the "
+                "shell's lengths units"
             )
         by_densities = self.lambda_m is None and not self.without_field
         if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
             raise ValueError(
-                "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
+                "magnetic: flux densities need shell.youngs_modulus in pascals: give "
+                "youngs_modulus and lengths units, "
                 "or lambda_m"
             )
         if self.without_field and not is_read(context) and self.interaction == "none":
@@ -324,7 +335,8 @@ class MagneticSection(Section, Ability):
         layers = self.remanent.layers if self.remanent else None
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
-                "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
+                "magnetic.remanent.layers: the layers cancel: their average is a remanence of "
+                "length zero, and a shell "
                 "knows no more of them"
             )
         patches = self.remanent.patches if self.remanent else None
@@ -399,14 +411,16 @@ class MagneticSection(Section, Ability):
             ):
                 x, y, z = strong[0]
                 raise CaseError(
-                    f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the field at (x, y, z)/R = "
+                    f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the "
+                    "field at (x, y, z)/R = "
                     f"({x:.3g}, {y:.3g}, {z:.3g})"
                 )
             bad = places[~np.isfinite(B).all(axis=1)]
             if len(bad):
                 x, y, z = bad[0]
                 raise CaseError(
-                    f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) {source.nowhere}; "
+                    f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) "
+                    f"{source.nowhere}; "
                     "see its position"
                 )
         components = {
@@ -423,7 +437,8 @@ class MagneticSection(Section, Ability):
             if len(bad):
                 x, y, z = bad[0]
                 raise CaseError(
-                    f"magnetic.{key}.components: {shown_value(text)}: has no finite value (or one above 1e6) "
+                    f"magnetic.{key}.components: {shown_value(text)}: has no finite value (or one "
+                    "above 1e6) "
                     f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
 
@@ -443,7 +458,8 @@ class MagneticSection(Section, Ability):
             return None
         x, y, z = places[np.argmax(np.maximum(*sizes))]
         return (
-            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl B up to "
+            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl B "
+            "up to "
             f"{largest[1]:.3g} B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): "
             "magnets and currents elsewhere make no such field"
         )
@@ -464,7 +480,8 @@ class MagneticSection(Section, Ability):
             np.sum([source(places)[0] for source in sources], axis=0), axis=1
         )
         return [
-            f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"
+            f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} "
+            "mT"
         ]
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:

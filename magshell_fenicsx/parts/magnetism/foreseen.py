@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.dense_tangent import BlockProducts, SinglePrecisionBlocks
-from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther
+from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian
 
 Array = NDArray[np.float64]
 POINTS, MOST = 3, 3  # of the path that are remembered, and coefficients of the polynomial along it
@@ -61,7 +61,7 @@ class Foreseen:
         self._blocks, self._turns, self._alone = blocks, turns, alone  # on one rank
         self._points = list[list[Known]]()  # the newest last; of each point several states
         self._ways = list[float]()  # to each point from the one before
-        self._D: ActingOnEachOther | None = None
+        self._D: InteractionHessian | None = None
         self._stored: SinglePrecisionBlocks | None = None  # of D, turned to `_turned`
         self._turned: Array | None = None
         self._products = deque[tuple[Array, Array]](maxlen=LAST)  # the last u and D u
@@ -78,7 +78,7 @@ class Foreseen:
             self._points, self._ways = [*before, [known]], [*self._ways[1 - POINTS :], way]
         self._model = None
 
-    def at(self, u: Array, D: ActingOnEachOther, of_D: Array) -> Array | None:
+    def at(self, u: Array, D: InteractionHessian, of_D: Array) -> Array | None:
         """This rank's part of the forces, from those of D at its state; None if nothing is known."""
         if not (self._points and np.isfinite(u).all()):
             return None
@@ -108,7 +108,7 @@ class Foreseen:
         """Whether a state is not of the last point."""
         return float(np.linalg.norm(u - self._points[-1][-1].u)) > TOGETHER * self._ways[-1]
 
-    def _turn(self, u: Array, D: ActingOnEachOther, of_D: Array) -> None:
+    def _turn(self, u: Array, D: InteractionHessian, of_D: Array) -> None:
         """Take D as it is at another state, if nodes have turned enough."""
         before = self._turned if D is self._D else None
         if before is not None and 2 * np.abs(self._turns(u, before)[:, :3]).max() < TURNED:
@@ -117,7 +117,11 @@ class Foreseen:
         if turned is None and before is not None:
             return
         self._D, self._turned = D, u
-        self._stored = SinglePrecisionBlocks.from_blocks(D.near_blocks, upper=self._alone) if turned is None else turned
+        self._stored = (
+            SinglePrecisionBlocks.from_blocks(D.near_blocks, upper=self._alone)
+            if turned is None
+            else turned
+        )
         self._model = None
         self._products.clear()
         self._points = [

@@ -25,14 +25,14 @@ from magshell_fenicsx.assembly.global_mesh import (
 )
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
-from magshell_fenicsx.parts.magnetism.coulomb import Charged, Touching
+from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges, PartsTooNear
 from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
-from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape, unit
-from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther, Cells
-from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Stiffness
-from magshell_fenicsx.parts.magnetism.self_field import own_field
-from magshell_fenicsx.parts.magnetism.singular_pairs import Near
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, unit
+from magshell_fenicsx.parts.magnetism.multipole_expansion import Cells, InteractionHessian
+from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
+from magshell_fenicsx.parts.magnetism.self_field import self_field
+from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.seen import Sight
 
@@ -47,7 +47,8 @@ LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
 TOO_NEAR = (
-    "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or than a seventh of "
+    "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or "
+    "than a seventh of "
     "the size of their cells: move them apart, or take smaller cells"
 )
 
@@ -85,14 +86,15 @@ class InteractionTerm:
         unknowns = 3 * V.dofmap.index_map.size_global
         if unknowns > LARGEST:
             raise CaseError(
-                f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on each other, "
+                f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on "
+                "each other, "
                 f"at most {LARGEST} are allowed: take a coarser mesh or a lower mesh.degree"
             )
         self._given: tuple[Array, ...] = ()
         self._seen = deque[tuple[Array, float, Array]](maxlen=REMEMBERED)
         self._blocks, self._turning = BlockProducts(self._comm), Turning(self._comm)
         self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
-        self._stiff: tuple[Array, tuple[ActingOnEachOther, ActingOnEachOther], Array] | None = (
+        self._stiff: tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None = (
             None  # beside its nodes and u
         )
 
@@ -120,14 +122,15 @@ class InteractionTerm:
         """
         if not self._itself and self._parts.max() == 0:
             raise CaseError(
-                "magnetic.interaction: others: acts between shells that no joint connects, or parts of a mesh file, "
+                "magnetic.interaction: others: acts between shells that no joint connects, or "
+                "parts of a mesh file, "
                 "and here all is one part: take interaction: all"
             )
         near = False
         try:
             nodes = self._nodes()  # first: the charges are made of what it gathers
             self._charged.rules(nodes, self._cells.own_range)
-        except Touching:
+        except PartsTooNear:
             near = True
         if self._comm.allreduce(near, MPI.LOR):
             raise CaseError(TOO_NEAR)
@@ -166,11 +169,11 @@ class InteractionTerm:
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Nodes far apart act on each other; see `acting`."""
 
-    def hessian(self, *, inexact: bool = False) -> "ActingOnEachOther":
+    def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
         """See `assembly.dense_tangent.DenseTerm`; collective."""
         return self._even.both(inexact=inexact)[1] if self._even else self.both(inexact=inexact)[0]
 
-    def both(self, *, inexact: bool) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
+    def both(self, *, inexact: bool) -> tuple["InteractionHessian", "InteractionHessian"]:
         """The second derivative, and that by additions to u that are opposite in the images;
         collective.
         """
@@ -184,13 +187,16 @@ class InteractionTerm:
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
         """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`; collective."""
-        own, of_shape = own_field(self._sight), name in ("thickness", "r0")
+        own, of_shape = self_field(self._sight), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         turned = np.concatenate([rates @ image.Q.T for image in self._copies.images])
-        weights, own_cells = Weights(self._scale * energy, self._scale * force), self._cells.own_range
+        weights, own_cells = (
+            Weights(self._scale * energy, self._scale * force),
+            self._cells.own_range,
+        )
         part = slice(own_cells.start, own_cells.stop)
         if of_shape:
-            into = self._charged.by_fields(nodes, turned, own_cells, weights, of_shape=True)
+            into = self._charged.field_derivatives(nodes, turned, own_cells, weights, of_shape=True)
             by_place, by_thickness = (
                 self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness)
             )
@@ -200,11 +206,18 @@ class InteractionTerm:
             return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
         if name != own.Br.name:
             return None
-        shape, cells, edges = self._all(may=True)
-        near = Near(
-            shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies, may=True
+        shape, cells, edges = self._all(include_uncharged=True)
+        near = SingularPairs(
+            shape,
+            self._corners,
+            cells,
+            edges,
+            self._cells.own_range,
+            self._comm,
+            self._copies,
+            include_uncharged=True,
         )
-        charged = Charged(
+        charged = InteractingCharges(
             shape,
             self._parts,
             cells,
@@ -212,9 +225,9 @@ class InteractionTerm:
             self._comm,
             near if self._itself else None,
             self._copies,
-            may=True,
+            include_uncharged=True,
         )
-        found = charged.by_fields(nodes, turned, own_cells, weights).by_remanence
+        found = charged.field_derivatives(nodes, turned, own_cells, weights).by_remanence
         return own.Br, np.asarray(self._comm.allreduce(found))[part]
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
@@ -228,7 +241,7 @@ class InteractionTerm:
         shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
         return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
 
-    def _acting_at(self, nodes: Array) -> tuple["ActingOnEachOther", "ActingOnEachOther"]:
+    def _acting_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
         own, images, V = self._cells.own_range, self._copies.images, self._u.function_space
         count, several = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
@@ -255,13 +268,13 @@ class InteractionTerm:
         stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
         try:
             self._charged.evaluate(nodes, own, stiffness)
-        except Touching:
+        except PartsTooNear:
             stiffness.blocks[:] = np.nan
         numbers = V.dofmap.index_map.local_to_global(np.arange(local, dtype=np.int32))
         cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
         B = far.jacobian(far.placed(nodes))
         even, odd = (
-            ActingOnEachOther(
+            InteractionHessian(
                 stiffness,
                 far,
                 B,
@@ -283,12 +296,14 @@ class InteractionTerm:
                 return energy, forces
         try:
             energy, gradient = self._charged.evaluate(nodes, self._cells.own_range)
-        except Touching:  # there is no such equilibrium
+        except PartsTooNear:  # there is no such equilibrium
             k = self._cells.nodes.shape[1]
             energy, gradient = np.nan, np.full((len(self._cells.own_range), k, 3), np.nan)
         forces = np.zeros_like(self._u.x.array)
         np.add.at(
-            forces.reshape(-1, 3), V.dofmap.list[: len(self._cells.own_range)], self._scale * gradient
+            forces.reshape(-1, 3),
+            V.dofmap.list[: len(self._cells.own_range)],
+            self._scale * gradient,
         )
         self._seen.appendleft((nodes, self._scale * energy, forces))
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
@@ -300,7 +315,7 @@ class InteractionTerm:
         them changed.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
-        own = own_field(self._sight)
+        own = self_field(self._sight)
         factor, of_nodes = (
             self._model.thickness,
             own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list],
@@ -314,7 +329,7 @@ class InteractionTerm:
             self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
             for name in ("_charged", "_near"):
                 self.__dict__.pop(name, None)
-        return self._copies.of((r0 + u)[self._cells.nodes])
+        return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
 
     def _turns(self, u: Array, before: Array) -> Array:
         """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar
@@ -333,26 +348,32 @@ class InteractionTerm:
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
-    def _charged(self) -> Charged:
+    def _charged(self) -> InteractingCharges:
         shape, cells, edges = self._all()
-        return Charged(shape, self._parts, cells, edges, self._comm, self._near, self._copies)
+        return InteractingCharges(
+            shape, self._parts, cells, edges, self._comm, self._near, self._copies
+        )
 
     @cached_property
-    def _near(self) -> Near | None:
+    def _near(self) -> SingularPairs | None:
         shape, cells, edges = self._all()
         if not self._itself:
             return None
-        return Near(shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies)
+        return SingularPairs(
+            shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies
+        )
 
-    def _all(self, *, may: bool = False) -> tuple[Shape, Ints, Ints]:
+    def _all(self, *, include_uncharged: bool = False) -> tuple[MagnetisedShell, Ints, Ints]:
         """The cells of all ranks, and their edges that are charged, or `may` be by any remanence;
         collective.
         """
-        own = own_field(self._sight)
-        shape, (cells, edges) = own.shape({}), own.chargeable if may else own.edges
+        own = self_field(self._sight)
+        shape, (cells, edges) = own.shape({}), own.chargeable if include_uncharged else own.edges
         thick = shape.thick and (shape.thick[0], self._given[2])
         r0, remanence = self._given[0][self._cells.nodes], self._given[1]
-        everywhere = Shape(shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick)
+        everywhere = MagnetisedShell(
+            shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick
+        )
         own_cells, every = np.asarray(cells) + self._cells.own_range.start, self._comm
         return everywhere, gather_rows(every, own_cells), gather_rows(every, np.asarray(edges))
 
@@ -360,8 +381,8 @@ class InteractionTerm:
     def _copies(self) -> Copies:
         """What is modelled, and the images that make the whole of a half or a sector."""
         if self._model.multiplicity == 1:
-            return ALL
-        own, mirror = own_field(self._sight), self._sight.mirror
+            return NO_IMAGES
+        own, mirror = self_field(self._sight), self._sight.mirror
         assert mirror
         return Copies(tuple(mirror.images), own.sign_of_images({}))
 
@@ -371,7 +392,7 @@ class InteractionTerm:
         original; collective.
         """
         r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]
-        places = self._copies.of(r0[None])
+        places = self._copies.nodes_of_all(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
         for later, x in enumerate(places):
             for earlier in range(later):

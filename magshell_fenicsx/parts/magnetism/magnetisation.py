@@ -32,7 +32,7 @@ from magshell_fenicsx.parts.magnetism.interaction import interaction
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
-from magshell_fenicsx.parts.magnetism.soft_magnet import Soft
+from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
@@ -133,7 +133,7 @@ def magnetisation(
     )
 
 
-def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | None:
+def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> SoftMagnet | None:
     """What is soft, in a frame turned about e3 (rad); None without a susceptibility; `within` is of
     `Problem`.
     """
@@ -159,7 +159,7 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> Soft | 
     )
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
     largest = None if magnetic.saturation is None else magnetic.saturation / tesla
-    return Soft(pattern, scale, tesla, remanent is None, patches or None, largest)
+    return SoftMagnet(pattern, scale, tesla, remanent is None, patches or None, largest)
 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
@@ -243,7 +243,9 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
         outline.meridian and vector_is_axisymmetric(remanent.components, outline.meridian)
     ):
         askew.append("the formula of the remanence differs around e3")
-    if formulas and not (outline.meridian and vector_is_axisymmetric(formulas, outline.meridian, in_space=True)):
+    if formulas and not (
+        outline.meridian and vector_is_axisymmetric(formulas, outline.meridian, in_space=True)
+    ):
         askew.append("the formula of the applied field differs around e3")
     if isinstance(magnetic.susceptibility, str) and not (
         outline.meridian and scalar_is_axisymmetric(magnetic.susceptibility, outline.meridian)
@@ -251,7 +253,8 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
         askew.append("the susceptibility differs around e3")
     sources = values(context) if magnetic.applied.sources or whole else []
     if sources and not (
-        outline.meridian and all(field_is_axisymmetric(field, outline.meridian) for field in sources)
+        outline.meridian
+        and all(field_is_axisymmetric(field, outline.meridian) for field in sources)
     ):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
@@ -265,7 +268,9 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
             few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
-                equal_to_rounding(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
+                equal_to_rounding(
+                    sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
+                )
                 for field, places in (
                     *((field, x) for field in fields),
                     *((field, few) for field in sources),
@@ -338,7 +343,8 @@ def account(context: Context, loads: Loads) -> Account:
     magnetic, field, words = context.of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
         words = [
-            f"magnetised parts in each other's field, |Br|²/(mu_0 E) = {loads.interaction.strength:g}"
+            "magnetised parts in each other's field, |Br|²/(mu_0 E) = "
+            f"{loads.interaction.strength:g}"
         ]
     if magnetic is None or field is None:
         none = "lambda_m is zero" if magnetic else "no magnetic section"

@@ -12,8 +12,8 @@ from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
-from magshell_fenicsx.parts.magnetism.moving_source import Driven, FieldInSpace
-from magshell_fenicsx.parts.magnetism.soft_magnet import Soft
+from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
+from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 
 ACROSS = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
@@ -75,10 +75,10 @@ class Magnetisation:
     law: RemanenceLaw = "deformation"
     in_space: FieldInSpace | None = None
     axes: tuple[NDArray[np.float64], ...] = ()
-    driven: tuple[Driven, ...] = ()
+    driven: tuple[MovingField, ...] = ()
     turns: tuple[RigidMotion, ...] = ()
     given: UserField | None = None
-    soft: Soft | None = None
+    soft: SoftMagnet | None = None
     tesla: float = 1.0
     metres: float = 0.0
     absent: bool = False

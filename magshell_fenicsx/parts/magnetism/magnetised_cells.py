@@ -1,5 +1,9 @@
-"""A magnetised shell at points of its cells, with coordinates (a, b) in [0, 1]² that triangles and
-rings share.
+"""A magnetised shell at points of its cells: places, normals, remanence, and their derivatives.
+
+Coordinates (a, b) in [0, 1]² are the same for both kinds of cells. A triangle is the square with
+one side drawn together into a corner; a cell of a meridian is swept around the axis. Lengths are
+over R, remanences over a magnitude of their own. Theory: docs/theory.md, the field of a magnetised
+shell.
 """
 
 from collections.abc import Callable
@@ -12,19 +16,21 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-STEP = 1e-30  # of imaginary changes
+COMPLEX_STEP = 1e-30  # imaginary change for derivatives that are exact to rounding
 
 
 @dataclass
-class Nodal:
-    """Derivatives by the displacement and by the remanence at the nodes of cells, (cells, nodes, 3)
-    each.
+class NodalDerivatives:
+    """Derivatives of a number by values at the nodes of cells.
 
     Attributes
     ----------
-    by_place, by_thickness
-        The same by the undeformed place and (cells, nodes) by what multiplies the thickness, at
-        nodes of their elements; None if nobody asks for them.
+    by_u, by_remanence
+        (cells, nodes, 3) by the displacement and by the remanence.
+    by_place
+        (cells, nodes, 3) by the undeformed place; None if nobody asks for it.
+    by_thickness
+        (cells, nodes) by the factor of the thickness; None if nobody asks for it.
     """
 
     by_u: Array
@@ -34,46 +40,45 @@ class Nodal:
 
 
 @dataclass(frozen=True)
-class Shape:
-    """The cells of a shell with what is magnetised, at nodes.
+class MagnetisedShell:
+    """Cells of a magnetised shell, with nodal values.
 
     Attributes
     ----------
     element
-        Of r0 and u.
+        Lagrange element of r0 and u.
     r0, u
-        (cells, nodes, components) at its nodes.
-    of_remanence
-        Of the remanence, discontinuous.
+        (cells, nodes, components) undeformed places and displacements, over R.
+    remanence_element
+        Discontinuous element of the remanence.
     remanence
-        (cells, nodes, 3), in the undeformed shell.
+        (cells, its nodes, 3) remanence in the undeformed shell.
     h
         Thickness over R.
-    thick
-        What multiplies it, with its element; None for 1.
+    thickness_factor
+        Element and nodal values (cells, its nodes) of the factor of the thickness; None for 1.
     swept
         Whether the cells are those of a meridian.
-    thins
-        1 where the thickness follows from the area, so that the volume stays; of each cell (cells,
-        1), or of all.
+    incompressible
+        1 where the thickness follows from the area, so that the volume stays, else 0; of each cell
+        (cells, 1), or of all.
     """
 
     element: Any
     r0: Array
     u: Array
-    of_remanence: Any
+    remanence_element: Any
     remanence: Array
     h: float
-    thick: tuple[Any, Array] | None = None
+    thickness_factor: tuple[Any, Array] | None = None
     swept: bool = False
-    thins: Array | float = 0
+    incompressible: Array | float = 0
 
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
-        """Places on the reference cell of coordinates (n, m, 2), their derivatives (n, m, 2, d),
-        and azimuths (n, m).
+        """Map coordinates ab (n, m, 2) to places (n, m, d) on the reference cell.
 
-        A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b over a turn,
-        or a part of it.
+        The derivatives (n, m, 2, d) of these places, and azimuths (n, m) over a full turn, come
+        with them. A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b.
         """
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
@@ -83,93 +88,110 @@ class Shape:
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:
-        """The thickness over R and its derivatives by X (.., n, m) at places (n, m, d) of reference
-        cells.
+        """Return the undeformed thickness over R and its derivatives by X, (1 + d or 3, n, m).
+
+        X (n, m, d) are places on the reference cell, of each of the cells (n,).
         """
-        if self.thick is None:
+        if self.thickness_factor is None:
             thickness = np.zeros((3, *X.shape[:2]))
             thickness[0] = self.h
             return thickness
-        element, values = self.thick
+        element, values = self.thickness_factor
         return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 
-    def nothing(self, *, of_shape: bool = False) -> Nodal:
-        """Derivatives to add to; `of_shape`: those by the undeformed place and the thickness too."""
-        zero = Nodal(np.zeros_like(self.r0), np.zeros_like(self.remanence))
+    def zero_derivatives(self, *, of_shape: bool = False) -> NodalDerivatives:
+        """Return zero derivatives, to which others are added.
+
+        With `of_shape`, those by the undeformed place and the thickness are there too.
+        """
+        zero = NodalDerivatives(np.zeros_like(self.r0), np.zeros_like(self.remanence))
         if not of_shape:
             return zero
-        thick = np.zeros((len(self.r0), 0)) if self.thick is None else np.zeros_like(self.thick[1])
-        return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=thick)
+        by_thickness = np.zeros((len(self.r0), 0))
+        if self.thickness_factor is not None:
+            by_thickness = np.zeros_like(self.thickness_factor[1])
+        return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=by_thickness)
 
-    def back_of_thickness(self, cells: Ints, X: Array, on: Array, into: Nodal) -> None:
-        """Add what thicknesses (n, m) in cells (n,) have at places X (m, d) of their reference
-        cell.
+    def add_thickness_derivatives(
+        self, cells: Ints, X: Array, by_thickness: Array, into: NodalDerivatives
+    ) -> None:
+        """Add derivatives by nodal factors of the thickness to `into`.
+
+        They follow from those by thicknesses (n, m) at places X (m, d) of reference cells (n,).
         """
-        if self.thick and into.by_thickness is not None:
-            T = self.thick[0].tabulate(0, X)[0, :, :, 0]
-            np.add.at(into.by_thickness, cells, self.h * on @ T)
+        if self.thickness_factor and into.by_thickness is not None:
+            T = self.thickness_factor[0].tabulate(0, X)[0, :, :, 0]
+            np.add.at(into.by_thickness, cells, self.h * by_thickness @ T)
 
 
 def tables(element: Any, X: Array, order: int) -> Array:
-    """(derivatives, n, m, nodes) of an element at places (n, m, d)."""
+    """Return values and derivatives (.., n, m, nodes) of an element's basis at places (n, m, d)."""
     flat = element.tabulate(order, X.reshape(-1, X.shape[-1]))[..., 0]
     return np.asarray(flat.reshape(len(flat), *X.shape[:2], -1))
 
 
-def turned(v: Array, angle: Array, way: float = 1.0) -> Array:
-    """Vectors (n, m, ..., 3) turned about e3 by angles (n, m)."""
-    c, s = np.cos(angle), way * np.sin(angle)
-    c, s = (each.reshape(*angle.shape, *[1] * (v.ndim - 3)) for each in (c, s))
+def rotate_about_axis(v: Array, angle: Array, sign: float = 1.0) -> Array:
+    """Rotate vectors (n, m, ..., 3) about e3 by angles (n, m), or back with `sign` -1."""
+    c, s = np.cos(angle), sign * np.sin(angle)
+    c, s = (component.reshape(*angle.shape, *[1] * (v.ndim - 3)) for component in (c, s))
     return np.stack(
         [c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1], v[..., 2]], axis=-1
     )
 
 
 @dataclass(frozen=True)
-class Jets:
-    """A shell at points of cells: jets by (a, b), those of r0 (6, n, m, 3), of r (3, n, m, 3),
-    remanence and thickness.
+class SurfaceJets:
+    """Jets (values and derivatives by a and b) of a magnetised shell at points of its cells.
 
     Attributes
     ----------
+    r0, r
+        (6, n, m, 3) of undeformed places, up to second derivatives; (3, n, m, 3) of deformed ones.
     B
-        (3, n, m, 3) the remanence and its derivatives.
+        (3, n, m, 3) of the remanence.
     t
-        (3, n, m) the thickness over R and its derivatives.
+        (3, n, m) of the undeformed thickness over R.
+    shape_tables, remanence_tables
+        Values and derivatives of the bases of both elements there.
+    angle
+        (n, m) azimuths.
+    ab
+        (n, m, 2) coordinates.
     """
 
     r0: Array
     r: Array
     B: Array
     t: Array
-    shape: Shape
+    shape: MagnetisedShell
     cells: Ints
-    shapes: Array
-    of_B: Array
+    shape_tables: Array
+    remanence_tables: Array
     angle: Array
     ab: Array
 
     @classmethod
-    def of(cls, shape: Shape, cells: Ints, ab: Array, turn: Array | None = None) -> "Jets":
-        """At coordinates (n, m, 2) in cells (n,); azimuths of a ring are b times `turn`, by default
-        a whole one.
-        """
+    def at_points(cls, shape: MagnetisedShell, cells: Ints, ab: Array) -> "SurfaceJets":
+        """Return the jets at coordinates ab (n, m, 2) in cells (n,)."""
         X, slopes, b = shape.reference(ab)
         angle = 2 * np.pi * b
-        T, TB = tables(shape.element, X, 2), tables(shape.of_remanence, X, 1)
+        T, TB = tables(shape.element, X, 2), tables(shape.remanence_element, X, 1)
         if shape.swept:
-            ring = 2 * np.pi
-            f0, f = (np.einsum("dnmk,nki->dnmi", T, each[cells]) for each in (shape.r0, shape.u))
-            jets = [np.stack([turned(d, angle) for d in _ring(each, ring)]) for each in (f0, f)]
+            full_turn = 2 * np.pi
+            jets = []
+            for nodal in (shape.r0, shape.u):
+                on_meridian = np.einsum("dnmk,nki->dnmi", T, nodal[cells])
+                at_azimuth_zero = _ring(on_meridian, full_turn)
+                jets.append(np.stack([rotate_about_axis(d, angle) for d in at_azimuth_zero]))
             B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
-            by_angle = ring * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
-            fields = np.stack([turned(each, angle) for each in (B[0], B[1], by_angle)])
+            by_azimuth = full_turn * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
+            fields = np.stack([rotate_about_axis(d, angle) for d in (B[0], B[1], by_azimuth)])
             t = shape.thickness(cells, X)
             t = np.stack([t[0], t[1], 0 * t[0]])
             r0, u = jets
             return cls(r0, r0[:3] + u[:3], fields, t, shape, cells, T, TB, angle, ab)
         T, TB = _chain(T, slopes, ab), _chain(TB, slopes, ab)
-        r0, u = (np.einsum("dnmk,nki->dnmi", T, each[cells]) for each in (shape.r0, shape.u))
+        r0, u = (np.einsum("dnmk,nki->dnmi", T, nodal[cells]) for nodal in (shape.r0, shape.u))
         t = shape.thickness(cells, X)
         if len(t) > 1:
             t = np.concatenate([t[:1], np.einsum("nmad,dnm->anm", slopes, t[1:3])])
@@ -177,100 +199,114 @@ class Jets:
         return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T, TB, angle, ab)
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
-        """dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at a height over the
-        thickness.
+        """Return dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell.
+
+        `eta` is the height over the thickness.
         """
         _, a1, a2, _a11, _a12, _a22 = self.r0
         n0, (n1, n2) = _normals(self.r0)
-        t, t1, t2 = (each[..., None] for each in self.t)
+        t, t1, t2 = (component[..., None] for component in self.t)
         return a1 + eta * (t * n1 + t1 * n0), a2 + eta * (t * n2 + t2 * n0), t * n0
 
     @property
     def thickness(self) -> Array:
-        """(n, m) of the deformed shell, over R."""
-        if not np.any(self.shape.thins):
+        """Thickness (n, m) of the deformed shell, over R."""
+        if not np.any(self.shape.incompressible):
             return np.asarray(self.t[0])
         area0, area = (np.linalg.norm(np.cross(a[1], a[2]), axis=-1) for a in (self.r0, self.r))
-        return np.asarray(self.t[0] * (1 + self._thins * (area0 / area - 1)))
+        return np.asarray(self.t[0] * (1 + self._incompressible * (area0 / area - 1)))
 
     @property
-    def _thins(self) -> Array | float:
-        """Of these cells."""
-        thins = self.shape.thins
-        return np.asarray(thins)[self.cells] if np.ndim(thins) else thins
+    def _incompressible(self) -> Array | float:
+        """`MagnetisedShell.incompressible` of these cells."""
+        of_all = self.shape.incompressible
+        return np.asarray(of_all)[self.cells] if np.ndim(of_all) else of_all
 
     def place(self, eta: float) -> Array:
-        """(n, m, 3) of the deformed shell."""
+        """Return places (n, m, 3) of the deformed shell at a height over the thickness."""
         return np.asarray(
             self.r[0] + eta * self.thickness[..., None] * unit(np.cross(self.r[1], self.r[2]))
         )
 
-    def back(self, into: Nodal, on_x: Array, on_n: Array, on_B: Array) -> None:
-        """Add dJ/du and dJ/dB at nodes, from dJ/dr and dJ/dn (n, m, 3) and dJ/d(B, B_a, B_b) (3, n,
-        m, 3).
+    def add_derivatives(
+        self, into: NodalDerivatives, by_place: Array, by_normal: Array, by_B: Array
+    ) -> None:
+        """Add dJ/du and dJ/dB at nodes to `into`, for a number J.
+
+        They follow from dJ/dr and dJ/dn (n, m, 3), and from dJ/d(B, B_a, B_b) (3, n, m, 3).
         """
-        m = np.cross(self.r[1], self.r[2])
-        size = np.linalg.norm(m, axis=-1, keepdims=True)
-        n = m / size
-        along = 1 + np.asarray(self._thins)[..., None]  # the thickness is over |m| too
-        across = (on_n - along * np.sum(on_n * n, axis=-1, keepdims=True) * n) / size  # dJ/dm
-        on = np.stack([on_x, np.cross(self.r[2], across), np.cross(across, self.r[1])])
+        area_vector = np.cross(self.r[1], self.r[2])
+        area = np.linalg.norm(area_vector, axis=-1, keepdims=True)
+        n = area_vector / area
+        # n is over |m| of m = r_a x r_b, and so is the thickness of what is incompressible
+        normal_factor = 1 + np.asarray(self._incompressible)[..., None]
+        along_normal = np.sum(by_normal * n, axis=-1, keepdims=True)
+        by_area_vector = (by_normal - normal_factor * along_normal * n) / area
+        by_tangents = np.cross(self.r[2], by_area_vector), np.cross(by_area_vector, self.r[1])
+        by_jets = np.stack([by_place, *by_tangents])
         if self.shape.swept:
-            on, on_B = (
-                np.stack([turned(each, self.angle, -1.0) for each in part]) for part in (on, on_B)
+            by_jets, by_B = (
+                np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
+                for derivatives in (by_jets, by_B)
             )
-            ring = 2 * np.pi
-            flat = np.stack([on[0], on[1]])[..., [0, 2]]  # of f and f_s
-            flat[0][..., 0] += ring * on[2][..., 1]  # f_theta = (0, U, 0)
-            by_u = np.einsum("dnmk,dnmi->nki", self.shapes[:2], flat)
-            of_B = np.stack([on_B[0], on_B[1]])
-            of_B[0][..., 0] += ring * on_B[2][..., 1]
-            of_B[0][..., 1] -= ring * on_B[2][..., 0]
-            by_B = np.einsum("dnmk,dnmi->nki", self.of_B[:2], of_B)
+            full_turn = 2 * np.pi
+            by_meridian = np.stack([by_jets[0], by_jets[1]])[..., [0, 2]]  # of f and f_s
+            by_meridian[0][..., 0] += full_turn * by_jets[2][..., 1]  # f_theta = (0, U, 0)
+            by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:2], by_meridian)
+            by_fields = np.stack([by_B[0], by_B[1]])
+            by_fields[0][..., 0] += full_turn * by_B[2][..., 1]
+            by_fields[0][..., 1] -= full_turn * by_B[2][..., 0]
+            by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables[:2], by_fields)
         else:
-            by_u = np.einsum("dnmk,dnmi->nki", self.shapes[:3], on)
-            by_B = np.einsum("dnmk,dnmi->nki", self.of_B, on_B)
+            by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:3], by_jets)
+            by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables, by_B)
         np.add.at(into.by_u, self.cells, by_u)
-        np.add.at(into.by_remanence, self.cells, by_B)
+        np.add.at(into.by_remanence, self.cells, by_remanence)
 
-    def back_of_undeformed(self, into: Nodal, of: "Callable[[Jets], Array]", on: Array) -> None:
-        """Add what numbers (n, m, l) of the jets of r0 and of the thickness have, times `on`; of
-        triangles.
+    def add_reference_derivatives(
+        self,
+        into: NodalDerivatives,
+        charges_of: "Callable[[SurfaceJets], Array]",
+        by_charges: Array,
+    ) -> None:
+        """Add derivatives by the undeformed place and the thickness to `into`; of triangles.
 
-        Their derivatives at each point are those along an imaginary change, exact to rounding.
+        They follow from the derivatives `by_charges` (n, m, l) by numbers that depend on the jets.
+        Those numbers' own derivatives are found along an imaginary change, exact to rounding.
         """
         if into.by_place is None or into.by_thickness is None:
             return
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
 
-        def rate(**moved: Any) -> Array:
-            return np.asarray(
-                np.sum(on * of(replace(self, **moved)).imag, axis=-1) / STEP, dtype=np.float64
-            )
+        def rate(**jets: Any) -> Array:
+            change = charges_of(replace(self, **jets)).imag
+            total = np.sum(by_charges * change, axis=-1)
+            return np.asarray(total / COMPLEX_STEP, dtype=np.float64)
 
         for d, i in product(range(1, 6), range(3)):
             r0 = self.r0.astype(np.complex128)
-            r0[d, ..., i] += STEP * 1j
+            r0[d, ..., i] += COMPLEX_STEP * 1j
             by_r0[d, ..., i] = rate(r0=r0)
         for d in range(3):
             t = self.t.astype(np.complex128)
-            t[d] += STEP * 1j
+            t[d] += COMPLEX_STEP * 1j
             by_t[d] = rate(t=t)
-        np.add.at(into.by_place, self.cells, np.einsum("dnmk,dnmi->nki", self.shapes, by_r0))
-        if self.shape.thick:
+        np.add.at(into.by_place, self.cells, np.einsum("dnmk,dnmi->nki", self.shape_tables, by_r0))
+        if self.shape.thickness_factor:
             X, slopes, _ = self.shape.reference(self.ab)
-            T = _chain(tables(self.shape.thick[0], X, 1), slopes, self.ab)
+            T = _chain(tables(self.shape.thickness_factor[0], X, 1), slopes, self.ab)
             np.add.at(
                 into.by_thickness, self.cells, self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t)
             )
 
 
 def unit(m: Array) -> Array:
+    """Return vectors m (..., 3) over their lengths."""
     return np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
 def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
-    """The normal of a jet (6, ..., 3), and its derivatives."""
+    """Return the normal (..., 3) of a surface with a jet (6, ..., 3), and its derivatives."""
     _, a1, a2, a11, a12, a22 = jet
     m = np.cross(a1, a2)
     size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # analytic
@@ -282,8 +318,11 @@ def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
 
 
 def _ring(f: Array, ring: float) -> Array:
-    """Jets by (s, b) at azimuth zero of plane vectors with derivatives by s (3, n, m, 2)."""
-    (U, W), (Us, Ws), (Uss, Wss) = (np.moveaxis(each, -1, 0) for each in f)
+    """Return jets (6, n, m, 3) by (s, b) at azimuth zero of vectors of a meridian.
+
+    `f` (3, n, m, 2) are these with their derivatives by s; `ring` is the angle for b = 1.
+    """
+    (U, W), (Us, Ws), (Uss, Wss) = (np.moveaxis(components, -1, 0) for components in f)
     zero = np.zeros_like(U)
     parts = [(U, zero, W), (Us, zero, Ws), (zero, ring * U, zero)]
     parts += [(Uss, zero, Wss), (zero, ring * Us, zero), (-(ring**2) * U, zero, zero)]
@@ -291,8 +330,9 @@ def _ring(f: Array, ring: float) -> Array:
 
 
 def _chain(T: Array, slopes: Array, ab: Array) -> Array:
-    """Derivatives by (a, b) of shape functions, from those by the reference coordinates X = a, Y =
-    (1 - a) b.
+    """Return derivatives by (a, b) of shape functions, from those by reference coordinates.
+
+    These are X = a, Y = (1 - a) b, of a triangle.
     """
     value, first = T[0], np.einsum("nmad,dnmk->anmk", slopes, T[1:3])
     if len(T) == 3:

@@ -21,7 +21,7 @@ FieldInSpace = Callable[[Array], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)
-class Driven:
+class MovingField:
     """A field that some amplitudes drive.
 
     Attributes
@@ -43,23 +43,23 @@ class Driven:
         """The amplitudes."""
         return (*(motion.name for motion in self.motions), *self.factors)
 
-    def at(self, x: Array, mu: Mapping[str, float]) -> "Here":
+    def at(self, x: Array, mu: Mapping[str, float]) -> "FieldAtPlaces":
         """The field at places."""
-        Q, t = carried(self.motions, mu)
+        Q, t = combined_motion(self.motions, mu)
         B, G, H = self.of((x - t) @ Q)
         turned = (
             B @ Q.T,
             np.einsum("ai,bj,nij->nab", Q, Q, G, optimize=True),
             np.einsum("ai,bj,ck,nijk->nabc", Q, Q, Q, H, optimize=True),
         )
-        return Here(self, x, dict(mu), *turned)
+        return FieldAtPlaces(self, x, dict(mu), *turned)
 
 
 @dataclass(frozen=True)
-class Here:
+class FieldAtPlaces:
     """A driven field at some places x, for some amplitudes; B, G and H are without the factors."""
 
-    driven: Driven
+    driven: MovingField
     x: Array
     mu: Mapping[str, float]
     B: Array
@@ -120,12 +120,12 @@ class Here:
         own = motions[number]
         A = np.asarray(np.cross(np.eye(3), own.turn), dtype=np.float64)
         v = own.shift - A @ own.centre
-        Q, t = carried(motions[number + 1 :], self.mu)
+        Q, t = combined_motion(motions[number + 1 :], self.mu)
         A = Q @ A @ Q.T
         return A, np.asarray(Q @ v - A @ t)
 
 
-def carried(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
+def combined_motion(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
     """x -> Q x + t of all motions together."""
     origin, *ends = apply_motions(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)

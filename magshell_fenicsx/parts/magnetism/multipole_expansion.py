@@ -19,7 +19,7 @@ from scipy.sparse import bsr_array
 
 from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, places
-from magshell_fenicsx.parts.magnetism.magnetised_cells import STEP
+from magshell_fenicsx.parts.magnetism.magnetised_cells import COMPLEX_STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
@@ -48,7 +48,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedCharges:
     """Charges where they are.
 
     Attributes
@@ -67,7 +67,7 @@ class Placed:
     heights: list[Array]
 
 
-class Far:
+class MultipoleExpansion:
     """The sum over pairs of boxes of a tree, for the charges of some kinds of elements.
 
     Parameters
@@ -92,19 +92,19 @@ class Far:
         self._q = np.concatenate([points.q.ravel() for _, points in kinds])[self._order]
         self._octants = [list(_octants(level.keys)) for level in tree.levels]
 
-    def placed(self, nodes: Array) -> Placed:
+    def placed(self, nodes: Array) -> PlacedCharges:
         """The charges on cells with nodes (cells, k, 3)."""
         surfaces = [Surface.of(nodes[cells], points.tables) for cells, points in self._kinds]
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
         both = zip(surfaces, heights, strict=True)
         x = [(s.r[:, :, None] + z[..., None] * s.n[:, :, None]).reshape(-1, 3) for s, z in both]
-        return Placed(
+        return PlacedCharges(
             harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width),
             surfaces,
             heights,
         )
 
-    def add(self, at: Placed, *, bent: bool) -> float:
+    def add(self, at: PlacedCharges, *, bent: bool) -> float:
         """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go
         to points' sums.
         """
@@ -145,7 +145,7 @@ class Far:
         Parameters
         ----------
         moved
-            (cells, k, 3) the nodes, with rates times `STEP` as imaginary parts.
+            (cells, k, 3) the nodes, with rates times `COMPLEX_STEP` as imaginary parts.
         """
         Y, N, width = self.placed(nodes).Y, derivatives(), self._leaf.width
         at = [places(points, np.arange(len(points.q)), moved[cells]) for cells, points in kinds]
@@ -153,14 +153,18 @@ class Far:
         def along(v: NDArray[np.floating[Any]], Y: Array) -> Array:
             return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
-        rate = np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag / STEP / width
+        rate = (
+            np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag
+            / COMPLEX_STEP
+            / width
+        )
         dY = along(rate, Y)
         L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
         wanted: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
         if heights:
             normals = [np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3) for _, n, x in at]
             upwards = np.concatenate(normals)[self._order] / width
-            n, dn = upwards.real, upwards.imag / STEP
+            n, dn = upwards.real, upwards.imag / COMPLEX_STEP
             nY = along(n, Y)
             wanted.append((self._q, nY, np.asarray(along(rate, nY) + along(dn, Y))))
         split = np.cumsum([points.q.size for _, points in kinds])[:-1]
@@ -224,7 +228,7 @@ class Far:
         np.add.at(M, self._leaf.of_cell, moments)
         return self._leaf.of_cell, np.asarray(self.onto(M) / self._leaf.width, dtype=np.float64)
 
-    def jacobian(self, at: Placed) -> Array:
+    def jacobian(self, at: PlacedCharges) -> Array:
         """(cells, COUNT, 3 k) derivatives of the moments of each cell's box by its nodes."""
         N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
@@ -286,13 +290,13 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class ActingOnEachOther:
+class InteractionHessian:
     """Second derivatives of the energy of all charges: an `assembly.dense_tangent.DenseHessian`.
 
     Attributes
     ----------
     B
-        See `Far.jacobian`.
+        See `MultipoleExpansion.jacobian`.
     sign
         -1 of additions to u that are opposite in the images.
     beside
@@ -300,7 +304,7 @@ class ActingOnEachOther:
     """
 
     near: Stiffness
-    far: Far
+    far: MultipoleExpansion
     B: Array
     scale: float
     cells: Cells

@@ -1,5 +1,8 @@
-"""Sums over pairs of charged cells, in C: energy, gradient and second derivatives, `LANES` pairs at
-once.
+"""Sums over pairs of charged cells, in C: energy, gradient and second derivatives.
+
+The C functions are in pairs.c, multipole_expansion.c and stacked_faces.c, which are compiled
+together and work at `LANES` pairs at once. Lengths are over R, charges over Br R², energies over
+Br² R³/(4 pi mu_0).
 """
 
 from dataclasses import dataclass
@@ -20,63 +23,66 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 LANES, SUMS = 8, 24  # as in pairs.c
 FUNCTIONS = """
-    double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, int64_t, const double *,
-        const double *, const double *, const double *, double *, const int64_t *, int64_t, int64_t, const double *,
-        const double *, const double *, const double *, double *, const int64_t *, int64_t, double *, double, double *,
-        double *, const int32_t *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
-    void points(int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, const double *, const double *,
-        double *, double *);
-    int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *, const double *, const double *,
-        const uint8_t *, double, double, double, double, int64_t, const double *, double, int8_t *);
-    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t, const int64_t *, int64_t,
-        int64_t, const double *, const double *, double *);
-    typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S; const double *charges, *thickness,
-        *heights; int64_t P; const double *T, *X, *weights, *gauss; double h, depth, least, inside,
-        precision; } Cells;
-    double close_pairs(const Cells *, int64_t, const int64_t *, const double *, double *, double, double *, double *,
+    double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t,
+        int64_t, const double *, const double *, const double *, const double *, double *,
+        const int64_t *, int64_t, int64_t, const double *, const double *, const double *,
+        const double *, double *, const int64_t *, int64_t, double *, double, double *, double *,
         const int32_t *, int64_t, const int64_t *, const int64_t *, const double *, int64_t);
-    int64_t seen_of(const Cells *, int64_t, int64_t, const double *, int64_t, int64_t *, double *, double *, double *,
-        double *);
+    void points(int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t, const double *,
+        const double *, double *, double *);
+    int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *,
+        const double *, const double *, const uint8_t *, double, double, double, double, int64_t,
+        const double *, double, int8_t *);
+    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t,
+        const int64_t *, int64_t, int64_t, const double *, const double *, double *);
+    typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S;
+        const double *charges, *thickness, *heights; int64_t P; const double *T, *X, *weights,
+        *gauss; double h, depth, least, inside, precision; } Cells;
+    double close_pairs(const Cells *, int64_t, const int64_t *, const double *, double *, double,
+        double *, double *, const int32_t *, int64_t, const int64_t *, const int64_t *,
+        const double *, int64_t);
+    int64_t seen_of(const Cells *, int64_t, int64_t, const double *, int64_t, int64_t *, double *,
+        double *, double *, double *);
 """
-INTEGERS = {np.dtype(of): f"{of}_t[]" for of in ("int64", "int32", "uint8", "int8")}
-KEPT: WeakKeyDictionary[Any, dict[str, Array]] = WeakKeyDictionary()
-KINDS = INTEGERS | {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
+C_TYPES = {np.dtype(name): f"{name}_t[]" for name in ("int64", "int32", "uint8", "int8")}
+C_TYPES |= {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
+# arrays to which a struct in C points, for as long as it is used
+ARRAYS_OF_STRUCTS: WeakKeyDictionary[Any, dict[str, Array]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
 class Copies:
-    """What is modelled and its images, which make the whole; cells of all are counted one copy
-    after the other.
+    """The modelled cells and their images, which make the whole shell.
+
+    Cells of all copies are counted one copy after the other.
 
     Attributes
     ----------
     images
         The first is what is modelled itself.
-    charge
+    charge_sign
         1 if charges of mirrored images are those of what is modelled, -1 if they are opposite.
     """
 
     images: tuple[Image, ...] = (Image(np.eye(3), np.zeros(3), 1.0),)
-    charge: float = 1.0
+    charge_sign: float = 1.0
 
     @property
-    def up(self) -> Array:
-        """(copies,) 1, or -1 where an image turns normals over, so that its heights have the other
-        sign.
-        """
+    def normal_signs(self) -> Array:
+        """(copies,) 1, or -1 where an image turns normals over, and with them the heights."""
         return np.array([image.sign for image in self.images])
 
     @property
-    def charges(self) -> Array:
-        """(copies,) factors of the charges."""
-        return np.where(self.up < 0, self.charge, 1.0)
+    def charge_factors(self) -> Array:
+        """(copies,) factors of the modelled charges."""
+        return np.where(self.normal_signs < 0, self.charge_sign, 1.0)
 
-    def of(self, nodes: Array) -> Array:
-        """The nodes (copies * cells, k, 3) of all."""
+    def nodes_of_all(self, nodes: Array) -> Array:
+        """Return nodes (copies * cells, k, 3) of all copies, from modelled ones (cells, k, 3)."""
         return np.concatenate([image.apply(nodes) for image in self.images])
 
 
-ALL = Copies()  # of a shell that is modelled whole
+NO_IMAGES = Copies()  # of a shell that is modelled whole
 
 
 @dataclass(frozen=True)
@@ -89,9 +95,9 @@ class Points:
         (P, 3, k) shape functions and their derivatives by the reference coordinates, or (P, M, 3,
         k): M points for each of the P of another element.
     heights
-        (.., L) of layers over the thickness.
+        (.., L) heights of layers over the thickness.
     t
-        (rows, ..) the thickness over R.
+        (rows, ..) thickness over R.
     q
         (rows, .., L) charges over Br R².
     """
@@ -107,22 +113,21 @@ class Points:
 
     @cached_property
     def sums(self) -> Array:
-        """(rows, P, SUMS) derivatives at points that stay on their elements; zero between
-        evaluations.
-        """
+        """(rows, P, SUMS) derivatives by places and normals of points; zero between evaluations."""
         return np.zeros((*self.t.shape, SUMS))
 
 
 class Stiffness:
-    """Second derivatives, added to blocks of a matrix; those by the nodes of one cell are first
-    summed for each cell.
+    """Blocks of a matrix to which second derivatives are added.
+
+    Second derivatives by the nodes of one cell are first summed for each cell: see `finish`.
 
     Parameters
     ----------
-    beside
-        (local nodes, all nodes) which blocks there are.
+    pattern
+        (local nodes, all nodes) whether there is a block.
     factor
-        Of all second derivatives.
+        Factor of all second derivatives.
     row_of, column_of
         (cells, k) numbers of nodes; rows of other ranks and of images are -1, columns of images
         follow all others.
@@ -132,22 +137,28 @@ class Stiffness:
     Attributes
     ----------
     blocks
-        (n, 3, 3) row by row, added to; then those of images.
+        (n, 3, 3) row by row; then those of images.
+    where
+        (local nodes, all nodes and those of images) number of each block, or -1.
+    starts, columns
+        First block of each row, and the column of each block.
+    onto
+        (cells, k (k + 1)/2, 3, 3) sums of each cell.
     """
 
     def __init__(
-        self, beside: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array
+        self, pattern: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array
     ) -> None:
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
         number = np.where(
-            beside, np.cumsum(beside, dtype=np.int32).reshape(beside.shape) - 1, -1
+            pattern, np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1, -1
         ).astype(np.int32)
-        self._count = int(np.count_nonzero(beside))
-        self.columns = np.nonzero(beside)[1].astype(np.int32)
-        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(beside, axis=1))]).astype(
+        self._count = int(np.count_nonzero(pattern))
+        self.columns = np.nonzero(pattern)[1].astype(np.int32)
+        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(pattern, axis=1))]).astype(
             np.int32
         )
-        self.shape = 3 * beside.shape[0], 3 * beside.shape[1]
+        self.shape = 3 * pattern.shape[0], 3 * pattern.shape[1]
         of_images = [number + self._count] if len(turn) > 1 else []
         self.where = np.concatenate([number, *of_images], axis=1)
         self.blocks = np.zeros((self._count * (1 + len(of_images)), 3, 3))
@@ -156,7 +167,7 @@ class Stiffness:
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
 
     def finish(self) -> None:
-        """Add the second derivatives by the nodes of one cell."""
+        """Add the sums of each cell to the blocks."""
         k = self.row_of.shape[1]
         a, b = np.triu_indices(k)
         block = np.zeros((k, k, 3, 3))
@@ -166,25 +177,19 @@ class Stiffness:
             self.blocks[self.where[self.row_of[cell][:, None], self.column_of[cell]]] += block
 
     def matrix(self, sign: float) -> bsr_array:
-        """(3 local nodes, 3 all nodes), with the columns of images times the sign."""
-        of_itself, of_images = self.blocks[: self._count], self.blocks[self._count :]
-        return bsr_array(
-            (
-                of_itself + sign * of_images if len(of_images) else of_itself,
-                self.columns,
-                self.starts,
-            ),
-            self.shape,
-        )
+        """Return the matrix (3 local nodes, 3 all nodes), columns of images times the sign."""
+        blocks, blocks_of_images = self.blocks[: self._count], self.blocks[self._count :]
+        if len(blocks_of_images):
+            blocks = blocks + sign * blocks_of_images
+        return bsr_array((blocks, self.columns, self.starts), self.shape)
 
 
 class Pairs:
-    """The sums over pairs of cells with nodes (cells, k, 3)."""
+    """The compiled functions for pairs of cells with nodes (cells, k, 3); collective to make."""
 
     def __init__(self, comm: MPI.Comm) -> None:
-        source, *behind = (
-            Path(__file__).with_name(name) for name in ("pairs.c", "multipole_expansion.c", "stacked_faces.c")
-        )
+        names = "pairs.c", "multipole_expansion.c", "stacked_faces.c"
+        source, *behind = (Path(__file__).with_name(name) for name in names)
         self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *behind)
 
     def add(
@@ -197,10 +202,10 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """The energy of the first `counted` pairs (n, 2) of cells; gradient (cells, k, 3) and
-        stiffness get all pairs.
+        """Return the energy of the first `counted` pairs (n, 2) of cells.
 
-        What they add at points that stay on their elements is in the sums of these: see `finish`.
+        The derivatives of all pairs are added to gradient (cells, k, 3) and stiffness; what they
+        are at points is first added to the sums of these: see `finish`.
 
         Parameters
         ----------
@@ -209,15 +214,18 @@ class Pairs:
         """
         if not len(cells):
             return 0.0
-        idle = -len(cells) % LANES
-        both, left_rows, right_rows = (_filled(rows, idle) for rows in (cells, left[1], right[1]))
-        same = right[0].tables.ndim == 3
+        padding = -len(cells) % LANES
+        filled_cells, left_rows, right_rows = (
+            _filled(rows, padding) for rows in (cells, left[1], right[1])
+        )
+        is_shared = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
         on_left, on_right = (
-            [p(of.tables), p(of.heights), p(of.t), p(of.q)] for of in (left[0], right[0])
+            [p(points.tables), p(points.heights), p(points.t), p(points.q)]
+            for points in (left[0], right[0])
         )
-        sizes = [len(both), counted, idle, p(both), nodes.shape[1], p(nodes)]
-        sums = p(right[0].sums) if same else self._ffi.NULL
+        sizes = [len(filled_cells), counted, padding, p(filled_cells), nodes.shape[1], p(nodes)]
+        sums = p(right[0].sums) if is_shared else self._ffi.NULL
         points = [
             P,
             L,
@@ -229,7 +237,7 @@ class Pairs:
             *on_right,
             sums,
             p(right_rows),
-            int(same),
+            int(is_shared),
         ]
         return float(self._lib.pairs(*sizes, *points, p(gradient), *self._matrix(nodes, stiffness)))
 
@@ -243,49 +251,45 @@ class Pairs:
         return [stiffness.factor, onto, blocks, p(where), where.shape[1], *nodes_of, turn, modelled]
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
-        """What `add_close` and `seen` have of all pairs: see `Cells` in stacked_faces.c."""
-        made = self._ffi.new(
+        """Return the struct `Cells` of stacked_faces.c, for `add_stacked` and `visible_points`."""
+        struct = self._ffi.new(
             "Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()}
         )
-        KEPT[made] = arrays  # as long as what points at them
-        return made
+        ARRAYS_OF_STRUCTS[struct] = arrays
+        return struct
 
-    def add_close(
+    def add_stacked(
         self,
-        of: Any,
+        struct: Any,
         nodes: Array,
         cells: Ints,
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """The energy of pairs (n, 2) of cells that are close, as `add`; no number if two are in
-        each other.
+        """Return the energy of pairs (n, 2) of cells with stacked faces, and add derivatives.
+
+        The energy is nan if two cells overlap; see `add`.
         """
+        if not len(cells):
+            return 0.0
         p, pairs = self._pointer, np.ascontiguousarray(cells)
+        arrays = p(pairs), p(nodes), p(gradient)
         matrix = self._matrix(nodes, stiffness)
-        return (
-            float(self._lib.close_pairs(of, len(pairs), p(pairs), p(nodes), p(gradient), *matrix))
-            if len(cells)
-            else 0.0
-        )
+        return float(self._lib.close_pairs(struct, len(pairs), *arrays, *matrix))
 
-    def seen(
-        self, of: Any, nodes: Array, one: int, other: int, most: int
+    def visible_points(
+        self, struct: Any, nodes: Array, first: int, second: int, max_points: int
     ) -> tuple[Array, Array, Array, Array] | None:
-        """What P points of a cell see of another: places (P, M, 2), weights (P, M), `inward` and
-        `shift` (P,).
+        """Return the rule of a cell with points on another, for each of P points of the first.
 
-        None if both are in each other.
+        It has places (P, M, 2), weights (P, M), and `inward` and `shift` (P,) of stacked_faces.c.
+        None if both cells overlap.
         """
-        p, count, (inward, shift) = (
-            self._pointer,
-            np.zeros(of.P, dtype=np.int64),
-            np.zeros((2, of.P)),
-        )
-        X, w = np.full((of.P, most, 2), 1 / 3), np.zeros((of.P, most))
-        if self._lib.seen_of(
-            of, one, other, p(nodes), most, p(count), p(X), p(w), p(inward), p(shift)
-        ):
+        p, P = self._pointer, struct.P
+        count, (inward, shift) = np.zeros(P, dtype=np.int64), np.zeros((2, P))
+        X, w = np.full((P, max_points, 2), 1 / 3), np.zeros((P, max_points))
+        outputs = p(count), p(X), p(w), p(inward), p(shift)
+        if self._lib.seen_of(struct, first, second, p(nodes), max_points, *outputs):
             return None
         longest = count.max()
         return X[:, :longest], w[:, :longest], inward, shift
@@ -298,20 +302,18 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> None:
-        """Add the sums at points of elements in cells (rows,) to gradient and stiffness, and make
-        them zero.
-        """
-        idle, p = -len(cells) % LANES, self._pointer
-        filled, (P, *_) = _filled(cells, idle), points.tables.shape
+        """Add the sums at points on cells (rows,) to gradient and stiffness, and reset them."""
+        padding, p = -len(cells) % LANES, self._pointer
+        filled, (P, *_) = _filled(cells, padding), points.tables.shape
         onto = p(stiffness.onto) if stiffness else self._ffi.NULL
-        sizes = [len(filled), idle, p(filled), nodes.shape[1], p(nodes), P]
+        sizes = [len(filled), padding, p(filled), nodes.shape[1], p(nodes), P]
         self._lib.points(*sizes, p(points.tables), p(points.sums), p(gradient), onto)
         points.sums[:] = 0.0
 
     def rules(
         self,
         nodes: Array,
-        own: range,
+        own_cells: range,
         apart: NDArray[np.uint8],
         least: Array,
         *,
@@ -321,32 +323,33 @@ class Pairs:
         flat: float,
         worst: float,
     ) -> NDArray[np.int8] | None:
-        """(own, cells) the number of the rule of each pair, -1 without one; None if two cells are
-        too near each other.
+        """Return (own cells, cells) the number of the rule of each pair, -1 without one.
+
+        None if two cells are too near each other.
 
         Parameters
         ----------
         apart
-            (own, cells) 1 for the pairs that have a rule.
+            (own cells, cells) 1 for the pairs that have a rule.
         least
             (rules,) the distance over the size of cells from which each rule is precise.
         h
-            Of the shell, over R: nearer cells are too near.
+            Thickness over R: nearer cells are too near.
         space
             Least distance over size that is counted.
         above
-            Part of a cell's radius: what is so near to its middle is above or below the cell.
+            Distance over a cell's radius: what is so near to its middle is above or below the cell.
         flat
-            Sine of the angle up to which a cell is beside another, not above it.
+            Sine of the angle up to which a cell is pattern another, not above it.
         worst
-            As `least`, of the rule beyond the last: cells below it are too near.
+            Distance over size below which cells are too near.
         """
         centre = nodes.mean(axis=1)
         normal = np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         radius = np.linalg.norm(nodes - centre[:, None], axis=-1).max(axis=1)
-        p, chosen = self._pointer, np.empty((len(own), len(nodes)), dtype=np.int8)
-        sizes = [len(nodes), own.start, own.stop, nodes.shape[1]]
+        p, chosen = self._pointer, np.empty((len(own_cells), len(nodes)), dtype=np.int8)
+        sizes = [len(nodes), own_cells.start, own_cells.stop, nodes.shape[1]]
         arrays = [p(array) for array in (nodes, centre, normal, radius, apart)]
         too_near = self._lib.rules(
             *sizes, *arrays, h, space, above, flat, len(least), p(least), worst, p(chosen)
@@ -356,34 +359,29 @@ class Pairs:
     def translate(
         self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array
     ) -> None:
-        """Add G number `which` times M of boxes `other` to L (boxes, .., n) of boxes `one`.
+        """Add the translations of moments M (boxes, .., n) of boxes `other` to L of boxes `one`.
 
         Parameters
         ----------
+        which
+            (pairs,) row of G of each pair.
         ends
-            How many of each row of G are not zero.
+            Number of entries of each row of a translation matrix that are not zero.
         G
-            (.., sum of ends) these, of the rows of each.
+            (matrices, sum of ends) these entries.
         """
-        p, arrays = self._pointer, [np.ascontiguousarray(each) for each in (G, M)]
-        if len(one):
-            numbers = [p(each) for each in (one, other, which)]
-            self._lib.translate(
-                len(one),
-                *numbers,
-                M.shape[1],
-                p(ends),
-                G.shape[1],
-                M.shape[2],
-                *(p(each) for each in arrays),
-                p(L),
-            )
+        if not len(one):
+            return
+        p, G, M = self._pointer, np.ascontiguousarray(G), np.ascontiguousarray(M)
+        numbers = p(one), p(other), p(which)
+        sizes = M.shape[1], p(ends), G.shape[1], M.shape[2]
+        self._lib.translate(len(one), *numbers, *sizes, p(G), p(M), p(L))
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype], array)
+        return self._ffi.from_buffer(C_TYPES[array.dtype], array)
 
 
-def _filled(rows: Ints, idle: int) -> Ints:
-    """The rows, and the last one `idle` times more."""
-    return np.concatenate([rows, rows[-1:].repeat(idle, 0)])
+def _filled(rows: Ints, padding: int) -> Ints:
+    """Return the rows with the last one repeated `padding` times more."""
+    return np.concatenate([rows, rows[-1:].repeat(padding, 0)])

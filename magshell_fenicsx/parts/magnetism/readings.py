@@ -31,7 +31,8 @@ register(
         Quantity(
             name,
             f"induced polarisation along e{number}",
-            f"Mean over the soft shell of the polarisation μ0 M that the field induces, along e{number}; in T, without "
+            "Mean over the soft shell of the polarisation μ0 M that the field induces, along "
+            f"e{number}; in T, without "
             "units over that of λ_m = 1.",
             "load",
         )
@@ -58,9 +59,9 @@ class FieldSeen(Seen):
         return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
 
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
-        from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetised
+        from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
 
-        of = magnetised(sight.loads)
+        of = magnetisation_of(sight.loads)
         if of is None or of.absent:
             return {}
         at = sight.model.system.at_state(state)
@@ -120,7 +121,8 @@ class SensorsSeen(Seen):
         for each in loads.sensors:
             if near.query(each.place)[0] < each.half:
                 raise CaseError(
-                    f"sensors.{each.name}.position: is in the shell, within half its thickness of it: place it outside"
+                    f"sensors.{each.name}.position: is in the shell, within half its thickness of "
+                    "it: place it outside"
                 )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
@@ -139,7 +141,11 @@ class SensorsSeen(Seen):
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
-        from magshell_fenicsx.parts.magnetism.self_field import CENTRAL, STEP, own_field
+        from magshell_fenicsx.parts.magnetism.self_field import (
+            DIFFERENCE_STEP,
+            DIFFERENCE_WEIGHTS,
+            self_field,
+        )
 
         matching = [
             (each, i)
@@ -149,13 +155,13 @@ class SensorsSeen(Seen):
         ]
         if not matching:
             return None
-        (sensor, i), own = matching[0], own_field(sight)
+        (sensor, i), own = matching[0], self_field(sight)
         e = sensor.own * rotation(sight.azimuth)[:, i]
         system = sight.model.system
         at, nodes = system.at_state(state), sight.model.r0.function_space.dofmap.list
 
         def derived() -> tuple[Array, Array]:
-            into, part = own.slope(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
+            into, part = own.derivatives(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
             size = into.by_u.shape[2]
             np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
             return part, into.by_remanence
@@ -166,16 +172,16 @@ class SensorsSeen(Seen):
         if applied and (sensor.total or applied.soft):
             names = {"lambda_m", *ACROSS, *(name for each in applied.driven for name in each.names)}
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
-                size = STEP * (abs(value) or 1.0)
+                size = DIFFERENCE_STEP * (abs(value) or 1.0)
                 moved = (
                     (way, State(state.u, {**state.mu, name: value + way * size}))
-                    for way, _ in CENTRAL
+                    for way, _ in DIFFERENCE_WEIGHTS
                 )
                 values = {
                     way: self._readings(sight, moved_state, [sensor])[0][i]
                     for way, moved_state in moved
                 }
-                by_mu[name] = float(sum(w / size * values[way] for way, w in CENTRAL))
+                by_mu[name] = float(sum(w / size * values[way] for way, w in DIFFERENCE_WEIGHTS))
         value = float(self._readings(sight, state, [sensor])[0][i])
         return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
 
@@ -202,12 +208,12 @@ def field_at(
         What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n,
         1), or of all.
     """
-    from magshell_fenicsx.parts.magnetism.self_field import magnetised, own_field
+    from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 
     def present() -> Array:
-        if magnetised(sight.loads) is None:
+        if magnetisation_of(sight.loads) is None:
             return np.zeros_like(places)
-        shell = own_field(sight)
+        shell = self_field(sight)
         return own * shell.B(shell.families(state.mu)[1], state.mu, places)
 
     B, outside = sight.model.system.at_state(state).evaluate(present), sight.loads.magnetic

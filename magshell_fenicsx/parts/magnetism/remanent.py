@@ -59,7 +59,8 @@ class RemanentSection(FileKeys, Direction):
         for key, kind in belongs.items():
             if (getattr(self, key) is not None) != (self.kind == kind):
                 raise ValueError(
-                    f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}"
+                    f"{key} belongs to kind: {kind}, and must be given there; the kind is "
+                    f"{self.kind}"
                 )
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")

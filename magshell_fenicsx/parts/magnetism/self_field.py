@@ -1,5 +1,8 @@
-"""The own field of a model's shell: what sensors read, its derivatives, its moment, and its export
-to magpylib.
+"""The self-field of a model's shell: flux density, its derivatives, moment, and export to magpylib.
+
+The model's remanence and what a field induces become charges (`charges`), at the displacement that
+the model's system has. Fields are over the remanence's magnitude, lengths over R, in the frame of
+the model. Theory: docs/theory.md, the field of a magnetised shell.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +20,9 @@ from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, place
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charges import (
-    Faces,
-    Family,
-    Sides,
+    ChargedElements,
+    EdgeStrips,
+    ShellFaces,
     field,
     gradient,
     moment,
@@ -27,23 +30,23 @@ from magshell_fenicsx.parts.magnetism.charges import (
 )
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
-from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, Shape
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, NodalDerivatives
 from magshell_fenicsx.parts.seen import Sight
 
 Array = NDArray[np.float64]
-JUMP = 1e-6  # of the remanence between two cells, relative
-AXIS = 1e-9  # over R
-STEP = 1e-4  # of differences of fourth order
-CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+JUMP_TOLERANCE = 1e-6  # of the remanence between two cells, over the largest
+AXIS_TOLERANCE = 1e-9  # distance from the axis, over R
+DIFFERENCE_STEP = 1e-4  # of central differences of fourth order
+DIFFERENCE_WEIGHTS = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
 
-def magnetised(loads: Loads) -> Magnetisation | None:
-    """What is magnetised, in a field or without; None if nothing is."""
+def magnetisation_of(loads: Loads) -> Magnetisation | None:
+    """Return the magnetisation of a model, in a field or without; None if it has none."""
     return loads.magnetic or loads.remanence
 
 
-class OwnField:
-    """The charges of a model's shell; those of a solid are of `self_field_of_solid`.
+class SelfField:
+    """Field of a model's shell; solids have `self_field_of_solid.SelfFieldOfSolid`.
 
     Parameters
     ----------
@@ -52,227 +55,252 @@ class OwnField:
 
     Attributes
     ----------
-    magnetised
-        What is magnetised.
+    magnetisation
+        The model's magnetisation.
+    Br
+        Its remanence at nodes.
     edges
-        Cells of this rank and their local edges that may be charged.
+        Cells of this rank and their local edges that are charged, or may be at some state.
     """
 
     def __init__(self, sight: Sight) -> None:
-        of = magnetised(sight.loads)
-        assert of
-        self._sight, self._model, self.magnetised = sight, sight.model, of
+        magnetisation = magnetisation_of(sight.loads)
+        assert magnetisation
+        self._sight, self._model, self.magnetisation = sight, sight.model, magnetisation
         V = sight.model.r0.function_space
         topology = V.mesh.topology
         self._dim = topology.dim
         self._owned = topology.index_map(self._dim).size_local
-        self._pattern = of.remanent if callable(of.remanent) else Uniform(np.asarray(of.remanent))
-        self.Br = self._given()
-        self._plain = of.law == "deformation" and of.soft is None
-        if not self._plain:
-            self._at = self._element()
-        self.edges = self._sides()
-        self._sign = self._parity()
+        remanence = magnetisation.remanent
+        self._pattern = remanence if callable(remanence) else Uniform(np.asarray(remanence))
+        self.Br = self._remanence_function()
+        self._is_convected = magnetisation.law == "deformation" and magnetisation.soft is None
+        if not self._is_convected:
+            self._interpolation = self._interpolation_element()
+        self.edges = self._charged_sides()
+        self._image_sign = self._parity()
 
-    def _given(self) -> fem.Function:
-        """The remanence at nodes."""
+    def _remanence_function(self) -> fem.Function:
+        """Return the remanence at nodes."""
         return pattern_field(self._pattern, self._model.r0)[0]
 
-    def _places(self) -> tuple[Array, Array]:
-        """Places and normals at the nodes of cells."""
+    def _node_places(self) -> tuple[Array, Array]:
+        """Return places and normals at the nodes of cells."""
         return places(self._model.r0)
 
-    def _element(self) -> Any:
-        """That in which what is not plain is interpolated."""
+    def _interpolation_element(self) -> Any:
+        """Return the element that interpolates a remanence that rotates or is induced."""
         return self._model.carrier.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
 
-    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Any, list[Family]]:
-        """The shape and its charges at the displacement that the system has; `may`: of any other
-        remanence.
+    def families(
+        self, mu: Mapping[str, float], *, include_uncharged: bool = False
+    ) -> tuple[Any, list[ChargedElements]]:
+        """Return the magnetised cells and their charges at the displacement of the system.
+
+        With `include_uncharged`, elements that another remanence may charge are there too.
         """
         shape = self.shape(mu)
-        cells, edges = self.chargeable if may else self.edges
-        faces = Faces(shape, np.arange(self._owned), may=may)
-        return shape, [faces, *([Sides(shape, cells, edges)] if len(cells) else [])]
+        cells, edges = self.chargeable if include_uncharged else self.edges
+        faces = ShellFaces(shape, np.arange(self._owned), include_uncharged=include_uncharged)
+        return shape, [faces, *([EdgeStrips(shape, cells, edges)] if len(cells) else [])]
 
     @cached_property
     def chargeable(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """As `edges`, all that any remanence may charge."""
-        return self._sides(every=True)
+        """Cells of this rank and their local edges that some remanence may charge."""
+        return self._charged_sides(include_all=True)
 
-    def B(self, families: Sequence[Family], mu: Mapping[str, float], places: Array) -> Array:
-        """The field (n, 3) at places (n, 3), of a remanence of length one; nan in the shell;
-        collective.
-        """
+    def B(
+        self, families: Sequence[ChargedElements], mu: Mapping[str, float], places: Array
+    ) -> Array:
+        """Return the flux density (n, 3) at places (n, 3), nan in the shell; collective."""
         total = np.zeros_like(places)
         for image in self._images:
-            relative_to, sign = image.apply_inverse(places), self.sign_of_images(mu) if image.sign < 0 else 1.0
-            total[self._holds(families, relative_to)] = np.nan
-            out = ~np.isnan(total[:, 0])
-            total[out] += sign * field(families, relative_to[out]) @ image.Q.T
+            sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
+            original_places = image.apply_inverse(places)
+            total[self._contains(families, original_places)] = np.nan
+            is_outside = ~np.isnan(total[:, 0])
+            total[is_outside] += sign * field(families, original_places[is_outside]) @ image.Q.T
         return np.asarray(self._model.system.comm.allreduce(total))
 
-    def _holds(self, families: Sequence[Family], places: Array) -> NDArray[np.bool_]:
-        """Which of places (n, 3) are in what is modelled on this rank."""
+    def _contains(self, families: Sequence[ChargedElements], places: Array) -> NDArray[np.bool_]:
+        """Return which of places (n, 3) are in the modelled cells of this rank."""
         faces = families[0]
-        assert isinstance(faces, Faces)
-        return faces.holds(places)
+        assert isinstance(faces, ShellFaces)
+        return faces.contains(places)
 
-    def flat(self, families: Sequence[Family]) -> Sequence[Family]:
-        """The same charges on surfaces."""
+    def surface_charges(self, families: Sequence[ChargedElements]) -> Sequence[ChargedElements]:
+        """Return the same charges, all of them on surfaces."""
         return families
 
-    def slope(self, mu: Mapping[str, float], x: Array, e: Array) -> Nodal:
-        """The derivatives of e .
+    def derivatives(self, mu: Mapping[str, float], x: Array, e: Array) -> NodalDerivatives:
+        """Return the derivatives of e . B(x) by displacement and remanence at this rank's nodes.
 
-        B at this rank's nodes, by the displacement and by the remanence.
+        `x` (3,) is a place and `e` (3,) a direction.
         """
-        parts = list[Nodal]()
-        for may in (
-            (False, True) if self._plain else (True,)
-        ):  # charges that are zero have derivatives
-            shape, families = self.families(mu, may=may)
-            into = Nodal(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
+        derivatives_of_families = list[NodalDerivatives]()
+        # charges that are zero have derivatives by the remanence
+        for include_uncharged in (False, True) if self._is_convected else (True,):
+            shape, families = self.families(mu, include_uncharged=include_uncharged)
+            into = NodalDerivatives(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
             for image in self._images:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
                 gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, into)
-            parts.append(into)
-        into = Nodal(parts[0].by_u, parts[-1].by_remanence)
-        return into if self._plain else self._to_material(into, mu)
+            derivatives_of_families.append(into)
+        first, last = derivatives_of_families[0], derivatives_of_families[-1]
+        into = NodalDerivatives(first.by_u, last.by_remanence)
+        return into if self._is_convected else self._to_material(into, mu)
 
     def moment(self, mu: Mapping[str, float]) -> Array:
-        """The integral of what is magnetised over the volume, remanent and induced, (3,) over R³;
-        collective.
-        """
+        """Return the magnetic moment, remanent and induced, (3,) over R³; collective."""
         total = np.asarray(self._model.system.comm.allreduce(self._moment(mu)))
         if mirror := self._sight.mirror:
             total = mirror.sum_over_images(total, self.sign_of_images(mu))
         return total
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
-        """Of this rank's part of what is modelled."""
+        """Return the moment of this rank's modelled cells."""
         return moment(self.families(mu)[1])
 
     @property
     def _images(self) -> list[Image]:
-        """Those of what is modelled, which make the whole shell."""
+        """Images of the modelled cells that make the whole shell, the cells themselves first."""
         mirror = self._sight.mirror
         return mirror.images if mirror else [Image(np.eye(3), np.zeros(3), 1.0)]
 
     def shape(self, mu: Mapping[str, float]) -> Any:
-        """Its shape and remanence at the displacement that the system has."""
+        """Return the magnetised cells of this rank at the displacement of the system."""
         model, V = self._model, self._model.r0.function_space
-        element, nodes, size = V.element.basix_element, V.dofmap.list[: self._owned], V.dofmap.bs
-        r0, u = (f.x.array.reshape(-1, size)[nodes] for f in (model.r0, model.system.u))
-        thick, factor = None, model.thickness
-        if factor is not None:
-            T = factor.function_space
-            thick = T.element.basix_element, factor.x.array[T.dofmap.list[: self._owned]]
-        if self._plain:
-            Q = self.Br.function_space
-            of, B = Q.element.basix_element, self._nodal()
-            return Shape(element, r0, u, of, B, model.material.h, thick, size == 2, self._thins)
-        Beff = self._material(self._jets(r0), self._jets(u), mu)
-        return Shape(
-            element, r0, u, self._at, Beff, model.material.h, thick, size == 2, self._thins
+        nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
+        r0, u = (f.x.array.reshape(-1, components)[nodes] for f in (model.r0, model.system.u))
+        thickness_factor, thickness = None, model.thickness
+        if thickness is not None:
+            space_of_thickness = thickness.function_space
+            nodal_factors = thickness.x.array[space_of_thickness.dofmap.list[: self._owned]]
+            thickness_factor = space_of_thickness.element.basix_element, nodal_factors
+        if self._is_convected:
+            remanence_element = self.Br.function_space.element.basix_element
+            remanence = self._nodal_remanence()
+        else:
+            remanence_element = self._interpolation
+            remanence = self._material(self._jets(r0), self._jets(u), mu)
+        return MagnetisedShell(
+            V.element.basix_element,
+            r0,
+            u,
+            remanence_element,
+            remanence,
+            model.material.h,
+            thickness_factor,
+            swept=components == 2,
+            incompressible=self._incompressible,
         )
 
     @property
-    def _thins(self) -> Array | float:
-        """Of this rank's cells, see `Shape.thins`."""
+    def _incompressible(self) -> Array | float:
+        """`MagnetisedShell.incompressible` of this rank's cells."""
         thins = self._model.law_of_cells.thins
         return np.asarray(thins)[: self._owned] if np.ndim(thins) else thins
 
-    def _nodal(self, cells: int | None = None) -> Array:
-        """The remanence at the nodes of cells."""
-        Q = self.Br.function_space
+    def _nodal_remanence(self, cells: int | None = None) -> Array:
+        """Return the remanence (cells, nodes, 3) at nodes of the first or all own cells."""
+        V = self.Br.function_space
         return np.asarray(
-            self.Br.x.array.reshape(-1, 3)[Q.dofmap.list[: self._owned if cells is None else cells]]
+            self.Br.x.array.reshape(-1, 3)[V.dofmap.list[: self._owned if cells is None else cells]]
         )
 
     def _jets(self, nodal: Array) -> Array:
-        """(derivatives, cells, nodes, 3) of a field at the nodes of what is taken back to the
-        undeformed shell.
+        """Return a field's values and derivatives (.., cells, nodes, 3) at interpolation nodes.
+
+        `nodal` (cells, nodes, components) are its nodal values; of a meridian, the derivative by
+        the azimuth comes last.
         """
         V = self._model.r0.function_space
-        T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
+        T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
         jets = np.einsum("dmk,nki->dnmi", T, nodal)
         if self._dim > 1:
             return np.asarray(jets)
         zero = np.zeros(jets.shape[1:3])
-        parts = [(f[..., 0], zero, f[..., 1]) for f in jets] + [(zero, jets[0][..., 0], zero)]
-        return np.stack([np.stack(part, axis=-1) for part in parts])
+        components = [(f[..., 0], zero, f[..., 1]) for f in jets] + [(zero, jets[0][..., 0], zero)]
+        return np.stack([np.stack(derivative, axis=-1) for derivative in components])
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
-        """F^-1 of the polarisation per undeformed volume, (cells, nodes, 3), over |Br|."""
-        frame, of = TangentFrame.of(np.concatenate([r0, 0 * r0])), self.magnetised
+        """Return F^-1 J (cells, nodes, 3), J the polarisation per undeformed volume over |Br|.
+
+        Charges of this field stay with the material. `r0` and `u` are jets at its nodes.
+        """
+        frame, magnetisation = TangentFrame.of(np.concatenate([r0, 0 * r0])), self.magnetisation
         n = frame.normal(u)
-        J = np.zeros_like(n)
-        if not (of.soft and of.soft.alone):
-            Q = self.Br.function_space
-            T = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
-            Br = np.einsum("mk,nki->nmi", T, self._nodal())
+        J, soft = np.zeros_like(n), magnetisation.soft
+        if not (soft and soft.alone):
+            space_of_Br = self.Br.function_space
+            tables = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)
+            T = tables[0, :, :, 0]
+            Br = np.einsum("mk,nki->nmi", T, self._nodal_remanence())
             J = (
-                frame.convected(Br, u, thins=self._thins)
-                if of.law == "deformation"
+                frame.convected(Br, u, thins=self._incompressible)
+                if magnetisation.law == "deformation"
                 else frame.rotated(Br, u)
             )
-        if of.soft:
-            B = of.at(mu, r0[0] + u[0])
-            J = J + of.soft.scale**2 * of.soft.polarisation(r0[0], frame.n0, n, B)
+        if soft:
+            B = magnetisation.at(mu, r0[0] + u[0])
+            J = J + soft.scale**2 * soft.polarisation(r0[0], frame.n0, n, B)
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
-        m = np.cross(r1, r2)
-        area = np.sum(m * n, axis=-1, keepdims=True)
-        first, second = (
-            np.sum(each * J, axis=-1, keepdims=True) / area
-            for each in (np.cross(r2, n), np.cross(n, r1))
+        area_vector = np.cross(r1, r2)
+        area = np.sum(area_vector * n, axis=-1, keepdims=True)
+        along_r1, along_r2 = (
+            np.sum(dual * J, axis=-1, keepdims=True) / area
+            for dual in (np.cross(r2, n), np.cross(n, r1))
         )
-        across = np.sum(n * J, axis=-1, keepdims=True)
-        if np.any(self._thins):  # over the stretch of the thickness
-            across = across * (
-                1 + np.asarray(self._thins)[..., None] * (area / frame.area[..., None] - 1)
+        along_normal = np.sum(n * J, axis=-1, keepdims=True)
+        if np.any(self._incompressible):  # over the stretch of the thickness
+            along_normal = along_normal * (
+                1 + np.asarray(self._incompressible)[..., None] * (area / frame.area[..., None] - 1)
             )
-        return np.asarray(first * r0[1] + second * r0[2] + across * frame.n0)
+        return np.asarray(along_r1 * r0[1] + along_r2 * r0[2] + along_normal * frame.n0)
 
-    def _to_material(self, into: Nodal, mu: Mapping[str, float]) -> Nodal:
-        """Derivatives by what is magnetised taken on to the displacement and to the remanence."""
+    def _to_material(self, into: NodalDerivatives, mu: Mapping[str, float]) -> NodalDerivatives:
+        """Return derivatives by displacement and remanence, from those by F^-1 J (`_material`)."""
         V, model = self._model.r0.function_space, self._model
-        nodes, size = V.dofmap.list[: self._owned], V.dofmap.bs
-        r0, u = (self._jets(f.x.array.reshape(-1, size)[nodes]) for f in (model.r0, model.system.u))
-        on = np.zeros_like(u)
+        nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
+        r0, u = (
+            self._jets(f.x.array.reshape(-1, components)[nodes]) for f in (model.r0, model.system.u)
+        )
+        by_jets = np.zeros_like(u)
         for d in range(len(u)):
             for i in range(3):
-                for way, weight in CENTRAL:
-                    moved = u.copy()
-                    moved[d, ..., i] += way * STEP
-                    on[d, ..., i] += (
+                for steps, weight in DIFFERENCE_WEIGHTS:
+                    u_moved = u.copy()
+                    u_moved[d, ..., i] += steps * DIFFERENCE_STEP
+                    by_jets[d, ..., i] += (
                         weight
-                        / STEP
-                        * np.sum(into.by_remanence * self._material(r0, moved, mu), axis=-1)
+                        / DIFFERENCE_STEP
+                        * np.sum(into.by_remanence * self._material(r0, u_moved, mu), axis=-1)
                     )
-        T = V.element.basix_element.tabulate(1, self._at.points)[..., 0]
+        T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
         if self._dim == 1:
-            flat = on[:2][..., [0, 2]]
-            flat[0][..., 0] += on[2][..., 1]
-            on = flat
-        by_u = into.by_u + np.einsum("dmk,dnmi->nki", T, on)
-        Q = self.Br.function_space
-        TB = Q.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
-        Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal())
+            by_meridian = by_jets[:2][..., [0, 2]]
+            by_meridian[0][..., 0] += by_jets[2][..., 1]
+            by_jets = by_meridian
+        by_u = into.by_u + np.einsum("dmk,dnmi->nki", T, by_jets)
+        space_of_Br = self.Br.function_space
+        TB = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)[0, :, :, 0]
+        Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
             self.Br.x.array[:] = Br
-            zero = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1)
+            before = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1)
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
-            change = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1) - zero
+            change = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1) - before
             by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
         self.Br.x.array[:] = Br
-        return Nodal(by_u, by_B)
+        return NodalDerivatives(by_u, by_B)
 
-    def _sides(self, *, every: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Own cells and their local edges at the boundary, and where the remanence jumps, or
-        `every` one.
+    def _charged_sides(
+        self, *, include_all: bool = False
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return own cells and local edges that are charged.
 
-        None on a mirror plane.
+        Edges at the boundary are charged, and those across which the remanence jumps, or all with
+        `include_all`; those on a mirror plane are not.
         """
         V = self._model.r0.function_space
         mesh = V.mesh
@@ -283,68 +311,66 @@ class OwnField:
             topology.connectivity(dim - 1, dim),
             topology.connectivity(dim, dim - 1),
         )
-        at = to_facets.array.reshape(-1, dim + 1)
-        several = np.diff(to_cells.offsets)
-        values = self._nodal(len(at))
+        facets_of_cells = to_facets.array.reshape(-1, dim + 1)
+        cells_of_facet = np.diff(to_cells.offsets)
+        values = self._nodal_remanence(len(facets_of_cells))
         largest = np.abs(values).max(initial=0.0) or 1.0
-        ends = self._ends(len(at), values)
+        at_edges = self._remanence_at_edges(len(facets_of_cells), values)
         cells, edges = list[int](), list[int]()
-        cut = {int(facet) for facet in self._model.mirrored_facets}
+        mirrored_facets = {int(facet) for facet in self._model.mirrored_facets}
         for cell in range(self._owned):
-            for local, facet in enumerate(at[cell]):
-                if facet in cut:
+            for local, facet in enumerate(facets_of_cells[cell]):
+                if facet in mirrored_facets:
                     continue
-                if several[facet] == 1:
+                if cells_of_facet[facet] == 1:
                     cells.append(cell)
                     edges.append(local)
                     continue
-                other = next(int(c) for c in to_cells.links(facet) if c != cell)
-                its_edge = int(np.flatnonzero(at[other] == facet)[0])
-                if (
-                    every
-                    or not self._plain
-                    or np.abs(ends[cell, local] - ends[other, its_edge]).max() > JUMP * largest
-                ):
+                neighbour = next(int(c) for c in to_cells.links(facet) if c != cell)
+                edge_of_neighbour = int(np.flatnonzero(facets_of_cells[neighbour] == facet)[0])
+                jump = np.abs(at_edges[cell, local] - at_edges[neighbour, edge_of_neighbour]).max()
+                always = include_all or not self._is_convected
+                if always or jump > JUMP_TOLERANCE * largest:
                     cells.append(cell)
                     edges.append(local)
         sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
         if dim == 2:
             return sides
-        X = np.array([[0.0], [1.0]])  # a pole has no edge: local facets of an interval are its ends
+        # a pole has no edge; local facets of an interval are its ends
+        X = np.array([[0.0], [1.0]])
         T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
         rho = np.einsum(
             "mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
         )
-        off = np.abs(rho[sides]) > AXIS
-        return sides[0][off], sides[1][off]
+        is_off_axis = np.abs(rho[sides]) > AXIS_TOLERANCE
+        return sides[0][is_off_axis], sides[1][is_off_axis]
 
-    def _ends(self, count: int, values: Array) -> Array:
-        """The remanence in the middle of each local edge, (cells, edges, 3)."""
-        middles = (
-            np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]])
-            if self._dim == 2
-            else np.array([[0.0], [1.0]])
-        )
+    def _remanence_at_edges(self, count: int, values: Array) -> Array:
+        """Return the remanence in the middle of each local edge, (count, edges, 3)."""
+        middles = np.array([[0.0], [1.0]])
+        if self._dim == 2:
+            middles = np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]])
         T = self.Br.function_space.element.basix_element.tabulate(0, middles)[0, :, :, 0]
         return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
 
     def sign_of_images(self, mu: Mapping[str, float]) -> float:
-        """1 if the mirror images of what is magnetised continue it, -1 if their opposites do."""
-        sign = self._sign
+        """Return 1 if mirror images continue the magnetisation, -1 if their opposites do."""
+        sign = self._image_sign
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
-            shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
+            amplitudes_shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
             return self._sight.loads.magnetic.sign_of_images(
-                shown, self._sight.model.r0, self._sight.mirror
+                amplitudes_shown, self._sight.model.r0, self._sight.mirror
             )
         return sign
 
     def _parity(self) -> float:
-        """1 if the mirror images of the remanence continue it, -1 if their opposites do;
-        collective.
+        """Return 1 if mirror images continue the remanence, -1 if their opposites do, else 0.
+
+        Collective.
         """
         if self._sight.mirror is None:
             return 1.0
-        x, n = (each[: self._owned] for each in self._places())
+        x, n = (at_nodes[: self._owned] for at_nodes in self._node_places())
         S, pattern = self._sight.mirror.reflection, self._pattern
         images = pattern(self._sight.mirror.image(x), n @ S) @ S
         return float(
@@ -353,39 +379,38 @@ class OwnField:
 
 
 def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
-    """The integral of the remanence and of what a field induces, as they are carried, (3,) over R³;
-    collective.
+    """Return the magnetic moment, remanent and induced, (3,) over R³; collective.
 
-    In the frame of the model, at the displacement that its system has.
+    It is in the frame of the model, at the displacement that its system has.
     """
-    return own_field(sight).moment(mu)
+    return self_field(sight).moment(mu)
 
 
-def own_field(sight: Sight) -> OwnField:
-    """That of a model, which keeps it until another remanence takes the place of its own."""
-    model, of = sight.model, magnetised(sight.loads)
-    own = model.kept.get(OwnField)
-    if own is None or own.magnetised is not of:
+def self_field(sight: Sight) -> SelfField:
+    """Return the self-field of a model, which keeps it until its magnetisation is replaced."""
+    model, magnetisation = sight.model, magnetisation_of(sight.loads)
+    field_of_model = model.kept.get(SelfField)
+    if field_of_model is None or field_of_model.magnetisation is not magnetisation:
         if sight.model.r0.function_space.mesh.topology.dim == 3:
-            from magshell_fenicsx.parts.magnetism.self_field_of_solid import (
-                OwnFieldOfBody,
-            )  # it is an own field
+            # late, as it derives from the class here
+            from magshell_fenicsx.parts.magnetism.self_field_of_solid import SelfFieldOfSolid
 
-            own = OwnFieldOfBody(sight)
+            field_of_model = SelfFieldOfSolid(sight)
         else:
-            own = OwnField(sight)
-        model.kept[OwnField] = own
-    return own
+            field_of_model = SelfField(sight)
+        model.kept[SelfField] = field_of_model
+    return field_of_model
 
 
 def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
-    """The body of a state as a source of magpylib, of charged triangles, in m and T; without units
-    over R and |Br|.
+    """Return the magnetised shell at a state as a source of magpylib, of charged triangles.
+
+    It is in m and T; in a case without units, over R and |Br|.
 
     Parameters
     ----------
     parts
-        Into how many parts each side of a cell is divided.
+        Number of parts into which each side of a cell is divided.
 
     Raises
     ------
@@ -394,42 +419,53 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
     """
     from magshell_fenicsx.parts.magnetism.sources.source import magpylib
 
-    of = magnetised(sight.loads)
-    if of is None:
+    magnetisation = magnetisation_of(sight.loads)
+    if magnetisation is None:
         raise CaseError(
             "to_magpylib: of a shell with a remanence or a susceptibility, this has neither"
         )
-    made, own, mirror = magpylib("to_magpylib"), own_field(sight), sight.mirror
-    Q, R = rotation(sight.azimuth), of.metres or 1.0
+    module, field_of_model, mirror = magpylib("to_magpylib"), self_field(sight), sight.mirror
+    Q, R = rotation(sight.azimuth), magnetisation.metres or 1.0
 
-    def present() -> list[tuple[Array, Array]]:
-        _, families = own.families(state.mu)
-        all_charged = [each for family in own.flat(families) for each in triangles(family, parts)]
+    def charged_triangles() -> list[tuple[Array, Array]]:
+        _, families = field_of_model.families(state.mu)
+        triangles_and_charges = [
+            part
+            for family in field_of_model.surface_charges(families)
+            for part in triangles(family, parts)
+        ]
         if mirror:
-            sign = own.sign_of_images(state.mu)
+            sign = field_of_model.sign_of_images(state.mu)
             copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
-            all_charged = [
-                (image.apply(x), factor * q) for image, factor in copies for x, q in all_charged
+            triangles_and_charges = [
+                (image.apply(x), factor * q)
+                for image, factor in copies
+                for x, q in triangles_and_charges
             ]
-        return all_charged
+        return triangles_and_charges
 
     system = sight.model.system
-    all_charged = [
-        each for rank in system.comm.allgather(system.at_state(state).evaluate(present)) for each in rank
-    ]
-    corners, charges = (np.concatenate([each[i] for each in all_charged]) for i in range(2))
+    on_all_ranks = system.comm.allgather(system.at_state(state).evaluate(charged_triangles))
+    triangles_and_charges = [part for on_rank in on_all_ranks for part in on_rank]
+    corners, charges = (
+        np.concatenate([part[i] for part in triangles_and_charges]) for i in range(2)
+    )
     corners = R * corners @ Q
-    m = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    J = (of.tesla * R**2 * charges / np.sum(m * m, axis=-1))[:, None] * m
+    area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    charges_per_area = (
+        magnetisation.tesla * R**2 * charges / np.sum(area_vectors * area_vectors, axis=-1)
+    )
+    J = charges_per_area[:, None] * area_vectors
 
-    def total(field: str, observers: Array) -> Array:
-        """Of all triangles; magpylib asks for B or H."""
+    def flux_density(field: str, observers: Array) -> Array:
+        """Return B or H, whatever magpylib asks for, of all triangles at observers (n, 3)."""
         B = np.zeros((len(observers), 3))
         for i, x in enumerate(observers):
-            seen = np.broadcast_to(x, (len(J), 3))
-            B[i] = made.core.triangle_Bfield(observers=seen, vertices=corners, polarizations=J).sum(
-                axis=0
+            observer = np.broadcast_to(x, (len(J), 3))
+            of_triangles = module.core.triangle_Bfield(
+                observers=observer, vertices=corners, polarizations=J
             )
+            B[i] = of_triangles.sum(axis=0)
         return np.asarray(B / MU_0 if field == "H" else B)
 
-    return made.misc.CustomSource(field_func=total)
+    return module.misc.CustomSource(field_func=flux_density)

@@ -1,4 +1,4 @@
-"""The own field of a magnetised solid, from the charges of its cells."""
+"""The self-field of a magnetised solid, from the charges of its cells (`charges_of_solid`)."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -11,89 +11,104 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import QUADRATURE_DEGREE
 from magshell_fenicsx.models.shell.patterns import field_in_body, places_in_body
-from magshell_fenicsx.parts.magnetism.charges import Family
+from magshell_fenicsx.parts.magnetism.charges import ChargedElements
 from magshell_fenicsx.parts.magnetism.charges_of_solid import (
-    Body,
     CellFaces,
-    Inside,
-    flat,
-    on_faces,
-    uneven,
+    CellInteriors,
+    MagnetisedSolid,
+    cells_with_varying_remanence,
+    on_surfaces,
+    places_on_faces,
 )
 from magshell_fenicsx.parts.magnetism.magnetised_cells import unit
-from magshell_fenicsx.parts.magnetism.self_field import JUMP, OwnField
+from magshell_fenicsx.parts.magnetism.self_field import JUMP_TOLERANCE, SelfField
 
 Array = NDArray[np.float64]
-Sides = tuple[NDArray[np.intp], NDArray[np.intp]]
-FINER = 1  # degree of what turns or is induced above that of the displacement
-LOOKED = np.array(
-    [[0.5, 0.5], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
-)  # where two cells meet
+CellsAndFaces = tuple[NDArray[np.intp], NDArray[np.intp]]
+# degree of a remanence that rotates or is induced, above that of the displacement
+DEGREE_INCREMENT = 1
+# coordinates of a face at which the remanence of two cells is compared
+FACE_SAMPLES = np.array([[0.5, 0.5], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
 
 
-class OwnFieldOfBody(OwnField):
-    """The charges of a solid; `edges` are own cells and the faces of them that are charged."""
+class SelfFieldOfSolid(SelfField):
+    """Field of a model's solid; `edges` are own cells and their local faces that are charged."""
 
-    def _given(self) -> fem.Function:
+    def _remanence_function(self) -> fem.Function:
         return field_in_body(self._pattern, self._model.r0.function_space)
 
-    def _places(self) -> tuple[Array, Array]:
+    def _node_places(self) -> tuple[Array, Array]:
         return places_in_body(self._model.r0.function_space)
 
-    def _element(self) -> Any:
+    def _interpolation_element(self) -> Any:
         family, degree = (
             basix.ElementFamily.P,
-            self._model.r0.function_space.element.basix_element.degree + FINER,
+            self._model.r0.function_space.element.basix_element.degree + DEGREE_INCREMENT,
         )
         return basix.create_element(
             family, basix.CellType.hexahedron, degree, basix.LagrangeVariant.gll_warped
         )
 
-    def families(self, mu: Mapping[str, float], *, may: bool = False) -> tuple[Body, list[Family]]:
+    def families(
+        self, mu: Mapping[str, float], *, include_uncharged: bool = False
+    ) -> tuple[MagnetisedSolid, list[ChargedElements]]:
         shape = self.shape(mu)
-        cells = np.arange(self._owned) if may else uneven(shape)
-        inside = [Inside(shape, cells)] if len(cells) else []
-        return shape, [CellFaces(shape, *(self.chargeable if may else self.edges)), *inside]
+        cells = np.arange(self._owned) if include_uncharged else cells_with_varying_remanence(shape)
+        inside = [CellInteriors(shape, cells)] if len(cells) else []
+        return shape, [
+            CellFaces(shape, *(self.chargeable if include_uncharged else self.edges)),
+            *inside,
+        ]
 
-    def shape(self, mu: Mapping[str, float]) -> Body:
+    def shape(self, mu: Mapping[str, float]) -> MagnetisedSolid:
         V = self._model.r0.function_space
         nodes = V.dofmap.list[: self._owned]
         X, u = (f.x.array.reshape(-1, 3)[nodes] for f in (self._model.r0, self._model.system.u))
         element = V.element.basix_element
-        if self._plain:
-            return Body(element, X, u, self.Br.function_space.element.basix_element, self._nodal())
-        return Body(element, X, u, self._at, self._material(self._jets(X), self._jets(u), mu))
+        if self._is_convected:
+            return MagnetisedSolid(
+                element, X, u, self.Br.function_space.element.basix_element, self._nodal_remanence()
+            )
+        return MagnetisedSolid(
+            element, X, u, self._interpolation, self._material(self._jets(X), self._jets(u), mu)
+        )
 
-    def _holds(self, families: Sequence[Family], places: Array) -> NDArray[np.bool_]:
+    def _contains(self, families: Sequence[ChargedElements], places: Array) -> NDArray[np.bool_]:
         faces = families[0]
         assert isinstance(faces, CellFaces)
-        return faces.shape.holds(places)
+        return faces.shape.contains(places)
 
-    def flat(self, families: Sequence[Family]) -> Sequence[Family]:
-        return flat(families)
+    def surface_charges(self, families: Sequence[ChargedElements]) -> Sequence[ChargedElements]:
+        return on_surfaces(families)
 
     def _polarised(
         self, X: Array, u: Array, Br: Array, mu: Mapping[str, float]
     ) -> tuple[Array, Array]:
-        """F, and the polarisation per undeformed volume, at points with jets (4, cells, points, 3)."""
-        of = self.magnetised
+        """Return F, and the polarisation per undeformed volume over |Br|.
+
+        `X` and `u` are jets (4, cells, points, 3) of undeformed places and displacements, `Br` the
+        remanence (cells, points, 3) there.
+        """
+        magnetisation = self.magnetisation
         G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
         F, n0 = np.eye(3) + H @ np.linalg.inv(G), unit(np.cross(X[1], X[2]))
-        J = np.zeros_like(n0)
-        if not (of.soft and of.soft.alone):
-            moved = F
-            if of.law == "rotation":
+        J, soft = np.zeros_like(n0), magnetisation.soft
+        if not (soft and soft.alone):
+            carrier = F
+            if magnetisation.law == "rotation":
                 U, _, W = np.linalg.svd(F)
-                moved = U @ W
-            J = np.einsum("cqij,cqj->cqi", moved, Br)
-        if of.soft:
+                carrier = U @ W
+            J = np.einsum("cqij,cqj->cqi", carrier, Br)
+        if soft:
             n = unit(np.asarray(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None]))[..., 0])
-            J = J + of.soft.scale**2 * of.soft.polarisation(X[0], n0, n, of.at(mu, X[0] + u[0]))
+            B = magnetisation.at(mu, X[0] + u[0])
+            J = J + soft.scale**2 * soft.polarisation(X[0], n0, n, B)
         return F, J
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
-        T = self.Br.function_space.element.basix_element.tabulate(0, self._at.points)[0, :, :, 0]
-        F, J = self._polarised(r0, u, np.einsum("mk,nki->nmi", T, self._nodal()), mu)
+        element = self.Br.function_space.element.basix_element
+        T = element.tabulate(0, self._interpolation.points)[0, :, :, 0]
+        F, J = self._polarised(r0, u, np.einsum("mk,nki->nmi", T, self._nodal_remanence()), mu)
         return np.asarray(np.linalg.solve(F, J[..., None])[..., 0])
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
@@ -107,51 +122,54 @@ class OwnFieldOfBody(OwnField):
             np.einsum("dqk,cki->dcqi", T, f.x.array.reshape(-1, 3)[nodes])
             for f in (self._model.r0, self._model.system.u)
         )
-        _, J = self._polarised(X, u, np.einsum("qk,cki->cqi", TB[0], self._nodal()), mu)
+        _, J = self._polarised(X, u, np.einsum("qk,cki->cqi", TB[0], self._nodal_remanence()), mu)
         volume = np.abs(np.linalg.det(np.moveaxis(X[1:], 0, -1))) * weights
         return np.asarray(np.einsum("cq,cqi->i", volume, J))
 
     @cached_property
-    def chargeable(self) -> Sides:
-        return self._sides(every=True)
+    def chargeable(self) -> CellsAndFaces:
+        return self._charged_sides(include_all=True)
 
-    def _sides(self, *, every: bool = False) -> Sides:
-        """Own cells and their local faces on the surface, and where the remanence jumps, or `every`
-        one.
+    def _charged_sides(self, *, include_all: bool = False) -> CellsAndFaces:
+        """Return own cells and local faces that are charged.
 
-        None on a mirror plane.
+        Faces on the surface are charged, and those across which the remanence jumps, or all with
+        `include_all`; those on a mirror plane are not.
         """
         V = self._model.r0.function_space
         topology = V.mesh.topology
-        for pair in ((2, 3), (3, 2)):
-            topology.create_connectivity(*pair)
-        of_cells = topology.connectivity(3, 2).array.reshape(-1, 6)
-        several = np.diff(topology.connectivity(2, 3).offsets)
-        chosen = np.isin(of_cells, self._model.mirrored_facets, invert=True)
-        if not every and self._plain:
-            chosen &= (several[of_cells] == 1) | self._jumps(of_cells)
-        cells, faces = np.nonzero(chosen[: self._owned])
+        for dimensions in ((2, 3), (3, 2)):
+            topology.create_connectivity(*dimensions)
+        facets_of_cells = topology.connectivity(3, 2).array.reshape(-1, 6)
+        cells_of_facet = np.diff(topology.connectivity(2, 3).offsets)
+        is_charged = np.isin(facets_of_cells, self._model.mirrored_facets, invert=True)
+        if not include_all and self._is_convected:
+            is_charged &= (cells_of_facet[facets_of_cells] == 1) | self._jumps(facets_of_cells)
+        cells, faces = np.nonzero(is_charged[: self._owned])
         return cells, faces
 
-    def _jumps(self, of_cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """(cells, 6) whether the remanence is another one beyond each face."""
-        Q, V, values = (
-            self.Br.function_space,
-            self._model.r0.function_space,
-            self._nodal(len(of_cells)),
+    def _jumps(self, facets_of_cells: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return (cells, 6) whether the remanence of the neighbour across each face differs."""
+        space_of_Br, V = self.Br.function_space, self._model.r0.function_space
+        values = self._nodal_remanence(len(facets_of_cells))
+        coordinates = np.broadcast_to(FACE_SAMPLES, (6, *FACE_SAMPLES.shape))
+        samples = places_on_faces(np.arange(6), coordinates).reshape(-1, 3)
+        T, TB = (
+            space.element.basix_element.tabulate(0, samples)[0, :, :, 0]
+            for space in (V, space_of_Br)
         )
-        at = on_faces(np.arange(6), np.broadcast_to(LOOKED, (6, *LOOKED.shape)))
-        T, TB = (f.element.basix_element.tabulate(0, at.reshape(-1, 3))[0, :, :, 0] for f in (V, Q))
         X = np.einsum("mk,nki->nmi", T, self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list])
-        B = np.einsum("mk,nki->nmi", TB, values).reshape(-1, len(LOOKED), 3)
-        X = X.reshape(-1, len(LOOKED), 3)
-        order = np.argsort(of_cells.ravel(), kind="stable")
-        same = np.flatnonzero(np.diff(of_cells.ravel()[order]) == 0)
-        one, other = order[same], order[same + 1]
-        matching = np.linalg.norm(X[one][:, :, None] - X[other][:, None], axis=-1).argmin(axis=2)
-        beyond = np.take_along_axis(B[other], matching[..., None], axis=1)
+        B = np.einsum("mk,nki->nmi", TB, values).reshape(-1, len(FACE_SAMPLES), 3)
+        X = X.reshape(-1, len(FACE_SAMPLES), 3)
+        order = np.argsort(facets_of_cells.ravel(), kind="stable")
+        pairs = np.flatnonzero(np.diff(facets_of_cells.ravel()[order]) == 0)
+        sides, sides_of_neighbours = order[pairs], order[pairs + 1]
+        distances = X[sides][:, :, None] - X[sides_of_neighbours][:, None]
+        matching = np.linalg.norm(distances, axis=-1).argmin(axis=2)
+        B_of_neighbours = np.take_along_axis(B[sides_of_neighbours], matching[..., None], axis=1)
         largest = np.abs(values).max(initial=0.0) or 1.0
-        apart = np.abs(B[one] - beyond).max(axis=(1, 2), initial=0.0) > JUMP * largest
-        jumps = np.zeros(of_cells.size, dtype=bool)
-        jumps[one[apart]] = jumps[other[apart]] = True
-        return jumps.reshape(of_cells.shape)
+        jump = np.abs(B[sides] - B_of_neighbours).max(axis=(1, 2), initial=0.0)
+        differs = jump > JUMP_TOLERANCE * largest
+        jumps = np.zeros(facets_of_cells.size, dtype=bool)
+        jumps[sides[differs]] = jumps[sides_of_neighbours[differs]] = True
+        return jumps.reshape(facets_of_cells.shape)

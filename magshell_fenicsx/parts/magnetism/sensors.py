@@ -108,7 +108,8 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
         for name, each in self.given.items():
             if not name.isidentifier():
                 raise CaseError(
-                    f"sensors: {name}: a name is made of letters, digits and _, as it begins names of columns"
+                    f"sensors: {name}: a name is made of letters, digits and _, as it begins names "
+                    "of columns"
                 )
             refuse_unknown_field(f"sensors.{name}", each.field, context)
             shell = context.shell
@@ -118,7 +119,8 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
             ):
                 x, y, z = each.position
                 raise CaseError(
-                    f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half its thickness of the "
+                    f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half "
+                    "its thickness of the "
                     "mid-surface: place it outside"
                 )
 

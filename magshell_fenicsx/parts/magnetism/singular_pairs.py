@@ -1,9 +1,8 @@
-"""The energy of the charges of cells that touch each other, and of each cell with itself.
+"""The energy of the charges of adjacent cells, and of each cell with itself: singular pairs.
 
 The charges of one cell act on those of its neighbours, of the same part of a shell, at distances
 from zero on. As they stay with the material, energy, forces and stiffness are derivatives of one
-sum over pairs of points; only their rules are others than far away (`touching`), the same for all
-pairs of one kind.
+sum over pairs of points, whose rules (`duffy_rules`) are the same for all pairs of one kind.
 """
 
 from collections.abc import Iterator
@@ -16,46 +15,50 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, add
-from magshell_fenicsx.parts.magnetism.charges import Boxes, Faces, Found, Sides, gauss, heights
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, pair_derivatives
+from magshell_fenicsx.parts.magnetism.charges import (
+    Boxes,
+    EdgeStrips,
+    PointCharges,
+    ShellFaces,
+    gauss,
+    heights,
+)
 from magshell_fenicsx.parts.magnetism.duffy_rules import (
-    APART,
     ENDS,
-    SPLIT,
-    along_strip,
-    around,
+    REGULAR_DEGREE,
+    STRIP_SCALE,
     at_corner,
-    beyond,
+    continued_across_side,
     on_edge,
     polar,
+    rule_along_sides,
     strip,
+    strip_rule_seen_from,
 )
-from magshell_fenicsx.parts.magnetism.magnetised_cells import Nodal, Shape
-from magshell_fenicsx.parts.magnetism.pairs import ALL, Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, NodalDerivatives
+from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Pairs, Points, Stiffness
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NOTHING = 1e-13  # of the largest charge: elements without any
-CHUNK = 40_000  # points at which charges are found at once
-ON_STRIP = (
-    8,
-    4,
-)  # nodes along and across a strip at which charges are found; between them they are polynomials
-NODES = basix.create_element(
+CHARGE_TOLERANCE = 1e-13  # over the largest charge: elements with less have none
+MAX_POINTS_AT_ONCE = 40_000  # at which charges are computed
+# nodes along and across a strip at which charges are computed; between them they are polynomials
+STRIP_NODES = (8, 4)
+FACE_NODES = basix.create_element(
     basix.ElementFamily.P,
     basix.CellType.triangle,
     8,
     lagrange_variant=basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
-Kind = tuple[
-    Any, ...
-]  # of a pair of elements: the first one with its sides, the second, and where they touch
+# kind of a pair of elements: the first one with its sides, the second, and where they touch
+PairKind = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class Places:
-    """Points of elements of one kind.
+    """Quadrature points of elements of one kind.
 
     Attributes
     ----------
@@ -64,7 +67,7 @@ class Places:
     weights
         (n,)
     at
-        Coordinates (n, 2) of a strip, in [0, 1]; None of faces.
+        (n, 2) coordinates on a strip, in [0, 1]; None for faces.
     """
 
     X: Array
@@ -82,79 +85,86 @@ class Batch:
 
     Attributes
     ----------
+    pairs
+        (n, 2) cells.
     own
-        How many of the first pairs have their first cell on this rank.
-    of_left, of_right
-        Where the charges are found, with the local edges of strips, and what these are multiplied
-        by.
+        Number of pairs, the first ones, whose first cell is on this rank.
+    left, right
+        Charged points of both elements.
+    charges_of_left, charges_of_right
+        Places of the charges, the local edge of strips, and the factor of the charges.
     """
 
     pairs: Ints
     own: int
     left: Points
     right: Points
-    of_left: tuple[Places, int | None, float]
-    of_right: tuple[Places, int | None, float]
+    charges_of_left: tuple[Places, int | None, float]
+    charges_of_right: tuple[Places, int | None, float]
 
 
-class Near:
-    """All pairs of cells with a common node.
+class SingularPairs:
+    """Charges of all pairs of cells with a common node.
 
     Parameters
     ----------
     shape
-        All cells that are modelled.
+        All modelled cells.
     corners
         (copies * cells, 3) numbers of the corners of all copies.
     cells, edges
         Edges that may be charged, by cell and local number.
     own
         The cells of this rank; pairs without one of them are left to others.
-    may
-        Whether what has no charge may get one.
+    include_uncharged
+        Whether elements without a charge are there too.
     """
 
     def __init__(
         self,
-        shape: Shape,
+        shape: MagnetisedShell,
         corners: Ints,
         cells: Ints,
         edges: Ints,
-        own: range,
+        own_cells: range,
         comm: MPI.Comm,
-        copies: Copies = ALL,
+        copies: Copies = NO_IMAGES,
         *,
-        may: bool = False,
+        include_uncharged: bool = False,
     ) -> None:
-        self._pairs, self._copies, self._may = Pairs(comm), copies, may
-        self._shape, self._corners, self._own = shape, corners, own
+        self._pairs, self._copies, self._include_uncharged = Pairs(comm), copies, include_uncharged
+        self._shape, self._corners, self._own = shape, corners, own_cells
         strips = np.zeros((len(shape.r0), 3), dtype=bool)
         strips[cells, edges] = True
         self._strips = np.tile(strips, (len(copies.images), 1))
         sides = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
         self._scale = float(shape.h / np.median(sides))
-        self._heights = heights(Faces(shape, np.arange(1), may=may))
-        meeting: dict[int, list[int]] = {}
-        numbers = [[int(each) for each in corners[cell]] for cell in range(len(corners))]
-        for cell, three in enumerate(numbers):
-            for each in three:
-                meeting.setdefault(each, []).append(cell)
-        self.touching = [
-            sorted({other for each in three for other in meeting[each]}) for three in numbers
+        self._heights = heights(
+            ShellFaces(shape, np.arange(1), include_uncharged=include_uncharged)
+        )
+        cells_at_corner: dict[int, list[int]] = {}
+        numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
+        for cell, corners_of_cell in enumerate(numbers):
+            for corner in corners_of_cell:
+                cells_at_corner.setdefault(corner, []).append(cell)
+        self.neighbours = [
+            sorted({other for corner in corners_of_cell for other in cells_at_corner[corner]})
+            for corners_of_cell in numbers
         ]
-        self._free = self._at_boundary()
-        kinds: dict[Kind, list[tuple[int, int]]] = {}
-        for c, others in enumerate(self.touching):
+        self._boundary_sides = self._at_boundary()
+        kinds: dict[PairKind, list[tuple[int, int]]] = {}
+        for c, others in enumerate(self.neighbours):
             for d in others:
-                if c in own or d in own:
-                    for kind in self._kinds(c, d):
+                if c in own_cells or d in own_cells:
+                    for kind in self._kinds_of_pair(c, d):
                         kinds.setdefault(kind, []).append((c, d))
-        self._most = 0.0
-        self._batches = list(self._charged(kinds))
+        self._largest_charge = 0.0
+        self._batches = list(self._charged_batches(kinds))
 
     def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
-        """The energy of pairs whose first cell is here; their gradient (cells, k, 3) is added,
-        right for own cells.
+        """Return the energy of pairs whose first cell is on this rank, and add derivatives.
+
+        The gradient (cells, k, 3) is complete for own cells.
         """
         energy = 0.0
         for batch in self._batches:
@@ -169,17 +179,17 @@ class Near:
         return energy
 
     def _at_boundary(self) -> NDArray[np.bool_]:
-        """(cells, 3) sides that no other cell has."""
+        """Return (cells, 3) which sides no other cell has."""
         at_boundary = np.ones((len(self._corners), 3), dtype=bool)
-        for c, others in enumerate(self.touching):
+        for c, others in enumerate(self.neighbours):
             for d in others:
                 for edge in range(3):
-                    if c != d and self._shared(c, edge, d):
+                    if c != d and self._common_side(c, edge, d):
                         at_boundary[c, edge] = False
         return at_boundary
 
-    def _shared(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
-        """The local number in d of a side of c, and whether it runs the other way."""
+    def _common_side(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
+        """Return the local number in cell d of a side of cell c, and whether it runs back there."""
         a, b = (int(self._corners[c, i]) for i in ENDS[edge])
         for side, (i, j) in enumerate(ENDS):
             ends = int(self._corners[d, i]), int(self._corners[d, j])
@@ -187,133 +197,166 @@ class Near:
                 return side, ends == (b, a)
         return None
 
-    def _kinds(self, c: int, d: int) -> Iterator[Kind]:
-        """Of all elements of two cells that touch."""
-        mine, theirs = ([int(each) for each in self._corners[cell]] for cell in (c, d))
-        mask = tuple(map(bool, self._free[c]))
-        sides = [(e, shared) for e in range(3) if c != d and (shared := self._shared(c, e, d))]
+    def _kinds_of_pair(self, c: int, d: int) -> Iterator[PairKind]:
+        """Yield the kinds of all pairs of elements of two adjacent cells c and d."""
+        own_corners, other_corners = (
+            [int(each) for each in self._corners[cell]] for cell in (c, d)
+        )
+        boundary_sides = tuple(map(bool, self._boundary_sides[c]))
+        sides = [
+            (edge, shared)
+            for edge in range(3)
+            if c != d and (shared := self._common_side(c, edge, d))
+        ]
         if c == d:
-            yield "faces", mask, "self"
+            yield "faces", boundary_sides, "self"
         elif sides:
-            e, (side_of_other, flip) = sides[0]
-            yield "faces", mask, "side", e, side_of_other, flip
+            edge, (side_of_other, flip) = sides[0]
+            yield "faces", boundary_sides, "side", edge, side_of_other, flip
         else:
-            yield "faces", mask, "corner", next(i for i, each in enumerate(theirs) if each in mine)
-        for e in np.flatnonzero(self._strips[c]):
-            e = int(e)
-            common, ends = self._shared(c, e, d), [mine[i] for i in ENDS[e]]
-            met = [i for i, each in enumerate(theirs) if each in ends]
-            if common:
-                yield "strip", e, "side", *common
+            yield (
+                "faces",
+                boundary_sides,
+                "corner",
+                next(i for i, each in enumerate(other_corners) if each in own_corners),
+            )
+        for edge in np.flatnonzero(self._strips[c]):
+            edge = int(edge)
+            common_side, ends = self._common_side(c, edge, d), [own_corners[i] for i in ENDS[edge]]
+            common_corners = [i for i, each in enumerate(other_corners) if each in ends]
+            if common_side:
+                yield "strip", edge, "side", *common_side
             else:
-                yield ("strip", e, "corner", met[0]) if met else ("strip", e, "apart")
-            for f in np.flatnonzero(self._strips[d]):
-                f = int(f)
-                other = [theirs[i] for i in ENDS[f]]
-                if common and common[0] == f:
-                    yield "strips", e, "side", f, common[1]
-                elif at := [i for i in range(2) if other[i] in ends]:
-                    yield "strips", e, "end", f, at[0], ends.index(other[at[0]])
+                yield (
+                    ("strip", edge, "corner", common_corners[0])
+                    if common_corners
+                    else ("strip", edge, "apart")
+                )
+            for other_edge in np.flatnonzero(self._strips[d]):
+                other_edge = int(other_edge)
+                ends_of_other = [other_corners[i] for i in ENDS[other_edge]]
+                if common_side and common_side[0] == other_edge:
+                    yield "strips", edge, "side", other_edge, common_side[1]
+                elif common_ends := [i for i in range(2) if ends_of_other[i] in ends]:
+                    yield (
+                        "strips",
+                        edge,
+                        "end",
+                        other_edge,
+                        common_ends[0],
+                        ends.index(ends_of_other[common_ends[0]]),
+                    )
                 else:
-                    yield "strips", e, "apart", f
+                    yield "strips", edge, "apart", other_edge
 
-    def _charged(self, kinds: dict[Kind, list[tuple[int, int]]]) -> Iterator[Batch]:
-        made = []
-        for kind, pairs in sorted(kinds.items(), key=lambda each: str(each[0])):
+    def _charged_batches(self, kinds: dict[PairKind, list[tuple[int, int]]]) -> Iterator[Batch]:
+        batches = []
+        for kind, pairs in sorted(kinds.items(), key=lambda batch: str(batch[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
-            made.append(
+            batches.append(
                 self._batch(
                     kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)
                 )
             )
-        most = max(
+        largest = max(
             (
                 float(np.abs(q).max(initial=0.0))
-                for each in made
-                for q in (each.left.q, each.right.q)
+                for batch in batches
+                for q in (batch.left.q, batch.right.q)
             ),
             default=0,
         )
-        for each in made:
-            if self._may or all(
-                np.abs(q).max(initial=0.0) > NOTHING * most for q in (each.left.q, each.right.q)
+        for batch in batches:
+            if self._include_uncharged or all(
+                np.abs(q).max(initial=0.0) > CHARGE_TOLERANCE * largest
+                for q in (batch.left.q, batch.right.q)
             ):
-                yield each
+                yield batch
 
-    def _batch(self, kind: Kind, pairs: Ints, own: int) -> Batch:
-        first, second, same = self._rules(kind)
+    def _batch(self, kind: PairKind, pairs: Ints, own_pairs: int) -> Batch:
+        first, second, is_shared = self._rules_of_pair(kind)
         on_strips = kind[0] == "strips"
         left = self._points(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
         right = self._points(pairs[:, 1], second, kind[3] if on_strips else None)
-        T, h, t, q = right
-        if not same:
+        T, heights_of_points, t, q = right
+        if not is_shared:
             count = len(first.weights)
             T = T.reshape(count, -1, *T.shape[1:])
-            h, t, q = (
-                h.reshape(count, -1, h.shape[-1]),
+            heights_of_points, t, q = (
+                heights_of_points.reshape(count, -1, heights_of_points.shape[-1]),
                 t.reshape(len(t), count, -1),
-                q.reshape(len(q), count, -1, h.shape[-1]),
+                q.reshape(len(q), count, -1, heights_of_points.shape[-1]),
             )
-        share = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
-        left_points = Points(left[0], left[1], left[2], share * left[3])
-        of = (
-            (first, kind[1] if kind[0] != "faces" else None, share),
+        weight = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
+        left_points = Points(left[0], left[1], left[2], weight * left[3])
+        sides = (
+            (first, kind[1] if kind[0] != "faces" else None, weight),
             (second, kind[3] if on_strips else None, 1.0),
         )
-        return Batch(pairs, own, left_points, Points(T, h, t, q), *of)
+        return Batch(pairs, own_pairs, left_points, Points(T, heights_of_points, t, q), *sides)
 
-    def _rules(self, kind: Kind) -> tuple[Places, Places, bool]:
-        """Points of both elements; of the second one those for each of the first, or, if true, the
-        same for all.
+    def _rules_of_pair(self, kind: PairKind) -> tuple[Places, Places, bool]:
+        """Return the points of both elements of a kind of pairs.
+
+        If the third value is true, the second element has the same points for all points of the
+        first one, else others for each.
         """
         s = self._scale
         if kind[0] == "faces":
-            first = Places(*around(kind[1], s))
+            first = Places(*rule_along_sides(kind[1], s))
             if kind[2] == "corner":
                 return first, Places(*at_corner(kind[3])), True
-            apex = first.X if kind[2] == "self" else beyond(first.X, kind[3:5], kind[5])
-            return first, self._each([polar(each, s) for each in apex]), False
+            apex = (
+                first.X if kind[2] == "self" else continued_across_side(first.X, kind[3:5], kind[5])
+            )
+            return first, self._padded([polar(point, s) for point in apex]), False
         t, eta, w = strip()
         first = Places.of_strip(kind[1], t, eta, w)
         if kind[0] == "strip":
             if kind[2] == "corner":
                 return first, Places(*at_corner(kind[3])), True
             if kind[2] == "apart":
-                return first, Places(*_quadrature(APART)), True
+                return first, Places(*_quadrature(REGULAR_DEGREE)), True
             foot = on_edge(kind[3], 1 - t if kind[4] else t)
-            return first, self._each([polar(each, SPLIT * s) for each in foot]), False
+            return first, self._padded([polar(point, STRIP_SCALE * s) for point in foot]), False
         if kind[2] in ("side", "end"):
-            at = 1 - t if kind[4] else t
+            positions = 1 - t if kind[4] else t
             if kind[2] == "end":  # as far from the common end as the place is, beyond it
-                at = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
-            strips = [along_strip(float(a), float(b), s) for a, b in zip(at, eta, strict=True)]
+                positions = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
+            strips = [
+                strip_rule_seen_from(float(position), float(height), s)
+                for position, height in zip(positions, eta, strict=True)
+            ]
             return (
                 first,
                 Places.of_strip(
-                    kind[3], *(np.concatenate(each) for each in zip(*strips, strict=True))
+                    kind[3], *(np.concatenate(point) for point in zip(*strips, strict=True))
                 ),
                 False,
             )
         return first, Places.of_strip(kind[3], t, eta, w), True
 
-    def _each(self, rules: list[tuple[Array, Array]]) -> Places:
-        """Rules for each of some points, made as long as the longest with points of weight zero."""
-        longest = max(len(w) for _, w in rules)
-        X = [np.concatenate([X, np.repeat(X[:1], longest - len(X), axis=0)]) for X, _ in rules]
-        w = [np.concatenate([w, np.zeros(longest - len(w))]) for _, w in rules]
+    def _padded(self, rules: list[tuple[Array, Array]]) -> Places:
+        """Return rules, padded to the length of the longest with points of weight zero."""
+        count = max(len(w) for _, w in rules)
+        X = [np.concatenate([X, np.repeat(X[:1], count - len(X), axis=0)]) for X, _ in rules]
+        w = [np.concatenate([w, np.zeros(count - len(w))]) for _, w in rules]
         return Places(np.concatenate(X), np.concatenate(w))
 
     def _points(
         self, cells: Ints, points: Places, edge: int | None
     ) -> tuple[Array, Array, Array, Array]:
-        """Tables (n, 3, k), heights (n, layers), thickness (cells, n), and charges (cells, n,
-        layers).
+        """Return shape functions, heights, thickness and charges at points of cells.
+
+        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers).
         """
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
-        up, charge = (each[copy][:, None] for each in (self._copies.up, self._copies.charges))
+        normal_signs, charge_factors = (
+            each[copy][:, None] for each in (self._copies.normal_signs, self._copies.charge_factors)
+        )
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
-        t = up * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
+        t = normal_signs * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
         basis = _basis(points)
         if points.at is None:
             q = np.einsum("mj,njl->nml", basis, self._on_faces[cells], optimize=True)
@@ -325,51 +368,59 @@ class Near:
             T,
             np.ascontiguousarray(layers),
             np.ascontiguousarray(t),
-            points.weights[:, None] * charge[..., None] * q,
+            points.weights[:, None] * charge_factors[..., None] * q,
         )
 
     @cached_property
     def _on_faces(self) -> Array:
-        """(cells, n, layers) charges per area of the reference triangle at nodes of what is
-        modelled.
-        """
-        return np.concatenate([found.q for _, found in self._found_on_faces(None)])
+        """(modelled cells, nodes, layers) charges per area of the reference triangle."""
+        return np.concatenate([found.q for _, found in self._face_charges(None)])
 
-    def _found_on_faces(self, into: Nodal | None) -> Iterator[tuple[Ints, Found]]:
-        X, cells = NODES.points, np.arange(len(self._shape.r0))
+    def _face_charges(self, into: NodalDerivatives | None) -> Iterator[tuple[Ints, PointCharges]]:
+        X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
-        each = max(1, CHUNK // len(X))
-        for part in (cells[first : first + each] for first in range(0, len(cells), each)):
+        cells_at_once = max(1, MAX_POINTS_AT_ONCE // len(X))
+        for part in (
+            cells[first : first + cells_at_once] for first in range(0, len(cells), cells_at_once)
+        ):
             yield (
                 part,
-                Faces(self._shape, part, may=self._may).at(
-                    Boxes.whole(len(part)), ab, weights, into
+                ShellFaces(self._shape, part, include_uncharged=self._include_uncharged).at(
+                    Boxes.undivided(len(part)), ab, weights, into
                 ),
             )
 
     @cached_property
     def _on_strips(self) -> list[Array]:
-        """(cells, n) charges per area of the coordinates of strips at their nodes; of each local
-        edge.
-        """
+        """(cells, nodes) charges per area of the coordinates of strips, for each local edge."""
         charges: list[Array] = [
-            np.zeros((len(self._shape.r0), int(np.prod(ON_STRIP)))) for _ in range(3)
+            np.zeros((len(self._shape.r0), int(np.prod(STRIP_NODES)))) for _ in range(3)
         ]
-        for edge, cells, found in self._found_on_strips(None):
+        for edge, cells, found in self._strip_charges(None):
             charges[edge][cells] = found.q[..., 0]
         return charges
 
-    def _found_on_strips(self, into: Nodal | None) -> Iterator[tuple[int, Ints, Found]]:
-        (a, _), (b, _) = (gauss(n) for n in ON_STRIP)
-        at = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
+    def _strip_charges(
+        self, into: NodalDerivatives | None
+    ) -> Iterator[tuple[int, Ints, PointCharges]]:
+        (a, _), (b, _) = (gauss(n) for n in STRIP_NODES)
+        points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
         for edge in range(3):
             cells = np.flatnonzero(self._strips[: len(self._shape.r0), edge])
             if len(cells):
-                sides = Sides(self._shape, cells, np.full(len(cells), edge))
-                yield edge, cells, sides.at(Boxes.whole(len(cells)), at, np.ones(len(at)), into)
+                sides = EdgeStrips(self._shape, cells, np.full(len(cells), edge))
+                yield (
+                    edge,
+                    cells,
+                    sides.charges_at(
+                        Boxes.undivided(len(cells)), points, np.ones(len(points)), into
+                    ),
+                )
 
-    def by_fields(self, moved: Complex, weights: Weights, into: Nodal) -> None:
-        """Add the derivatives that `into` has: see `Charged.by_fields`."""
+    def field_derivatives(
+        self, moved_nodes: Complex, weights: Weights, into: NodalDerivatives
+    ) -> None:
+        """Add derivatives by nodal values to `into`: see `InteractingCharges.field_derivatives`."""
         on_faces, on_strips = (
             np.zeros_like(self._on_faces),
             [np.zeros_like(each) for each in self._on_strips],
@@ -377,58 +428,72 @@ class Near:
         for batch in self._batches:
             pairs = batch.pairs[: batch.own]
             rows = np.arange(len(pairs))
-            sides = zip((0, 1), (batch.of_left, batch.of_right), strict=True)
-            on_q = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights)
+            sides = zip((0, 1), (batch.charges_of_left, batch.charges_of_right), strict=True)
+            by_charges_of_both = pair_derivatives(
+                moved_nodes, pairs, (batch.left, rows), (batch.right, rows), weights
+            )
             if into.by_thickness is not None:
-                self._by_heights(batch, pairs, moved, weights, into)
-            for i, (points, edge, share) in sides:
-                copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
-                on = on_q[i][: len(pairs)].reshape(len(pairs), len(points.weights), -1)
-                on = (
-                    share * points.weights[:, None] * self._copies.charges[copy][:, None, None] * on
+                self._by_heights(batch, pairs, moved_nodes, weights, into)
+            for side, (points, edge, share) in sides:
+                copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
+                by_charges = by_charges_of_both[side][: len(pairs)].reshape(
+                    len(pairs), len(points.weights), -1
+                )
+                by_charges = (
+                    share
+                    * points.weights[:, None]
+                    * self._copies.charge_factors[copy][:, None, None]
+                    * by_charges
                 )
                 if edge is None:
                     np.add.at(
-                        on_faces, cells, np.einsum("mj,nml->njl", _basis(points), on, optimize=True)
+                        on_faces,
+                        cells,
+                        np.einsum("mj,nml->njl", _basis(points), by_charges, optimize=True),
                     )
                 else:
-                    np.add.at(on_strips[edge], cells, on[..., 0] @ _basis(points))
-        for part, found in self._found_on_faces(into):
-            assert found.back
-            found.back(np.zeros_like(found.x), on_faces[part])
-        for edge, cells, found in self._found_on_strips(into):
-            assert found.back
-            found.back(np.zeros_like(found.x), on_strips[edge][cells][..., None])
+                    np.add.at(on_strips[edge], cells, by_charges[..., 0] @ _basis(points))
+        for part, found in self._face_charges(into):
+            assert found.add_derivatives
+            found.add_derivatives(np.zeros_like(found.x), on_faces[part])
+        for edge, cells, found in self._strip_charges(into):
+            assert found.add_derivatives
+            found.add_derivatives(np.zeros_like(found.x), on_strips[edge][cells][..., None])
 
     def _by_heights(
-        self, batch: Batch, pairs: Ints, moved: Complex, weights: Weights, into: Nodal
+        self,
+        batch: Batch,
+        pairs: Ints,
+        moved_nodes: Complex,
+        weights: Weights,
+        into: NodalDerivatives,
     ) -> None:
-        rows, both = np.arange(len(pairs)), (batch.left, batch.right)
-        on = add(moved, pairs, (batch.left, rows), (batch.right, rows), weights, heights=True)
-        for i, (places, _, _) in enumerate((batch.of_left, batch.of_right)):
-            copy, cells = np.divmod(pairs[:, i], len(self._shape.r0))
+        rows, points_of_both = np.arange(len(pairs)), (batch.left, batch.right)
+        by_heights = pair_derivatives(
+            moved_nodes, pairs, (batch.left, rows), (batch.right, rows), weights, heights=True
+        )
+        for side, (places, _, _) in enumerate((batch.charges_of_left, batch.charges_of_right)):
+            copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
             shape = len(pairs), len(places.weights), -1
-            heights = both[i].heights.reshape(shape[1:])
-            on_t = self._copies.up[copy][:, None] * np.sum(
-                heights * on[i][: len(pairs)].reshape(shape), axis=-1
+            heights = points_of_both[side].heights.reshape(shape[1:])
+            on_t = self._copies.normal_signs[copy][:, None] * np.sum(
+                heights * by_heights[side][: len(pairs)].reshape(shape), axis=-1
             )
-            self._shape.back_of_thickness(cells, places.X, on_t, into)
+            self._shape.add_thickness_derivatives(cells, places.X, on_t, into)
 
 
 def _basis(points: Places) -> Array:
-    """(m, n) values at points of the polynomials that are one at one of the nodes each at which
-    charges are found.
-    """
+    """Return values (m, n) at points of the Lagrange basis of the nodes of charges."""
     if points.at is None:
-        return np.asarray(NODES.tabulate(0, points.X)[0, :, :, 0])
+        return np.asarray(FACE_NODES.tabulate(0, points.X)[0, :, :, 0])
     basis = np.einsum(
-        "ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(ON_STRIP))
+        "ma,mb->mab", *(_lagrange(n, points.at[:, i]) for i, n in enumerate(STRIP_NODES))
     )
     return np.asarray(basis.reshape(len(points.X), -1))
 
 
 def _lagrange(n: int, x: Array) -> Array:
-    """(m, n) values at places of the polynomials that are one at one of Gauss's points each."""
+    """Return values (m, n) at places x (m,) of the Lagrange basis of n Gauss points on [0, 1]."""
     V = np.polynomial.legendre.legvander
     return np.asarray(np.linalg.solve(V(2 * gauss(n)[0] - 1, n - 1).T, V(2 * x - 1, n - 1).T).T)
 

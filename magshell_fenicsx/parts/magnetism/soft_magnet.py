@@ -36,7 +36,7 @@ TERM = "soft magnetism"
 
 
 @dataclass(frozen=True)
-class Soft:
+class SoftMagnet:
     """What is soft.
 
     Attributes
@@ -62,7 +62,7 @@ class Soft:
     patches: Mapping[str, Array] | None = None
     saturation: float | None = None
 
-    def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "Soft":
+    def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "SoftMagnet":
         """With a pattern in place of patches."""
         return (
             replace(self, susceptibility=carried(self.patches), patches=None)

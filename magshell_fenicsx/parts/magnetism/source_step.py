@@ -98,7 +98,8 @@ class SourceStep(LoadStep):
         if self.number(sources) is None:
             names = [one.name or str(i) for i, one in enumerate(sources)]
             raise ValueError(
-                f"{key}.source: {self.source}: magnetic.applied.sources has no such source; allowed: "
+                f"{key}.source: {self.source}: magnetic.applied.sources has no such source; "
+                "allowed: "
                 f"{', '.join(names) or 'none'}"
             )
         if context.whole and FieldSection.amplitude not in context.driven_before(step.number):
@@ -148,7 +149,8 @@ class SourcesSeen(Seen):
         Quantity(
             "source",
             "source",
-            "Factor of a source's motion or strength; the step may give it another name. With units the way of a "
+            "Factor of a source's motion or strength; the step may give it another name. With "
+            "units the way of a "
             "motion has a column too, in mm or degrees.",
             "load",
             units=(DISTANCE, TURN),
@@ -156,7 +158,8 @@ class SourcesSeen(Seen):
         Quantity(
             "source_force",
             "force on the source",
-            "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
+            "Force of the shell on a source that is driven, along its motion; of several "
+            "source_force_NAME.",
             "reaction",
             units=(FORCE,),
             each=True,

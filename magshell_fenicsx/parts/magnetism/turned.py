@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
-from magshell_fenicsx.parts.magnetism.pairs import KINDS, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import C_TYPES, Stiffness
 from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
@@ -100,4 +100,4 @@ class Turning:
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous
-        return self._ffi.from_buffer(KINDS[array.dtype], array)
+        return self._ffi.from_buffer(C_TYPES[array.dtype], array)

@@ -56,7 +56,8 @@ def _components(
             or not least <= value <= most
         ):
             raise ValueError(
-                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, z"
+                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, "
+                "z"
             )
         return value
 

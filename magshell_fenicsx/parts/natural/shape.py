@@ -143,7 +143,8 @@ class Natural:
         if (bad := needed & ~(length[..., 0] > NORMAL)).any():
             x, y, z = r0[bad][0]
             raise MeshError(
-                f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
+                f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, "
+                f"{y:.3g}, {z:.3g})"
             )
         t1 = np.where(length > NORMAL, d / np.maximum(length, 1e-300), 0.0)
         return t1, np.cross(n0, t1)

@@ -87,9 +87,12 @@ class BoundarySection(Section, Ability):
         if not (clamped and blown_up and is_rubber) or context.shell.R_over_h > THIN_RUBBER:
             return None
         return (
-            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as it is "
-            "thick, in which no shell theory holds: its fold may come too low, by up to a fourth, and "
-            "modes at the edge are none of the shell; hinged is right, and a clamped edge raises the "
+            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
+            "is "
+            "thick, in which no shell theory holds: its fold may come too low, by up to a fourth, "
+            "and "
+            "modes at the edge are none of the shell; hinged is right, and a clamped edge raises "
+            "the "
             "fold by less than h/R"
         )
 

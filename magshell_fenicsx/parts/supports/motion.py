@@ -126,7 +126,8 @@ class EdgeSection(PathStep):
             for name in move.supports:
                 if name not in held:
                     raise ValueError(
-                        f"{step.key}.moves.{i}.supports: {name}: only what boundary holds (clamped, hinged or held) "
+                        f"{step.key}.moves.{i}.supports: {name}: only what boundary holds "
+                        "(clamped, hinged or held) "
                         f"can move: {', '.join(held) or 'nothing'}"
                     )
 

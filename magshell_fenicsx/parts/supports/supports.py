@@ -90,7 +90,8 @@ def refuse_unknown(
         if name in joined and name not in patches:
             there, number = ", ".join(sorted(edges)) or "none", joined[name]
             raise MeshError(
-                f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: {there}"
+                f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: "
+                f"{there}"
             )
 
     for name, condition in conditions.items():

@@ -7,9 +7,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism import coulomb, tree
-from magshell_fenicsx.parts.magnetism.coulomb import Charged
-from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape
-from magshell_fenicsx.parts.magnetism.multipole_expansion import ActingOnEachOther, Cells
+from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
+from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian, Cells
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
 from magshell_fenicsx.parts.magnetism.turned import Turning
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 H, SIDES = 0.02, 5
 
 
-def two_bowls() -> tuple[Shape, NDArray[np.intp]]:
+def two_bowls() -> tuple[MagnetisedShell, NDArray[np.intp]]:
     """A sphere of 8 x 25 triangles, and which half of it each is in; the upper one is moved away."""
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, 2, basix.LagrangeVariant.gll_warped
@@ -39,16 +39,16 @@ def two_bowls() -> tuple[Shape, NDArray[np.intp]]:
     upper = r0[..., 2].mean(axis=1) > 0
     r0[upper, :, 2] += 0.6
     remanence = np.broadcast_to([0.6, 0.0, 0.8], r0.shape)
-    return Shape(element, r0, 0 * r0, element, np.array(remanence), H), upper.astype(np.intp)
+    return MagnetisedShell(element, r0, 0 * r0, element, np.array(remanence), H), upper.astype(np.intp)
 
 
-def charged() -> tuple[Charged, Array]:
+def charged() -> tuple[InteractingCharges, Array]:
     shape, parts = two_bowls()
     none, x = np.zeros(0, dtype=np.intp), shape.r0
     bend = 0.03 * np.stack(
         [np.sin(3 * x[..., 1]), np.cos(2 * x[..., 0]), np.sin(2 * x[..., 0] + x[..., 1])], axis=-1
     )
-    return Charged(shape, parts, none, none, MPI.COMM_SELF), x + bend
+    return InteractingCharges(shape, parts, none, none, MPI.COMM_SELF), x + bend
 
 
 def test_translations() -> None:
@@ -105,7 +105,7 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     _, gradient = charges.evaluate(nodes, own, stiffness)
     cells = Cells(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
     kept, turning = np.ones(len(stiffness.columns), dtype=bool), Turning(MPI.COMM_SELF)
-    acting = ActingOnEachOther(
+    acting = InteractionHessian(
         stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning
     )
     product = acting.near_blocks @ v.ravel() + acting.times_far(v.reshape(-1, 1))[:, 0]

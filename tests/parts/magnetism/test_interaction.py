@@ -24,8 +24,8 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism import interacting
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
-from magshell_fenicsx.parts.magnetism.self_field import own_field
-from magshell_fenicsx.parts.magnetism.singular_pairs import Near
+from magshell_fenicsx.parts.magnetism.self_field import self_field
+from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.gradients.gradient import gradient as gradient_of
 
@@ -537,7 +537,7 @@ def test_derivatives_by_thickness_and_place(
     thickness.x.array[:] += 0.1 * rng.standard_normal(len(thickness.x.array))
     fixed = property(lambda self: 0.07, lambda self, value: None)
     monkeypatch.setattr(
-        Near, "_scale", fixed, raising=False
+        SingularPairs, "_scale", fixed, raising=False
     )  # else rules change with the size of cells
 
     def values() -> np.ndarray:
@@ -585,7 +585,7 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
         term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0))
     )
     change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
-    own, forces, energies = own_field(term._sight), list[float](), list[float]()
+    own, forces, energies = self_field(term._sight), list[float](), list[float]()
     own.edges = own.chargeable  # the change has charges on edges between cells
     for side in (1, -1):
         Br.x.array[:], b = before + side * change, np.zeros(len(u.x.array))
@@ -676,12 +676,12 @@ def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
     strips(tmp_path / "strips.msh", 4.0, 2.0, 0.33, 1.5)
     scene = Scene(case_of(tmp_path / "strips.msh", 0.3, mesh={"degree": 2}))
     (term,) = (each for each in scene.model.system.terms if each.name == "interaction")
-    nodes, own, charged = term._nodes(), term._cells.own, term._charged
+    nodes, own, charged = term._nodes(), term._cells.own_range, term._charged
     assert charged.rules(nodes, own)[1].any()
     rates = 0.01 * np.cos(3.0 * np.arange(nodes.size)).reshape(nodes.shape)
     energy, slope = charged.evaluate(nodes, own)
     for weights, of in ((Weights(1.0, 0.0), energy), (Weights(0.0, 1.0), np.sum(slope * rates))):
-        by = charged.by_fields(nodes, rates, own, weights).by_remanence
+        by = charged.field_derivatives(nodes, rates, own, weights).by_remanence
         assert np.sum(by * charged._shape.remanence) == pytest.approx(2 * of, rel=1e-9)
 
 

@@ -16,8 +16,8 @@ from scipy.integrate import quad
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.magnetism.charges import Faces, field, moment
-from magshell_fenicsx.parts.magnetism.magnetised_cells import Shape
+from magshell_fenicsx.parts.magnetism.charges import ShellFaces, field, moment
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.public import follow, run
 
@@ -30,17 +30,17 @@ def dipole(x: np.ndarray, m: np.ndarray) -> np.ndarray:
     return np.asarray((3 * x * (x @ m)[:, None] / r**5 - m / r**3) / (4 * np.pi))
 
 
-def sphere_of_meridians(h: float, B: np.ndarray) -> Shape:
+def sphere_of_meridians(h: float, B: np.ndarray) -> MagnetisedShell:
     """A closed sphere as a meridian from pole to pole."""
     element = basix.create_element(LAGRANGE[0], basix.CellType.interval, 6, LAGRANGE[1])
     angle = np.pi * (np.arange(16)[:, None] + element.points[:, 0]) / 16
     r0 = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-    return Shape(
+    return MagnetisedShell(
         element, r0, 0 * r0, element, np.broadcast_to(B, (*r0.shape[:2], 3)), h, None, True
     )
 
 
-def sphere_of_triangles(h: float, B: np.ndarray) -> Shape:
+def sphere_of_triangles(h: float, B: np.ndarray) -> MagnetisedShell:
     """An octahedron of 8 x 64 triangles, on the sphere."""
     element = basix.create_element(LAGRANGE[0], basix.CellType.triangle, 6, LAGRANGE[1])
     X, cells = element.points, list[np.ndarray]()
@@ -57,7 +57,7 @@ def sphere_of_triangles(h: float, B: np.ndarray) -> Shape:
                     cells.append((np.column_stack([1 - X.sum(axis=1), X]) @ barycentric) @ corners)
     flat = np.array(cells)
     r0 = flat / np.linalg.norm(flat, axis=-1, keepdims=True)
-    return Shape(element, r0, 0 * r0, element, np.broadcast_to(B, r0.shape), h)
+    return MagnetisedShell(element, r0, 0 * r0, element, np.broadcast_to(B, r0.shape), h)
 
 
 @pytest.mark.parametrize("made", [sphere_of_meridians, sphere_of_triangles])
@@ -66,7 +66,7 @@ def test_a_closed_sphere(made: Any) -> None:
     (1e-6).
     """
     h, B = 0.02, np.array([0.0, 0.0, 1.0])
-    families = [Faces(made(h, B), np.arange(len(made(h, B).r0)))]
+    families = [ShellFaces(made(h, B), np.arange(len(made(h, B).r0)))]
     assert (
         np.abs(field(families, np.array([[0, 0, 0], [0.3, 0.2, 0.1], [0, 0.5, -0.7]]))).max()
         < 1e-4 * h

@@ -20,8 +20,8 @@ from magshell_fenicsx import Scene
 from magshell_fenicsx.assembly.dense_tangent import DenseTangent, SinglePrecisionBlocks
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
-from magshell_fenicsx.parts.magnetism.coulomb import Charged
-from magshell_fenicsx.parts.magnetism.singular_pairs import Near
+from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
+from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 
 __all__ = ["model"]
 
@@ -73,8 +73,8 @@ def test_a_closed_sphere(R_over_h: float, error: float) -> None:
         1
     ].reshape(-1, 3)
     none, count = np.zeros(0, dtype=np.intp), len(shape.r0)
-    near = Near(shape, corners, none, none, range(count), MPI.COMM_WORLD)
-    charged = Charged(shape, np.zeros(count, dtype=np.intp), none, none, MPI.COMM_WORLD, near)
+    near = SingularPairs(shape, corners, none, none, range(count), MPI.COMM_WORLD)
+    charged = InteractingCharges(shape, np.zeros(count, dtype=np.intp), none, none, MPI.COMM_WORLD, near)
     found = charged.evaluate(shape.r0, range(count))[0]
     h = 1 / R_over_h
     volume = 4 * np.pi / 3 * ((1 + h / 2) ** 3 - (1 - h / 2) ** 3)

@@ -13,7 +13,7 @@ from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_der
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
-from magshell_fenicsx.parts.magnetism.moving_source import Driven, FieldInSpace
+from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, PlacedSource
 from magshell_fenicsx.parts.part import Context
@@ -98,7 +98,9 @@ def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
     return tuple(rotations)
 
 
-def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
+def in_space(
+    context: Context, turn: float = 0.0
+) -> tuple[FieldInSpace | None, tuple[MovingField, ...]]:
     """The field that stays, None if it is built in, and the fields that steps drive, in a frame
     turned about e3 (rad).
 
@@ -119,7 +121,7 @@ def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, 
     if applied.beside:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
         parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
-    driven = list[Driven]()
+    driven = list[MovingField]()
     for number, source in enumerate(placed(context, turn)):
         one = _driven(applied, context.steps, number, source, rotations, Q)
         if one.names:
@@ -127,7 +129,7 @@ def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, 
         else:
             parts.append(source)
     if rotations:
-        driven += [Driven(part, rotations) for part in parts]
+        driven += [MovingField(part, rotations) for part in parts]
         parts = []
     return Sum(parts), tuple(driven)
 
@@ -139,11 +141,16 @@ def _driven(
     source: PlacedSource,
     rotations: Sequence[RigidMotion],
     Q: Array,
-) -> Driven:
+) -> MovingField:
     """A source with the amplitudes of its steps; turns about its own position come before all other
     motions.
     """
-    spins, moves, factors, zero = list[RigidMotion](), list[RigidMotion](), dict[str, float](), np.zeros(3)
+    spins, moves, factors, zero = (
+        list[RigidMotion](),
+        list[RigidMotion](),
+        dict[str, float](),
+        np.zeros(3),
+    )
     of_all = {motion.name: motion for motion in rotations}
     loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
     own = {name for name, load in loads.items() if load.number(applied.sources or []) == number}
@@ -156,7 +163,9 @@ def _driven(
         load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
-            spins.append(RigidMotion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
+            spins.append(
+                RigidMotion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position)
+            )
         elif load.strength is not None:
             factors[name] = load.strength - 1
         else:
@@ -165,7 +174,7 @@ def _driven(
                 moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]
             ).x[0]
             moves.append(RigidMotion(name, Q @ end - (begin if load.to else zero), zero, zero))
-    return Driven(source, [*spins, *moves], factors)
+    return MovingField(source, [*spins, *moves], factors)
 
 
 def values(context: Context) -> list[Callable[[Array], Array]]:

@@ -23,7 +23,9 @@ class FormulaSource(SourceSection):
         return f"formulas ({', '.join(self.components)})"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        formulas = FormulasInSpace([formula_with_derivatives(text) for text in self.components], np.eye(3))
+        formulas = FormulasInSpace(
+            [formula_with_derivatives(text) for text in self.components], np.eye(3)
+        )
 
         def values(x: Array) -> tuple[Array, Array, Array]:
             B, G, H = formulas(np.asarray(x / R))

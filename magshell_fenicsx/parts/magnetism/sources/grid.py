@@ -112,7 +112,8 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
         values[np.ravel_multi_index(where, shape)] = B
     if not np.isfinite(values).all():
         raise TableError(
-            f"is no rectilinear grid of finite numbers: {len(x)} rows with {' x '.join(map(str, shape))} "
+            f"is no rectilinear grid of finite numbers: {len(x)} rows with "
+            f"{' x '.join(map(str, shape))} "
             "different places along the axes"
         )
     return axes, values.reshape(*shape, 3)

@@ -220,7 +220,8 @@ def magpylib(key: str) -> ModuleType:
         import magpylib
     except ImportError:
         raise CaseError(
-            f"{key}: magnets and coils need the package magpylib: python3 -m pip install --no-deps magpylib"
+            f"{key}: magnets and coils need the package magpylib: python3 -m pip install --no-deps "
+            "magpylib"
         ) from None
     return magpylib  # type: ignore[no-any-return]
 
