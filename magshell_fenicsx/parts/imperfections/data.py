@@ -162,8 +162,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     if wanted is None:
         raise TableError(
             f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, "
-            "w0, or x, y, z of the "
-            "real surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
+            "w0, or x, y, z of the real surface, or polar, azimuth, w0 of a sphere, or azimuth, "
+            "z, w0 of a cylinder"
         )
     names = [*wanted, *(["w0"] if "w0" in columns else [])]
     if (
@@ -172,8 +172,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         and any(units[name] for name in wanted if name not in ANGLES)
     ):
         raise TableError(
-            "column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 "
-            "[um]"
+            "column w0: has no unit, but the places have one: write w0 [h] or a length, such as "
+            "w0 [um]"
         )
     return _finite_rows(
         names, [columns[name] * _factor(units[name], name, lengths) for name in names]
@@ -242,18 +242,16 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
         where = place_text(surface[np.argmax(gaps)])
         raise TableError(
             f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole "
-            "is too large to "
-            "guess; give values there, w0 = 0 where the shell is perfect"
+            "is too large to guess; give values there, w0 = 0 where the shell is perfect"
         )
     places, w0 = _merged(places, w0, SAME * spacing)
     noise = None if standard is None else standard * h
     function = fit_scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
-        f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, "
-        f"residual of the fit {function.residual / h:.3g} h, noise {function.noise / h:.3g} h "
-        f"({estimated}), "
-        f"largest gap {gaps.max():.3g} R"
+        f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, residual of the fit "
+        f"{function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), largest "
+        f"gap {gaps.max():.3g} R"
     )
     lost = f", {scan.lost} rows without a number left out" if scan.lost else ""
     return _Fit(
@@ -286,8 +284,7 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
         row = int(np.argmax(away))
         raise TableError(
             f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the "
-            "columns their unit, "
-            "such as x [mm], or turn and move them to the shell's frame"
+            "columns their unit, such as x [mm], or turn and move them to the shell's frame"
         )
     places, heights = feet(ground.perfect, x)
     if w0 is None:
@@ -296,9 +293,8 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
         row = int(np.argmax(np.abs(heights)))
         raise TableError(
             f"the place {place_text(x[row])} over R is {abs(heights[row]):.3g} R from the shell, "
-            "but w0 there "
-            f"is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another "
-            "shell"
+            f"but w0 there is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the "
+            "place of another shell"
         )
     return places, w0
 

@@ -57,6 +57,6 @@ class DimpleSection(LocalSection):
 def _too_wide(phi_o: float, max_phi_o: float) -> str:
     """Return the message that the half-width `phi_o` reaches its limit, both in rad."""
     return (
-        f"the dimple's half-width phi_o is {phi_o * 180 / pi:.1f} degrees at this R/h "
-        f"and poisson_ratio; it must stay below {max_phi_o * 180 / pi:.3g}"
+        f"the dimple's half-width phi_o is {phi_o * 180 / pi:.1f} degrees at this R/h and "
+        f"poisson_ratio; it must stay below {max_phi_o * 180 / pi:.3g}"
     )

@@ -47,8 +47,7 @@ class FormulaSection(ImperfectionSection):
             place = ", ".join(f"{c:.3g}" for c in bad[0])
             raise CaseError(
                 f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
-                "radius, at (x, y, z)/R = "
-                f"({place})"
+                f"radius, at (x, y, z)/R = ({place})"
             )
         largest, derived = (
             np.ptp(deviation(x)) / abs(deviation.factor or 1.0),

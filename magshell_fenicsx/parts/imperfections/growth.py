@@ -63,8 +63,8 @@ class ImperfectionStep(LoadStep):
             )
         if not grown_by([step], keys)[step.name]:
             raise ValueError(
-                f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from "
-                "0"
+                f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted "
+                "from 0"
             )
         if names[step.name].item is None and len(names) > 1:
             raise ValueError(

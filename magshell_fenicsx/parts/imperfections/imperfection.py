@@ -127,7 +127,8 @@ def in_frame(of_place: Callable[[Array], Values], turn: float) -> Callable[[Arra
 
 
 def half_width(width: float, R_over_h: float, nu: float) -> float:
-    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
+    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 -
+    nu^2))^(1/4)."""
     return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
 
 
@@ -212,7 +213,8 @@ class ImperfectionSection(Section):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Numbers that a knockdown factor is differentiated by, as paths of keys below the section."""
+        """Numbers that a knockdown factor is differentiated by, as paths of keys below the
+        section."""
         return ("amplitude",)
 
     def account(self) -> str:
@@ -262,8 +264,8 @@ class LocalSection(ImperfectionSection):
     amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
     width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
-    """Half-width. A number is φo of a dimple, or φg of a Gaussian one, in radians times (√(12(1 - ν²)) R/h)^(1/2); a
-    length with a unit is R φo, or R φg"""
+    """Half-width. A number is φo of a dimple, or φg of a Gaussian one, in radians times (√(12(1 -
+    ν²)) R/h)^(1/2); a length with a unit is R φo, or R φg"""
     at: At = At.model_construct()
     """Its centre"""
 
@@ -319,6 +321,8 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 raise ValueError(f"shell.{key}: {e}") from None
 
 
-def flaws(imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell) -> dict[str, Flaw]:
+def flaws(
+    imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell
+) -> dict[str, Flaw]:
     """Key of each imperfection below `shell` -> what it brings."""
     return {key: section.flaw(ground, f"shell.{key}") for key, section in imperfections.items()}

@@ -40,9 +40,11 @@ class ModesSection(FileKeys, ImperfectionSection):
     amplitudes: Annotated[
         list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)
     ]
-    """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest [h]"""
+    """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest
+    [h]"""
     file: str | None = None
-    """A mode file of a run (fields/mode_*.vtu), its path from the folder of the case, in place of computed modes"""
+    """A mode file of a run (fields/mode_*.vtu), its path from the folder of the case, in place of
+    computed modes"""
 
     _shapes: tuple[Shape, ...] | None = PrivateAttr(default=None)
 
@@ -77,7 +79,9 @@ class ModesSection(FileKeys, ImperfectionSection):
     def of_perfect_shell(self) -> bool:
         return self.file is None
 
-    def become(self, modes: "Sequence[Mode]", name: str = "", place: ShellPose | None = None) -> None:
+    def become(
+        self, modes: "Sequence[Mode]", name: str = "", place: ShellPose | None = None
+    ) -> None:
         """Take the modes of the perfect shell, or the parts of the shell `name` in those of
         several.
 
@@ -99,8 +103,7 @@ class ModesSection(FileKeys, ImperfectionSection):
         if counted and not any(counted):
             raise ValueError(
                 f"amplitudes: of the {len(parts)} lowest modes of all shells together those with "
-                "an amplitude do not "
-                "move it: give more, and 0 for those of other shells"
+                "an amplitude do not move it: give more, and 0 for those of other shells"
             )
         self._shapes = tuple(part or _still for part in parts)
 

@@ -92,7 +92,9 @@ class _Sum:
         local = [d for d in self.deviations if isinstance(d, Local)]
         kinds = list(dict.fromkeys(type(d) for d in local))
         angles = [d.distance.axis for d in local if isinstance(d.distance, AngularDistance)]
-        places = angles or [d.distance.place for d in local if isinstance(d.distance, StraightDistance)]
+        places = angles or [
+            d.distance.place for d in local if isinstance(d.distance, StraightDistance)
+        ]
         if not places or len(places) < len(self.deviations):
             return None
         shapes = [(d.width, kinds.index(type(d))) for d in local]
@@ -222,7 +224,10 @@ class Spot:
     def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
         """Small elements on it and a little around it, which grow so fast away from there."""
         radius, size = self.radius + 0.7 * sqrt(fit.h), self.size / fit.refinement
-        return [DiscFeature((float(x), float(y)), radius, size, growth) for x, y in images(self, outline)]
+        return [
+            DiscFeature((float(x), float(y)), radius, size, growth)
+            for x, y in images(self, outline)
+        ]
 
 
 def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:
@@ -283,8 +288,7 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     if not outside.any(axis=0).all():
         raise CaseError(
             f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: "
-            "it would reach "
-            "around the shell or its axis"
+            "it would reach around the shell or its axis"
         )
     high = tried[outside.argmax(axis=0)]
     low, below, above = high - tried[0], beyond(high - tried[0]), beyond(high)

@@ -181,7 +181,8 @@ class AppliedField:
         return ""
 
     def _sum(self, still: tuple[Array, Array, Array], x: Array) -> tuple[Array, Array, Array]:
-        """B, G and H of the field that no amplitude drives and of those that are driven, at places."""
+        """B, G and H of the field that no amplitude drives and of those that are driven, at
+        places."""
         self._here = [each.at(x, self.mu) for each in self._driven]
         parts = [still, *(curve.value for curve in self._here)]
         B, G, H = (np.sum(part, axis=0) for part in zip(*parts, strict=True))

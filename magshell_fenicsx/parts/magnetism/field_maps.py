@@ -43,7 +43,8 @@ class FieldMapSection(Section):
     corner: Coordinates
     """Where the sides begin [the shell's length; over R if that has no unit]"""
     sides: Annotated[list[Lengths], Field(min_length=2, max_length=3)]
-    """Vectors along the sides, perpendicular to each other [the shell's length; over R if that has no unit]"""
+    """Vectors along the sides, perpendicular to each other [the shell's length; over R if that has
+    no unit]"""
     points: list[Annotated[int, Field(ge=2, le=10_000)]] = Field(
         default=[41, 41], min_length=2, max_length=3
     )
@@ -56,8 +57,7 @@ class FieldMapSection(Section):
         if len(self.points) != len(self.sides):
             raise ValueError(
                 f"points: {len(self.points)} numbers for {len(self.sides)} sides: give one for "
-                "each side, "
-                "as [41, 41] for two"
+                "each side, as [41, 41] for two"
             )
         if np.prod(self.points) > MOST:
             raise ValueError(f"points: more than {MOST} places in all: give fewer")
@@ -141,8 +141,7 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
             if not (name.isascii() and name.isidentifier() and len(name) <= LONGEST):
                 raise ValueError(
                     f"field_maps: {name}: a name is made of at most {LONGEST} letters, digits and "
-                    "_, as it is in names "
-                    "of files"
+                    "_, as it is in names of files"
                 )
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:

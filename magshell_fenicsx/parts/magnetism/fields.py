@@ -46,7 +46,8 @@ class AppliedSection(Direction):
     """
 
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
-    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m; negative: the field is reversed"""
+    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m; negative: the field is
+    reversed"""
     uniform: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of the uniform part [|B^a|]"""
     gradient: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]] | None = Field(
@@ -54,12 +55,13 @@ class AppliedSection(Direction):
     )
     """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
-    """Formulas of the deformed position x, y, z over R, in place of the other keys. On a shell the position is that of
-    the mid-surface. They are written as those of `remanent`, must be twice differentiable, and need energy: full
-    [|B^a|]"""
+    """Formulas of the deformed position x, y, z over R, in place of the other keys. On a shell the
+    position is that of the mid-surface. They are written as those of `remanent`, must be twice
+    differentiable, and need energy: full [|B^a|]"""
     sources: Sources | None = None
-    """Magnets, coils, and fields on grids or by formulas, in tesla; without `flux_density` they are the whole field,
-    |B^a| is 1 T, and λ_m is in proportion. They need lengths with units and energy: full"""
+    """Magnets, coils, and fields on grids or by formulas, in tesla; without `flux_density` they are
+    the whole field, |B^a| is 1 T, and λ_m is in proportion. They need lengths with units and
+    energy: full"""
 
     @model_validator(mode="after")
     def _beside_sources(self) -> Self:
@@ -118,8 +120,8 @@ def _of_places(value: Any) -> Any:
                 or not 0 <= each <= MOST_SOFT
             ):
                 raise ValueError(
-                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, y, "
-                    "z"
+                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, "
+                    "y, z"
                 )
     return value
 
@@ -143,20 +145,21 @@ class MagneticSection(Section, Ability):
     energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
     """The full magnetic energy, or an expansion"""
     remanence: Literal["deformation", "rotation"] = "deformation"
-    """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
+    """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the
+    rotation of F alone"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
     susceptibility: Susceptibility | None = None
-    """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a number, a formula of
-    the undeformed place x, y, z over R, or a mapping of patches, and `rest`, to numbers. Beside a remanence it needs
-    flux densities, and always energy: full"""
+    """χ of a soft-magnetic shell, whose magnetisation follows the field as that of a thin sheet: a
+    number, a formula of the undeformed place x, y, z over R, or a mapping of patches, and `rest`,
+    to numbers. Beside a remanence it needs flux densities, and always energy: full"""
     saturation: FluxDensity | None = Field(default=None, gt=0, le=1e3)
-    """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in proportion to the field.
-    It needs a susceptibility and flux densities"""
+    """The largest polarisation μ0 M of what is soft, by Langevin's law; left out, it grows in
+    proportion to the field. It needs a susceptibility and flux densities"""
     interaction: Literal["none", "others", "all"] = "none"
-    """Whether parts that are not connected, several shells or those of a mesh file, act on each other with their own
-    fields (others), each part and any one shell on itself too (all), or feel the applied field alone (none). It needs
-    remanent.flux_density and shell.youngs_modulus"""
+    """Whether parts that are not connected, several shells or those of a mesh file, act on each
+    other with their own fields (others), each part and any one shell on itself too (all), or feel
+    the applied field alone (none). It needs remanent.flux_density and shell.youngs_modulus"""
     remanent: RemanentSection | None = RemanentSection.model_construct()
     """What is magnetised for good; left out, a shell with a susceptibility has nothing of it"""
     applied: AppliedSection = AppliedSection.model_construct()
@@ -186,8 +189,7 @@ class MagneticSection(Section, Ability):
         ):
             raise ValueError(
                 "saturation: is of a shell with a susceptibility in a field in tesla: give "
-                "susceptibility and "
-                "applied.flux_density (or sources), without lambda_m"
+                "susceptibility and applied.flux_density (or sources), without lambda_m"
             )
         if self.susceptibility is not None and self.energy != "full":
             raise ValueError(
@@ -196,9 +198,8 @@ class MagneticSection(Section, Ability):
             )
         if self.susceptibility is not None and self.remanent and self.lambda_m is not None:
             raise ValueError(
-                "susceptibility: beside a remanence lambda_m does not say how strong the field is: "
-                "give "
-                "remanent.flux_density and applied.flux_density"
+                "susceptibility: beside a remanence lambda_m does not say how strong the field "
+                "is: give remanent.flux_density and applied.flux_density"
             )
         return self
 
@@ -216,8 +217,7 @@ class MagneticSection(Section, Ability):
         if bad := next((key for key, given in beside.items() if given), None):
             raise ValueError(
                 f"interaction: {self.interaction}: not with {bad}: it is that of parts with a "
-                "remanence alone, with "
-                "remanence: deformation and energy: full"
+                "remanence alone, with remanence: deformation and energy: full"
             )
         return self
 
@@ -308,8 +308,7 @@ class MagneticSection(Section, Ability):
         if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
             raise ValueError(
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give "
-                "youngs_modulus and lengths units, "
-                "or lambda_m"
+                "youngs_modulus and lengths units, or lambda_m"
             )
         if self.without_field and not is_read(context) and self.interaction == "none":
             raise ValueError(
@@ -336,8 +335,7 @@ class MagneticSection(Section, Ability):
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of "
-                "length zero, and a shell "
-                "knows no more of them"
+                "length zero, and a shell knows no more of them"
             )
         patches = self.remanent.patches if self.remanent else None
         if patches is not None and "rest" not in patches and not isinstance(shell, MeshSurface):
@@ -412,16 +410,14 @@ class MagneticSection(Section, Ability):
                 x, y, z = strong[0]
                 raise CaseError(
                     f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the "
-                    "field at (x, y, z)/R = "
-                    f"({x:.3g}, {y:.3g}, {z:.3g})"
+                    f"field at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
             bad = places[~np.isfinite(B).all(axis=1)]
             if len(bad):
                 x, y, z = bad[0]
                 raise CaseError(
                     f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) "
-                    f"{source.nowhere}; "
-                    "see its position"
+                    f"{source.nowhere}; see its position"
                 )
         components = {
             "remanent": self.remanent and self.remanent.components,
@@ -438,8 +434,7 @@ class MagneticSection(Section, Ability):
                 x, y, z = bad[0]
                 raise CaseError(
                     f"magnetic.{key}.components: {shown_value(text)}: has no finite value (or one "
-                    "above 1e6) "
-                    f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
+                    f"above 1e6) at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
 
     def warning(self, context: Context, places: Array) -> str | None:
@@ -458,10 +453,9 @@ class MagneticSection(Section, Ability):
             return None
         x, y, z = places[np.argmax(np.maximum(*sizes))]
         return (
-            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl B "
-            "up to "
-            f"{largest[1]:.3g} B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): "
-            "magnets and currents elsewhere make no such field"
+            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl "
+            f"B up to {largest[1]:.3g} B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, "
+            f"{z:.3g}): magnets and currents elsewhere make no such field"
         )
 
     def numbers(self, context: Context) -> list[str]:
@@ -480,8 +474,8 @@ class MagneticSection(Section, Ability):
             np.sum([source(places)[0] for source in sources], axis=0), axis=1
         )
         return [
-            f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} "
-            "mT"
+            f"field of the sources on the undeformed shell: {sizes.min():.4g} to "
+            f"{sizes.max():.4g} mT"
         ]
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:

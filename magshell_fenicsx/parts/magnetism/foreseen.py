@@ -79,7 +79,8 @@ class Foreseen:
         self._model = None
 
     def at(self, u: Array, D: InteractionHessian, of_D: Array) -> Array | None:
-        """This rank's part of the forces, from those of D at its state; None if nothing is known."""
+        """This rank's part of the forces, from those of D at its state; None if nothing is
+        known."""
         if not (self._points and np.isfinite(u).all()):
             return None
         if D is not self._D or self._begins(u):
@@ -129,7 +130,8 @@ class Foreseen:
         ]
 
     def _made(self) -> tuple["Along", list[tuple[Array, Array]]]:
-        """The polynomial along the path, and orthonormal changes with what is lacking along them."""
+        """The polynomial along the path, and orthonormal changes with what is lacking along
+        them."""
         along, changes = Along.through(self._points), list[tuple[Array, Array]]()
         pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
         for one, other in pairs[:CHANGES]:

@@ -47,9 +47,8 @@ LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
 
 
 TOO_NEAR = (
-    "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, or "
-    "than a seventh of "
-    "the size of their cells: move them apart, or take smaller cells"
+    "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, "
+    "or than a seventh of the size of their cells: move them apart, or take smaller cells"
 )
 
 
@@ -87,8 +86,8 @@ class InteractionTerm:
         if unknowns > LARGEST:
             raise CaseError(
                 f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on "
-                "each other, "
-                f"at most {LARGEST} are allowed: take a coarser mesh or a lower mesh.degree"
+                f"each other, at most {LARGEST} are allowed: take a coarser mesh or a lower "
+                "mesh.degree"
             )
         self._given: tuple[Array, ...] = ()
         self._seen = deque[tuple[Array, float, Array]](maxlen=REMEMBERED)
@@ -123,8 +122,7 @@ class InteractionTerm:
         if not self._itself and self._parts.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between shells that no joint connects, or "
-                "parts of a mesh file, "
-                "and here all is one part: take interaction: all"
+                "parts of a mesh file, and here all is one part: take interaction: all"
             )
         near = False
         try:
@@ -186,7 +184,8 @@ class InteractionTerm:
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`; collective."""
+        """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`;
+        collective."""
         own, of_shape = self_field(self._sight), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         turned = np.concatenate([rates @ image.Q.T for image in self._copies.images])
@@ -231,7 +230,8 @@ class InteractionTerm:
         return own.Br, np.asarray(self._comm.allreduce(found))[part]
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
-        """By the nodes of own cells: a placement moves charges as a displacement does; collective."""
+        """By the nodes of own cells: a placement moves charges as a displacement does;
+        collective."""
         V, count = self._u.function_space, len(self._cells.own_range)
         D, v = self.hessian(), global_values(direction).ravel()
         of_nodes = energy * self._evaluated()[1] + force * (

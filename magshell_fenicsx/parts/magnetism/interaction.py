@@ -74,8 +74,7 @@ class InteractionStep(FactorStep):
     def unstable_alone(self, value: float, course: Course, what: str) -> str:
         return (
             f"the interaction alone makes the shell unstable at {value:.9g} of it ({what}): to go "
-            "on, take it as a "
-            "load, kind: interaction"
+            "on, take it as a load, kind: interaction"
         )
 
 
@@ -112,26 +111,22 @@ def refuse_unfit_interaction(context: Context) -> None:
     if not (context.shell.youngs_modulus and magnetic.remanent and magnetic.remanent.flux_density):
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: how strong it is follows from "
-            "remanent.flux_density and "
-            "shell.youngs_modulus: give both"
+            "remanent.flux_density and shell.youngs_modulus: give both"
         )
     if not context.shell.with_units:
         raise CaseError(
-            f"magnetic.interaction: {magnetic.interaction}: shell.youngs_modulus has no unit: give "
-            "it in pascals, and "
-            "lengths in units"
+            f"magnetic.interaction: {magnetic.interaction}: shell.youngs_modulus has no unit: "
+            "give it in pascals, and lengths in units"
         )
     if magnetic.interaction == "others" and not isinstance(context.shell, MeshSurface):
         raise CaseError(
-            f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file that "
-            "are not connected: "
-            "take geometry: mesh, or interaction: all or none"
+            f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file "
+            "that are not connected: take geometry: mesh, or interaction: all or none"
         )
     if context.whole and AMPLITUDE not in {step.name for step in context.steps}:
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: no step of the programme drives it: "
-            "begin loading with a "
-            "step of kind: interaction, or take interaction: none"
+            "begin loading with a step of kind: interaction, or take interaction: none"
         )
 
 

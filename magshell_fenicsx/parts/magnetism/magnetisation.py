@@ -304,7 +304,8 @@ def _at_places(pattern: Pattern, x: Array) -> Array:
 
 
 def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
-    """What a mirror plane through e3 may hold: the places of sources, or the axes of those on e3."""
+    """What a mirror plane through e3 may hold: the places of sources, or the axes of those on
+    e3."""
     places = [np.array(source.position) / R for source in sources]
     axes = [source.axes[:, 2] for source in sources]
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]

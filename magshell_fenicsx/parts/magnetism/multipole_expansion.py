@@ -188,7 +188,8 @@ class MultipoleExpansion:
         return [list(each) for each in zip(*found, strict=True)]
 
     def _summed(self, values: Array) -> Array:
-        """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of boxes."""
+        """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of
+        boxes."""
         M = np.zeros((len(self._leaf.keys), COUNT, 1))
         M[self._filled, :, 0] = np.add.reduceat(values, self._first, axis=1).T
         return M
@@ -273,7 +274,8 @@ class Cells:
     turn: Array
 
     def of_copies(self, v: Array, sign: float) -> Array:
-        """Changes (3 nodes, n) as those of the nodes of all copies' cells (copies * cells, 3 k, n)."""
+        """Changes (3 nodes, n) as those of the nodes of all copies' cells (copies * cells, 3 k,
+        n)."""
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
         each = [
             sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)

@@ -32,8 +32,7 @@ register(
             name,
             f"induced polarisation along e{number}",
             "Mean over the soft shell of the polarisation μ0 M that the field induces, along "
-            f"e{number}; in T, without "
-            "units over that of λ_m = 1.",
+            f"e{number}; in T, without units over that of λ_m = 1.",
             "load",
         )
         for number, name in enumerate(INDUCED, 1)

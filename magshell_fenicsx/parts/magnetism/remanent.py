@@ -34,19 +34,22 @@ class RemanentSection(FileKeys, Direction):
     ] = "uniform"
     """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
-    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
+    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence
+    is reversed"""
     components: Annotated[
         Annotated[list[Formula], Field(min_length=3, max_length=3)] | UserField | None,
         OrInMemory(UserField),
     ] = None
-    """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
+    """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign,
+    arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
     """Of kind: patches: name -> direction"""
     layers: list[Layer] | None = Field(default=None, min_length=1)
     """Of kind: layers: those through the thickness"""
     file: str | None = None
-    """Of kind: points: CSV with the columns x, y, z, bx, by, bz, or rho, z, b_rho, b_z of a field that turns about e3;
-    undeformed places over R, vectors over |B^r|, the path from the folder of the case"""
+    """Of kind: points: CSV with the columns x, y, z, bx, by, bz, or rho, z, b_rho, b_z of a field
+    that turns about e3; undeformed places over R, vectors over |B^r|, the path from the folder of
+    the case"""
     filter: float | None = Field(default=None, gt=0, le=10)
     """Of kind: points: distance over which the points are averaged [R]"""
 

@@ -108,8 +108,8 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
         for name, each in self.given.items():
             if not name.isidentifier():
                 raise CaseError(
-                    f"sensors: {name}: a name is made of letters, digits and _, as it begins names "
-                    "of columns"
+                    f"sensors: {name}: a name is made of letters, digits and _, as it begins "
+                    "names of columns"
                 )
             refuse_unknown_field(f"sensors.{name}", each.field, context)
             shell = context.shell
@@ -120,8 +120,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
                 x, y, z = each.position
                 raise CaseError(
                     f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half "
-                    "its thickness of the "
-                    "mid-surface: place it outside"
+                    "its thickness of the mid-surface: place it outside"
                 )
 
 
@@ -161,7 +160,8 @@ def is_read(context: Context) -> bool:
 
 
 def depth(shell: "ShellSection | Surface", x: Array) -> float:
-    """How far a place (3,) over R is from the nearest face of an undeformed shell; negative inside."""
+    """How far a place (3,) over R is from the nearest face of an undeformed shell; negative
+    inside."""
     from magshell_fenicsx.shape.outline import outline  # reads meshes
 
     drawn = outline(shell)

@@ -186,7 +186,8 @@ class Sheet:
     def of_body(
         self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
     ) -> Expr:
-        """The same of a body, in units of E h R²: its layers are sheets, with the normal n0 before."""
+        """The same of a body, in units of E h R²: its layers are sheets, with the normal n0
+        before."""
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
         return (
             s**2 * (self.of_field(present, B, across(H, n0)) - self.of_field(at_first, B0, n0)) / h

@@ -47,7 +47,8 @@ class SourceStep(LoadStep):
     move: Lengths | None = None
     """Translation for a factor of one [m]"""
     to: Lengths | None = None
-    """The same by its end: the position for a factor of one, of a source that no other step moves [m]"""
+    """The same by its end: the position for a factor of one, of a source that no other step moves
+    [m]"""
     turn: SpinSection | None = None
     """Rotation for a factor of one"""
     strength: float | None = Field(default=None, ge=-1e6, le=1e6)
@@ -99,8 +100,7 @@ class SourceStep(LoadStep):
             names = [one.name or str(i) for i, one in enumerate(sources)]
             raise ValueError(
                 f"{key}.source: {self.source}: magnetic.applied.sources has no such source; "
-                "allowed: "
-                f"{', '.join(names) or 'none'}"
+                f"allowed: {', '.join(names) or 'none'}"
             )
         if context.whole and FieldSection.amplitude not in context.driven_before(step.number):
             raise ValueError(
@@ -150,8 +150,7 @@ class SourcesSeen(Seen):
             "source",
             "source",
             "Factor of a source's motion or strength; the step may give it another name. With "
-            "units the way of a "
-            "motion has a column too, in mm or degrees.",
+            "units the way of a motion has a column too, in mm or degrees.",
             "load",
             units=(DISTANCE, TURN),
         ),

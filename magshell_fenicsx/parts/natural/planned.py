@@ -71,7 +71,10 @@ def frame(context: Context, turn: float) -> Pattern:
     if direction == MERIDIAN:
         return meridians
     return FormulaVectors(
-        [formula_function(v) for v in direction], rotation(turn), context.shell.reference, vectors=True
+        [formula_function(v) for v in direction],
+        rotation(turn),
+        context.shell.reference,
+        vectors=True,
     )
 
 
@@ -104,7 +107,9 @@ def askew(context: Context, outline: Outline) -> str | None:
     upright = [v == 0 for v in direction] == [True, True, False]
     if uneven(context) and direction != MERIDIAN and not upright:
         return "the natural shape is not along the meridians"
-    if outline.meridian and not all(scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts):
+    if outline.meridian and not all(
+        scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts
+    ):
         return "the natural shape differs around e3"
     return None
 
@@ -131,7 +136,8 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
     d, image = (
-        np.stack([formula_function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x))
+        np.stack([formula_function(v)(*(R * p).T) for v in direction], -1)
+        for p in (x, mirror.image(x))
     )
     return any(
         bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all())
@@ -174,7 +180,9 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
     return [
-        SymmetryConstraint(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))
+        SymmetryConstraint(
+            askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror)
+        )
     ]
 
 

@@ -56,8 +56,8 @@ def _components(
             or not least <= value <= most
         ):
             raise ValueError(
-                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, "
-                "z"
+                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, "
+                "y, z"
             )
         return value
 
@@ -108,16 +108,18 @@ class NaturalSection(Section, Ability):
     """
 
     curvature: Annotated[Values, _components(3, -1e9, 1e9, lengths=True)] = None
-    """In addition to the drawn one, per natural length, positive where the surface bends towards its normal: one number
-    for all directions (a sphere), or k11, k22, k12 in the frame of `along` [1/length]"""
+    """In addition to the drawn one, per natural length, positive where the surface bends towards
+    its normal: one number for all directions (a sphere), or k11, k22, k12 in the frame of `along`
+    [1/length]"""
     stretch: Annotated[Values, _components(2, 0.05, 20)] = None
-    """Natural over drawn length: one number for all directions, the thickness too, or two along t1 and t2 of `along`,
-    with the thickness as drawn"""
+    """Natural over drawn length: one number for all directions, the thickness too, or two along t1
+    and t2 of `along`, with the thickness as drawn"""
     along: (
         Literal["meridian"] | Annotated[list[Component], Field(min_length=3, max_length=3)] | None
     ) = None
-    """t1 of the frame t1, t2 = n x t1: away from the pole on the meridians of e3, or the part in the surface of a
-    vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
+    """t1 of the frame t1, t2 = n x t1: away from the pole on the meridians of e3, or the part in
+    the surface of a vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all
+    else"""
 
     @model_validator(mode="after")
     def _something_grows(self) -> Self:

@@ -87,17 +87,15 @@ class BoundarySection(Section, Ability):
         if not (clamped and blown_up and is_rubber) or context.shell.R_over_h > THIN_RUBBER:
             return None
         return (
-            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
-            "is "
-            "thick, in which no shell theory holds: its fold may come too low, by up to a fourth, "
-            "and "
-            "modes at the edge are none of the shell; hinged is right, and a clamped edge raises "
-            "the "
-            "fold by less than h/R"
+            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as "
+            "it is thick, in which no shell theory holds: its fold may come too low, by up to a "
+            "fourth, and modes at the edge are none of the shell; hinged is right, and a clamped "
+            "edge raises the fold by less than h/R"
         )
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that the names of points are free, and that a geometry has the edges that are named."""
+        """See that the names of points are free, and that a geometry has the edges that are
+        named."""
         refuse_taken(context.points)
         shell = context.shell
         edges = EDGES[shell.geometry] if isinstance(shell, ShellSection) else ()

@@ -29,7 +29,8 @@ class TurnSection(AboutAxis):
     """A rotation about an axis through a point."""
 
     point: Lengths
-    """On the axis, where the shell is undeformed [the shell's length; over R if that has no unit]"""
+    """On the axis, where the shell is undeformed [the shell's length; over R if that has no
+    unit]"""
 
 
 class MoveSection(Section):
@@ -76,12 +77,14 @@ class EdgeSection(PathStep):
     moves: list[MoveSection] = Field(min_length=1, max_length=100)
     """Motions of supports"""
     control: Literal["load", "reaction", "arc"] = "arc"
-    """What is prescribed step by step: the factor, the reaction, or arc length, which passes every fold"""
+    """What is prescribed step by step: the factor, the reaction, or arc length, which passes every
+    fold"""
     until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e9, le=1e9)
     """Target of the factor, 1 by default; with control: load or arc"""
     reaction: Annotated[float, or_number("newton"), Field(ge=-1e30, le=1e30)] | None = None
-    """Target of the reaction; with control: reaction or arc [force; of rotations alone force times length]"""
+    """Target of the reaction; with control: reaction or arc [force; of rotations alone force times
+    length]"""
     points: Count = 10
 
     @model_validator(mode="after")
@@ -127,14 +130,17 @@ class EdgeSection(PathStep):
                 if name not in held:
                     raise ValueError(
                         f"{step.key}.moves.{i}.supports: {name}: only what boundary holds "
-                        "(clamped, hinged or held) "
-                        f"can move: {', '.join(held) or 'nothing'}"
+                        f"(clamped, hinged or held) can move: {', '.join(held) or 'nothing'}"
                     )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         R = context.shell.reference
         return [
-            SymmetryConstraint(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))
+            SymmetryConstraint(
+                sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror)
+            )
         ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
@@ -155,7 +161,9 @@ def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMo
     if about is None:
         return RigidMotion(name, shift, zero, zero)
     axis = np.array(about.axis) / np.linalg.norm(about.axis)
-    return RigidMotion(name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R))
+    return RigidMotion(
+        name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R)
+    )
 
 
 def sideways(load: EdgeSection) -> str | None:
@@ -179,7 +187,8 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
     """Whether a plane maps the motions onto themselves."""
     motions = {name: motion(one, "", R) for one in load.moves for name in one.supports}
     return all(
-        mirror.image_of_edge(name) in motions and _is_image(one, motions[mirror.image_of_edge(name)], mirror)
+        mirror.image_of_edge(name) in motions
+        and _is_image(one, motions[mirror.image_of_edge(name)], mirror)
         for name, one in motions.items()
     )
 

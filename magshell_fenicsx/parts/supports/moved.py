@@ -72,12 +72,17 @@ def rotation_of(loads: Loads, name: str, V: fem.FunctionSpace) -> fem.Constant |
 
 
 def moving(
-    r0: fem.Function, supports: Mapping[str, Support], loads: Loads, pressed: EdgePressure | None = None
+    r0: fem.Function,
+    supports: Mapping[str, Support],
+    loads: Loads,
+    pressed: EdgePressure | None = None,
 ) -> PrescribedMotion | None:
     """The nodes that move; None without motions."""
     moved = {name: motions_of(loads, name) for name in supports}
     bodies = [
-        RigidBody(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]
+        RigidBody(moved[name], s.dofs, s.edge, s.turn)
+        for name, s in supports.items()
+        if moved[name]
     ]
     return PrescribedMotion(r0, bodies, pressed) if bodies else None
 

@@ -139,7 +139,10 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:
     """See that the surface crosses the plane of an end at right angles."""
-    s, near = meridian.parameter(name), PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE
+    s, near = (
+        meridian.parameter(name),
+        PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE,
+    )
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + near]))
     if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))

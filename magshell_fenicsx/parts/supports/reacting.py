@@ -52,8 +52,7 @@ class Moved(Seen):
             "motion",
             "motion",
             "Factor of the motion of supports; the step may give it another name. With units its "
-            "way has a column too: "
-            "all translations together in mm, of rotations alone degrees.",
+            "way has a column too: all translations together in mm, of rotations alone degrees.",
             "load",
             units=(DISTANCE, TURN),
         ),
@@ -61,8 +60,8 @@ class Moved(Seen):
             "reaction",
             "reaction",
             "Reaction of the supports that move, along their motion; of several motions "
-            "reaction_NAME. In the case's "
-            "unit of force (N with units), of rotations alone in that of a moment.",
+            "reaction_NAME. In the case's unit of force (N with units), of rotations alone in "
+            "that of a moment.",
             "reaction",
             units=(REACTION, MOMENT),
             each=True,

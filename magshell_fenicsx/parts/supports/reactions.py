@@ -43,7 +43,11 @@ class Reaction:
 
     def whole(self, mirror: Mirror) -> "Reaction":
         """What a support does that is its own image, the point too."""
-        return Reaction(mirror.sum_over_images(self.force), mirror.sum_over_images(self.moment, -1.0), self.point)
+        return Reaction(
+            mirror.sum_over_images(self.force),
+            mirror.sum_over_images(self.moment, -1.0),
+            self.point,
+        )
 
 
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:

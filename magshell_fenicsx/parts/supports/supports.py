@@ -167,7 +167,10 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
-    if spread[1] <= PLANARITY_TOLERANCE * spread[0] or np.ptp(vertices @ axes[2]) > PLANARITY_TOLERANCE:
+    if (
+        spread[1] <= PLANARITY_TOLERANCE * spread[0]
+        or np.ptp(vertices @ axes[2]) > PLANARITY_TOLERANCE
+    ):
         return
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
     off = (x[dofs] - centre) @ axes[2]
@@ -184,7 +187,9 @@ def closing_point(planes: Sequence[Mirror]) -> Array | None:
         return np.zeros(3)
     normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])
     point = np.linalg.lstsq(normals, offsets, rcond=PLANARITY_TOLERANCE)[0]
-    return np.asarray(point) if np.abs(normals @ point - offsets).max() < PLANARITY_TOLERANCE else None
+    return (
+        np.asarray(point) if np.abs(normals @ point - offsets).max() < PLANARITY_TOLERANCE else None
+    )
 
 
 def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:

@@ -28,7 +28,8 @@ class CoilSection(SourceSection):
     diameter: Size | None = None
     """Of a circle [m]"""
     vertices: Annotated[list[Position], Field(min_length=2, max_length=100_000)] | None = None
-    """Corners of a polygon in its own axes, in place of diameter; the first again at the end closes it [m]"""
+    """Corners of a polygon in its own axes, in place of diameter; the first again at the end closes
+    it [m]"""
     current: Current
     """By the right-hand rule about its own z axis, or along the polygon [A]"""
     turns: int = Field(default=1, ge=1, le=1_000_000)

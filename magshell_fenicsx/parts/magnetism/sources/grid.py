@@ -113,8 +113,7 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
     if not np.isfinite(values).all():
         raise TableError(
             f"is no rectilinear grid of finite numbers: {len(x)} rows with "
-            f"{' x '.join(map(str, shape))} "
-            "different places along the axes"
+            f"{' x '.join(map(str, shape))} different places along the axes"
         )
     return axes, values.reshape(*shape, 3)
 

@@ -107,7 +107,8 @@ class MagnetSection(SourceSection):
     position: Position
     """Of its middle [m]"""
     polarization: Polarization
-    """Along its own z axis, or three components along its own axes: its remanence, μ0 times its magnetisation"""
+    """Along its own z axis, or three components along its own axes: its remanence, μ0 times its
+    magnetisation"""
 
     @property
     def vector(self) -> Array:
@@ -220,8 +221,8 @@ def magpylib(key: str) -> ModuleType:
         import magpylib
     except ImportError:
         raise CaseError(
-            f"{key}: magnets and coils need the package magpylib: python3 -m pip install --no-deps "
-            "magpylib"
+            f"{key}: magnets and coils need the package magpylib: python3 -m pip install "
+            "--no-deps magpylib"
         ) from None
     return magpylib  # type: ignore[no-any-return]
 
