@@ -275,7 +275,7 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
             ends.append((model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu))
-        if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
+        if said := [each for each in model.system.comm.allgather(field.passed_through(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
 
 

@@ -1,5 +1,4 @@
-"""An applied flux density that is known by its values: its Taylor polynomial at the present place
-of each point.
+"""An applied flux density by its Taylor polynomial at the present place of each quadrature point.
 
 The polynomial of second order has the first and second derivatives of the field itself, and so have
 the energies that take it: the forms and kernels are the same for every field. A shell that has
@@ -30,33 +29,37 @@ from magshell_fenicsx.parts.magnetism.moving_source import (
 )
 
 Array = NDArray[np.float64]
-HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the places of a path
+MAX_HALVINGS = 16  # of a segment, whose parts are then shorter than rounding in places of a path
 
 
-def crossing(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
-    """A place (3,) inside a body on the straight ways from some places (n, 3) to others; None if
-    there is none.
+def crossed_place(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
+    """Return a place (3,) inside a body on the segments between places (n, 3); None without one.
 
-    A distance changes by at most the length of a way. So no place of a way is inside if the
-    distances at both ends add up to more than its length; the other ways are halved.
+    A distance changes by at most the length of a segment. So no place of a segment is inside if
+    the distances at both ends add up to more than its length; the other segments are halved.
     """
-    low, high = distance(before), distance(after)
-    for _ in range(HALVINGS):
-        near = low + high <= np.linalg.norm(after - before, axis=1)
-        if not near.any():
+    distance_before, distance_after = distance(before), distance(after)
+    for _ in range(MAX_HALVINGS):
+        may_cross = distance_before + distance_after <= np.linalg.norm(after - before, axis=1)
+        if not may_cross.any():
             return None
-        before, after, low, high = (values[near] for values in (before, after, low, high))
+        before, after, distance_before, distance_after = (
+            values[may_cross] for values in (before, after, distance_before, distance_after)
+        )
         middle = (before + after) / 2
         between = distance(middle)
         if (between < 0).any():
             return np.asarray(middle[between.argmin()])
         before, after = np.concatenate([before, middle]), np.concatenate([middle, after])
-        low, high = np.concatenate([low, between]), np.concatenate([between, high])
+        distance_before, distance_after = (
+            np.concatenate([distance_before, between]),
+            np.concatenate([between, distance_after]),
+        )
     return None
 
 
 class AppliedField:
-    """The polynomials of a field at the quadrature points of a shell, a meridian or a body.
+    """Taylor polynomials of a field at the quadrature points of a shell, a meridian or a solid.
 
     Parameters
     ----------
@@ -77,34 +80,36 @@ class AppliedField:
     Attributes
     ----------
     polynomial
-        The parameter of the densities.
+        The coefficient of the densities.
     mu
         The amplitudes of the driven fields.
     lost
-        Where the field was not finite, since a walk began and emptied this.
+        Where the field was not finite since the path began; empty if it was finite everywhere.
     """
 
     def __init__(
         self,
-        of: FieldInSpace,
+        field_at_rest: FieldInSpace,
         r0: fem.Function,
         u: fem.Function,
         degree: int,
-        driven: Sequence[MovingField] = (),
+        moving_fields: Sequence[MovingField] = (),
     ) -> None:
         V = u.function_space
         self._degree = degree
         self.polynomial = PointField(V.mesh, degree, SIZE)
-        self._of, self._driven, self._u = of, driven, u
-        self.mu = {name: 0.0 for each in driven for name in each.names}
+        self._field_at_rest, self._moving_fields, self._u = field_at_rest, moving_fields, u
+        self.mu = {name: 0.0 for field in moving_fields for name in field.names}
         self.lost = ""
-        self._here: list[FieldAtPlaces] = []
+        self._fields_at_places: list[FieldAtPlaces] = []
         points = self.polynomial.points
         self._r0 = Memo(lambda: at_quadrature(r0, points), lambda: (r0.x.array,))
-        self._moved = Memo(lambda: at_quadrature(u, points), lambda: (u.x.array,))
-        self._still = Memo(lambda: of(self.places), lambda: (r0.x.array, u.x.array))
+        self._displacement = Memo(lambda: at_quadrature(u, points), lambda: (u.x.array,))
+        self._values_at_rest = Memo(
+            lambda: field_at_rest(self.places), lambda: (r0.x.array, u.x.array)
+        )
         places = self._r0.renew()
-        B, G, H = self._sum(of(places.reshape(-1, 3)), places.reshape(-1, 3))
+        B, G, H = self._total_field(field_at_rest(places.reshape(-1, 3)), places.reshape(-1, 3))
         differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
         self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
         refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
@@ -118,36 +123,43 @@ class AppliedField:
         return tuple(self.mu)
 
     def _polynomials(self) -> Array:
-        u, x = self._moved.renew(), self.places
-        B, G, H = self._sum(self._still.renew(), x)
-        bad = ~np.isfinite(B).all(axis=1)
-        self.lost = self._where(x[bad][0]) if bad.any() else self.lost
+        u, x = self._displacement.renew(), self.places
+        B, G, H = self._total_field(self._values_at_rest.renew(), x)
+        is_lost = ~np.isfinite(B).all(axis=1)
+        self.lost = self._lost_description(x[is_lost][0]) if is_lost.any() else self.lost
         second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
-        flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
-        return np.concatenate(flat, axis=-1)
+        columns = [array.reshape(*u.shape[:2], -1) for array in (u, self._B0, B, G, second)]
+        return np.concatenate(columns, axis=-1)
 
-    def slope(self, name: str, other: str = "", *, moved: bool = True) -> PointField:
-        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes.
+    def slope(self, name: str, other: str = "", *, at_present_places: bool = True) -> PointField:
+        """Return the polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, of moving fields.
 
         Parameters
         ----------
-        moved
+        at_present_places
             Whether they are about the present places; else they are changes of the polynomials
             there.
         """
         field = PointField(self._u.function_space.mesh, self._degree, SIZE)
         field.compute_by(
-            lambda: self._slopes(name, other, moved=moved), lambda: (self.polynomial.renew(),)
+            lambda: self._slopes(name, other, at_present_places=at_present_places),
+            lambda: (self.polynomial.renew(),),
         )
         return field
 
-    def _slopes(self, name: str, other: str, *, moved: bool) -> Array:
+    def _slopes(self, name: str, other: str, *, at_present_places: bool) -> Array:
         values = np.zeros_like(self.polynomial.values)
-        values[..., :3] = self.polynomial.values[..., :3] if moved else 0.0
+        values[..., :3] = self.polynomial.values[..., :3] if at_present_places else 0.0
         shape = values.shape[:2]
-        for curve in self._here:
-            if name in curve.driven.names and (not other or other in curve.driven.names):
-                B, G = (curve.twice(name, other), None) if other else curve.by(name)
+        for at_places in self._fields_at_places:
+            if name in at_places.moving_field.names and (
+                not other or other in at_places.moving_field.names
+            ):
+                B, G = (
+                    (at_places.second_derivative(name, other), None)
+                    if other
+                    else at_places.derivative(name)
+                )
                 values[..., 6:9] += B.reshape(*shape, 3)
                 if G is not None:
                     values[..., 9:18] += G.reshape(*shape, 9)
@@ -156,53 +168,64 @@ class AppliedField:
     @property
     def places(self) -> Array:
         """The present places (n, 3) of the quadrature points."""
-        return (self._r0.renew() + self._moved.renew()).reshape(-1, 3)
+        return (self._r0.renew() + self._displacement.renew()).reshape(-1, 3)
 
-    def passed(
+    def passed_through(
         self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]
     ) -> str:
-        """Through what a point has moved between two states, from their places and amplitudes; ""
-        if through none.
+        """Describe the body through which a point has moved between two states; "" without one.
+
+        Each state is given by places (n, 3) and amplitudes.
         """
-        still: list[tuple[FieldInSpace, MovingField]] = [
-            (part, MovingField(part)) for part in getattr(self._of, "parts", [])
+        at_rest: list[tuple[FieldInSpace, MovingField]] = [
+            (part, MovingField(part)) for part in getattr(self._field_at_rest, "parts", [])
         ]
-        for of, driven in [*still, *((each.of, each) for each in self._driven)]:
-            if distance := getattr(of, "distance", None):
-                ways = [
+        for field, moving_field in [
+            *at_rest,
+            *((moving.at_rest, moving) for moving in self._moving_fields),
+        ]:
+            if distance := getattr(field, "distance", None):
+                relative_places = [
                     (x - t) @ Q
                     for x, (Q, t) in (
-                        (x, combined_motion(driven.motions, mu)) for x, mu in (before, after)
+                        (x, combined_motion(moving_field.motions, mu)) for x, mu in (before, after)
                     )
                 ]
-                if crossing(distance, *ways) is not None:
-                    said = getattr(of, "nowhere", "is inside a source")
-                    return f"a point of the shell {said} between two points of the path"
+                if crossed_place(distance, *relative_places) is not None:
+                    description = getattr(field, "nowhere", "is inside a source")
+                    return f"a point of the shell {description} between two points of the path"
         return ""
 
-    def _sum(self, still: tuple[Array, Array, Array], x: Array) -> tuple[Array, Array, Array]:
-        """B, G and H of the field that no amplitude drives and of those that are driven, at
-        places."""
-        self._here = [each.at(x, self.mu) for each in self._driven]
-        parts = [still, *(curve.value for curve in self._here)]
-        B, G, H = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+    def _total_field(
+        self, at_rest: tuple[Array, Array, Array], x: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return B, G and H of the field at rest and the moving ones together, at places x."""
+        self._fields_at_places = [moving.at(x, self.mu) for moving in self._moving_fields]
+        fields = [at_rest, *(at_places.value for at_places in self._fields_at_places)]
+        B, G, H = (np.sum(part, axis=0) for part in zip(*fields, strict=True))
         return B, G, H
 
-    def _where(self, x: Array) -> str:
-        """What a place (3,) without a finite field is."""
-        still = [(part, part(x[None])[0]) for part in getattr(self._of, "parts", [self._of])]
-        for of, B in [*still, *((each.of, each.at(x[None], self.mu).B) for each in self._driven)]:
+    def _lost_description(self, x: Array) -> str:
+        """Describe why the field is not finite at a place (3,)."""
+        at_rest = [
+            (part, part(x[None])[0])
+            for part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
+        ]
+        for field, B in [
+            *at_rest,
+            *((moving.at_rest, moving.at(x[None], self.mu).B) for moving in self._moving_fields),
+        ]:
             if not np.isfinite(B).all():
-                said = getattr(of, "nowhere", "is where magnetic.applied has no finite value")
-                return (
-                    f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
+                description = getattr(
+                    field, "nowhere", "is where magnetic.applied has no finite value"
                 )
+                return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {description}"
         return ""
 
 
 @dataclass(eq=False)
 class Amplitude:
-    """The value of an amplitude in a field, which takes the place of a constant in a form.
+    """The amplitude of a moving field, which takes the place of a constant in a form.
 
     Attributes
     ----------
@@ -211,7 +234,7 @@ class Amplitude:
         is soft is quadratic.
     """
 
-    known: AppliedField
+    applied: AppliedField
     name: str
     terms: Sequence[FormTerm]
     u: fem.Function
@@ -219,38 +242,46 @@ class Amplitude:
 
     @property
     def value(self) -> float:
-        return self.known.mu[self.name]
+        return self.applied.mu[self.name]
 
     @value.setter
     def value(self, value: float) -> None:
-        self.known.mu[self.name] = float(value)
+        self.applied.mu[self.name] = float(value)
 
     def slopes(self) -> list[FormTerm]:
-        """dPi/dmu: of what is linear in the field the energy in dB/dmu."""
-        linear = [self._instead(t, self.known.slope(self.name)) for t in self._linear]
+        """Return dPi/dmu: of energies linear in the field, the energy in dB/dmu."""
+        linear = [self._with_polynomial(t, self.applied.slope(self.name)) for t in self._linear]
         return linear + [
-            self._along(t, self.known.slope(self.name, moved=False)) for t in self._quadratic
+            self._derivative_along(t, self.applied.slope(self.name, at_present_places=False))
+            for t in self._quadratic
         ]
 
     def second_derivatives(self, q: Any) -> Sequence[Derivative]:
-        """d2Pi/dmu dq by a value of a field, a constant of the terms, or what has a method of its
-        own.
-        """
+        """Return d2Pi/dmu dq by another amplitude, a constant, or a `q` with this method."""
         if not isinstance(q, Amplitude):
             if hasattr(q, "second_derivatives"):
                 derivatives: Sequence[Derivative] = q.second_derivatives(self)
                 return derivatives
-            entered = [t for t in self.slopes() if q in t.form.constants()]
-            return [self._term(t, derived(t.form, q)) for t in entered]
-        if q.known is not self.known:
+            terms_with_q = [t for t in self.slopes() if q in t.form.constants()]
+            return [self._term(t, derived(t.form, q)) for t in terms_with_q]
+        if q.applied is not self.applied:
             return []
-        linear = [self._instead(t, self.known.slope(self.name, q.name)) for t in self._linear]
-        both, one, other = (
-            self.known.slope(*names, moved=False)
+        linear = [
+            self._with_polynomial(t, self.applied.slope(self.name, q.name)) for t in self._linear
+        ]
+        by_both_change, by_first, by_second = (
+            self.applied.slope(*names, at_present_places=False)
             for names in ((self.name, q.name), (self.name,), (q.name,))
         )
-        by_both = [self._along(t, both) for t in self._quadratic]
-        return linear + by_both + [self._along(self._along(t, one), other) for t in self._quadratic]
+        by_both = [self._derivative_along(t, by_both_change) for t in self._quadratic]
+        return (
+            linear
+            + by_both
+            + [
+                self._derivative_along(self._derivative_along(t, by_first), by_second)
+                for t in self._quadratic
+            ]
+        )
 
     @property
     def _linear(self) -> list[FormTerm]:
@@ -260,13 +291,13 @@ class Amplitude:
     def _quadratic(self) -> list[FormTerm]:
         return [t for t in self.terms if t.amplitude is None]
 
-    def _instead(self, t: FormTerm, polynomial: PointField) -> FormTerm:
-        """The term with another polynomial in place of the field's own."""
-        return self._term(t, ufl.replace(t.form, {self.known.polynomial: polynomial}))
+    def _with_polynomial(self, t: FormTerm, polynomial: PointField) -> FormTerm:
+        """Return the term with another polynomial in place of the field's."""
+        return self._term(t, ufl.replace(t.form, {self.applied.polynomial: polynomial}))
 
-    def _along(self, t: FormTerm, change: PointField) -> FormTerm:
-        """The derivative of the term along a change of the polynomial."""
-        return self._term(t, ufl.derivative(t.form, self.known.polynomial, change))
+    def _derivative_along(self, t: FormTerm, change: PointField) -> FormTerm:
+        """Return the derivative of the term along a change of the polynomial."""
+        return self._term(t, ufl.derivative(t.form, self.applied.polynomial, change))
 
     def _term(self, t: FormTerm, form: ufl.Form) -> FormTerm:
         return FormTerm(t.name, form, self.u, self.log, t.amplitude)
@@ -275,18 +306,18 @@ class Amplitude:
 def field_parameters(
     fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
 ) -> dict[str, FreeParameter]:
-    """The amplitudes of driven fields, by name; collective."""
+    """Return the amplitudes of moving fields as free parameters, by name; collective."""
     parameters = {}
     for field in fields:
-        own = [
+        terms_of_field = [
             t
             for t in terms
             if isinstance(t, FormTerm) and field.polynomial in t.form.coefficients()
         ]
         for name in field.names:
-            p = Amplitude(field, name, own, u, log)
+            p = Amplitude(field, name, terms_of_field, u, log)
             slopes = p.slopes()
-            for each in slopes:
-                each.compile_residual()
+            for slope in slopes:
+                slope.compile_residual()
             parameters[name] = FreeParameter(p, slopes, p.second_derivatives)
     return parameters

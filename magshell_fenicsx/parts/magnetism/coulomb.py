@@ -290,13 +290,13 @@ class InteractingCharges:
         """
         acts_on_itself = self._singular_pairs is not None
         self._octree = self._octree or Octree(
-            self._places, self._parts, self._groups, own_cells, itself=acts_on_itself
+            self._places, self._parts, self._groups, own_cells, acts_on_itself=acts_on_itself
         )
         places, radii = _balls(nodes)
         grown = np.maximum(
             0, np.ceil(np.log(radii / self._radii) / np.log(RADIUS_RATIO) - 0.5)
         ).astype(np.int64)
-        key = np.column_stack([self._octree.moved(places), grown])
+        key = np.column_stack([self._octree.steps_moved(places), grown])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
             tree = self._octree.tree(
                 key[:, :3], self._radii * RADIUS_RATIO ** key[:, 3] + self._h / 2
@@ -326,7 +326,9 @@ class InteractingCharges:
         """
         (rules, is_stacked), gradient = self.rules(nodes, own_cells), np.zeros_like(nodes)
         multipoles = self.boxes(nodes, own_cells)[0]
-        energy = multipoles.add(multipoles.placed(nodes), bent=stiffness is not None)
+        energy = multipoles.add(
+            multipoles.place_charges(nodes), with_second_derivatives=stiffness is not None
+        )
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own_cells.start
         is_own_pair = (second >= own_cells.start) & (
@@ -373,8 +375,8 @@ class InteractingCharges:
         """Return derivatives of energy and forces by the remanence, at fixed deformed nodes.
 
         What is differentiated is the energy and its rate along `rates`, times `weights`; if
-        `of_shape`, also by the undeformed place and the thickness. The energy is that of `evaluate`,
-        of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
+        `of_shape`, also by the undeformed place and the thickness. The energy is the one of
+        `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
 
         Raises
         ------
@@ -390,7 +392,7 @@ class InteractingCharges:
             self.boxes(nodes, own_cells)[0],
             [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds],
         )
-        by_far_charges = multipoles.by_charges(
+        by_far_charges = multipoles.charge_derivatives(
             nodes, moved_nodes, cells_and_points, weights, heights=of_shape
         )
         for kind, (by_charges, *by_all_heights) in zip(self._kinds, by_far_charges, strict=True):

@@ -1,5 +1,7 @@
-"""Magnetised parts of a shell in each other's field: the term of its energy, and what a room sees
-of it.
+"""Magnetised parts of a shell in each other's field: the term of its energy.
+
+The energy couples all nodes, so the second derivative is dense: near blocks and multipoles
+(`multipole_expansion.InteractionHessian`). Theory: docs/theory.md, parts in each other's field.
 """
 
 from collections import deque
@@ -29,7 +31,7 @@ from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges, PartsTo
 from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, unit
-from magshell_fenicsx.parts.magnetism.multipole_expansion import Cells, InteractionHessian
+from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
 from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
@@ -41,11 +43,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-REMEMBERED = 3  # energies and forces: a point of a path is looked at again after its tangent
-SAME = 1e-7  # over R: places of a node and its image on a mirror plane
-LARGEST = 9000  # unknowns: a matrix of 650 MB where the sum is factored
-
-
+MAX_REMEMBERED_STATES = (
+    3  # energies and forces: a point of a path is looked at again after its tangent
+)
+IMAGE_TOLERANCE = 1e-7  # between a node on a mirror plane and its image, over R
+MAX_UNKNOWNS = 9000  # a matrix of 650 MB where the sum is factored
 TOO_NEAR = (
     "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, "
     "or than a seventh of the size of their cells: move them apart, or take smaller cells"
@@ -53,17 +55,17 @@ TOO_NEAR = (
 
 
 def polar(F: Array) -> Array:
-    """The rotations nearest to matrices (n, 3, 3)."""
+    """Return the rotations (n, 3, 3) nearest to matrices F (n, 3, 3)."""
     U, _, V = np.linalg.svd(F)
-    U[:, :, 2] *= np.linalg.det(U @ V)[
-        :, None
-    ]  # a reflection where an iterate has turned a cell inside out
+    # a determinant of -1 is a reflection, where an iterate has turned a cell inside out
+    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]
     return np.asarray(U @ V)
 
 
 class InteractionTerm:
-    """The energy over E h R² of the parts of a model in each other's and their own field; its
-    amplitude: `interaction`.
+    """Energy over E h R² of the parts of a model in each other's field, and in their own.
+
+    It is multiplied by the amplitude `interaction`.
 
     Raises
     ------
@@ -73,64 +75,69 @@ class InteractionTerm:
 
     group, column = "magnetic", "magnetic"
 
-    def __init__(self, model: "Observed", u: fem.Function, of: Interaction) -> None:
+    def __init__(self, model: "Observed", u: fem.Function, interaction: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE
-        self._itself = of.itself
+        self._acts_on_itself = interaction.itself
         self._model, self._u = model, u
-        self._scale = of.strength / (4 * np.pi * model.material.h)
+        self._scale = interaction.strength / (4 * np.pi * model.material.h)
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
         self._cells = GlobalCells.gather(V)
-        self._even: InteractionTerm | None = None  # of an antisymmetric one the other
+        self._even_term: InteractionTerm | None = None  # of an antisymmetric one the other
         unknowns = 3 * V.dofmap.index_map.size_global
-        if unknowns > LARGEST:
+        if unknowns > MAX_UNKNOWNS:
             raise CaseError(
                 f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on "
-                f"each other, at most {LARGEST} are allowed: take a coarser mesh or a lower "
+                f"each other, at most {MAX_UNKNOWNS} are allowed: take a coarser mesh or a lower "
                 "mesh.degree"
             )
-        self._given: tuple[Array, ...] = ()
-        self._seen = deque[tuple[Array, float, Array]](maxlen=REMEMBERED)
+        self._inputs_of_charges: tuple[Array, ...] = ()
+        self._evaluations = deque[tuple[Array, float, Array]](maxlen=MAX_REMEMBERED_STATES)
         self._blocks, self._turning = BlockProducts(self._comm), Turning(self._comm)
-        self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
-        self._stiff: tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None = (
-            None  # beside its nodes and u
-        )
+        self._extrapolation = Foreseen(self._blocks, self._rotations, alone=self._comm.size == 1)
+        self._latest_hessians: (
+            tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None
+        ) = None  # beside its nodes and u
 
     @property
     def no_number(self) -> str:
-        """What is said where it is not a number."""
+        """Explanation for the user where the energy is not a number."""
         if self._model.touchings:
-            return " (parts are in each other, or too near for the size of their cells: take smaller ones)"
-        return " (parts touch or nearly do, and magnetism does not keep them apart: name them in contact)"
+            return (
+                " (parts are in each other, or too near for the size of their cells: take smaller "
+                "ones)"
+            )
+        return (
+            " (parts touch or nearly do, and magnetism does not keep them apart: name them in "
+            "contact)"
+        )
 
     def antisymmetric(self) -> "InteractionTerm":
-        """The same term for additions to u that are opposite in the images."""
-        other = copy(self)
-        other._even = self
-        return other
+        """Return the same term for additions to u that are opposite in the images."""
+        odd_term = copy(self)
+        odd_term._even_term = self
+        return odd_term
 
     def refuse_near(self) -> None:
-        """See that there are several parts, undeformed as far from each other as their cells can
-        tell; collective.
+        """Refuse a single part, or undeformed parts that are too near each other; collective.
 
         Raises
         ------
         CaseError
-            On every rank, if they are not.
+            On every rank, for such parts.
         """
-        if not self._itself and self._parts.max() == 0:
+        if not self._acts_on_itself and self._part_of_cells.max() == 0:
             raise CaseError(
                 "magnetic.interaction: others: acts between shells that no joint connects, or "
                 "parts of a mesh file, and here all is one part: take interaction: all"
             )
-        near = False
+        is_near = False
         try:
             nodes = self._nodes()  # first: the charges are made of what it gathers
-            self._charged.rules(nodes, self._cells.own_range)
+            self._charges.rules(nodes, self._cells.own_range)
         except PartsTooNear:
-            near = True
-        if self._comm.allreduce(near, MPI.LOR):
+            is_near = True
+        if self._comm.allreduce(is_near, MPI.LOR):
             raise CaseError(TOO_NEAR)
 
     def energy(self) -> float:
@@ -145,20 +152,24 @@ class InteractionTerm:
     def add_extrapolated_residual(self, b: Array, factor: float) -> None:
         """See `assembly.dense_tangent.DenseTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
-        foreseen = (
-            self._foreseen.at(global_values(self._u).ravel(), self._stiff[1][0], self._stiff[2])
-            if self._stiff
+        extrapolated = (
+            self._extrapolation.at(
+                global_values(self._u).ravel(),
+                self._latest_hessians[1][0],
+                self._latest_hessians[2],
+            )
+            if self._latest_hessians
             else None
         )
-        b += factor * (self._evaluated()[1] if foreseen is None else foreseen)
+        b += factor * (self._evaluated()[1] if extrapolated is None else extrapolated)
 
     def extrapolation_holds_along(self, step: Array) -> bool:
         """See `assembly.dense_tangent.DenseTerm`."""
         self._nodes()
-        there, nodes = global_values(self._u), self._u.function_space.dofmap.index_map
-        own = step.reshape(-1, 3)[: nodes.size_local]
-        return self._foreseen.extrapolation_holds_along(
-            there.ravel(), np.concatenate(self._comm.allgather(own)).ravel()
+        displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
+        step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
+        return self._extrapolation.extrapolation_holds_along(
+            displacement.ravel(), np.concatenate(self._comm.allgather(step_of_rank)).ravel()
         )
 
     def compile_tangent(self) -> None:
@@ -169,44 +180,56 @@ class InteractionTerm:
 
     def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
         """See `assembly.dense_tangent.DenseTerm`; collective."""
-        return self._even.both(inexact=inexact)[1] if self._even else self.both(inexact=inexact)[0]
+        return (
+            self._even_term.even_and_odd_hessians(inexact=inexact)[1]
+            if self._even_term
+            else self.even_and_odd_hessians(inexact=inexact)[0]
+        )
 
-    def both(self, *, inexact: bool) -> tuple["InteractionHessian", "InteractionHessian"]:
-        """The second derivative, and that by additions to u that are opposite in the images;
-        collective.
+    def even_and_odd_hessians(
+        self, *, inexact: bool
+    ) -> tuple["InteractionHessian", "InteractionHessian"]:
+        """Return the second derivative by u, and that by odd additions to u; collective.
+
+        Odd additions are opposite in the images.
         """
         nodes = self._nodes()
-        if self._stiff is None or not (inexact or np.array_equal(nodes, self._stiff[0])):
-            self._stiff = None  # two are not kept at once
-            self._stiff = nodes, self._acting_at(nodes), global_values(self._u).ravel()
-        return self._stiff[1]
+        if self._latest_hessians is None or not (
+            inexact or np.array_equal(nodes, self._latest_hessians[0])
+        ):
+            self._latest_hessians = None  # two are not kept at once
+            self._latest_hessians = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
+        return self._latest_hessians[1]
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
         """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`;
         collective."""
-        own, of_shape = self_field(self._sight), name in ("thickness", "r0")
+        field_of_model, of_shape = self_field(self._view), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
-        turned = np.concatenate([rates @ image.Q.T for image in self._copies.images])
+        rates_of_copies = np.concatenate([rates @ image.Q.T for image in self._copies.images])
         weights, own_cells = (
             Weights(self._scale * energy, self._scale * force),
             self._cells.own_range,
         )
         part = slice(own_cells.start, own_cells.stop)
         if of_shape:
-            into = self._charged.field_derivatives(nodes, turned, own_cells, weights, of_shape=True)
+            into = self._charges.field_derivatives(
+                nodes, rates_of_copies, own_cells, weights, of_shape=True
+            )
             by_place, by_thickness = (
-                self._comm.allreduce(by)[part] for by in (into.by_place, into.by_thickness)
+                self._comm.allreduce(derivative)[part]
+                for derivative in (into.by_place, into.by_thickness)
             )
             if name == "thickness":
                 assert self._model.thickness
                 return self._model.thickness, np.asarray(by_thickness[..., None])
             return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
-        if name != own.Br.name:
+        if name != field_of_model.Br.name:
             return None
-        shape, cells, edges = self._all(include_uncharged=True)
-        near = SingularPairs(
+        shape, cells, edges = self._cells_and_charged_edges(include_uncharged=True)
+        singular_pairs = SingularPairs(
             shape,
             self._corners,
             cells,
@@ -216,22 +239,26 @@ class InteractionTerm:
             self._copies,
             include_uncharged=True,
         )
-        charged = InteractingCharges(
+        charges = InteractingCharges(
             shape,
-            self._parts,
+            self._part_of_cells,
             cells,
             edges,
             self._comm,
-            near if self._itself else None,
+            singular_pairs if self._acts_on_itself else None,
             self._copies,
             include_uncharged=True,
         )
-        found = charged.field_derivatives(nodes, turned, own_cells, weights).by_remanence
-        return own.Br, np.asarray(self._comm.allreduce(found))[part]
+        by_remanence = charges.field_derivatives(
+            nodes, rates_of_copies, own_cells, weights
+        ).by_remanence
+        return field_of_model.Br, np.asarray(self._comm.allreduce(by_remanence))[part]
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
-        """By the nodes of own cells: a placement moves charges as a displacement does;
-        collective."""
+        """Return derivatives by the placement of own cells' nodes at fixed charges; collective.
+
+        A placement moves charges as a displacement does.
+        """
         V, count = self._u.function_space, len(self._cells.own_range)
         D, v = self.hessian(), global_values(direction).ravel()
         of_nodes = energy * self._evaluated()[1] + force * (
@@ -241,38 +268,40 @@ class InteractionTerm:
         shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
         return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
 
-    def _acting_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
-        own, images, V = self._cells.own_range, self._copies.images, self._u.function_space
-        count, several = V.dofmap.index_map.size_global, len(images) > 1
+    def _hessians_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
+        own_cells, images, V = self._cells.own_range, self._copies.images, self._u.function_space
+        count, has_images = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
         column_of[len(self._cells.nodes) :] += count  # those of images are apart
         row_of = np.full(column_of.shape, -1)
-        row_of[own.start : own.stop] = V.dofmap.list[: len(own)]
+        row_of[own_cells.start : own_cells.stop] = V.dofmap.list[: len(own_cells)]
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
-        far, near = self._charged.boxes(nodes, own)
-        stored, touching = (
+        far, near_cells = self._charges.boxes(nodes, own_cells)
+        stored, adjacent = (
             np.zeros((local, count), dtype=bool),
             np.zeros((count, count), dtype=bool),
         )
-        for into, row_in, pairs in (
-            (stored, row_of, near),
-            (touching, self._cells.nodes, far.beside(own)),
+        for pattern, row_numbers, pairs in (
+            (stored, row_of, near_cells),
+            (adjacent, self._cells.nodes, far.adjacent_cells(own_cells)),
         ):
-            for cell, row in zip(own, pairs, strict=True):
+            for cell, row in zip(own_cells, pairs, strict=True):
                 columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
-                into[row_in[cell][:, None], columns] = True
+                pattern[row_numbers[cell][:, None], columns] = True
         self._comm.Allreduce(
-            MPI.IN_PLACE, touching, MPI.LOR
+            MPI.IN_PLACE, adjacent, MPI.LOR
         )  # the same blocks on any number of ranks
         stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
         try:
-            self._charged.evaluate(nodes, own, stiffness)
+            self._charges.evaluate(nodes, own_cells, stiffness)
         except PartsTooNear:
             stiffness.blocks[:] = np.nan
         numbers = V.dofmap.index_map.local_to_global(np.arange(local, dtype=np.int32))
-        cells = Cells(self._cells.nodes, own, row_of[own.start : own.stop], numbers, turn)
-        B = far.jacobian(far.placed(nodes))
+        cells = CellNodes(
+            self._cells.nodes, own_cells, row_of[own_cells.start : own_cells.stop], numbers, turn
+        )
+        B = far.jacobian(far.place_charges(nodes))
         even, odd = (
             InteractionHessian(
                 stiffness,
@@ -281,21 +310,21 @@ class InteractionTerm:
                 self._scale,
                 cells,
                 sign,
-                touching[numbers][stored],
+                adjacent[numbers][stored],
                 self._turning,
             )
-            for sign in ([1.0, -1.0] if several else [1.0, 1.0])
+            for sign in ([1.0, -1.0] if has_images else [1.0, 1.0])
         )
         return even, odd
 
     def _evaluated(self) -> tuple[float, Array]:
-        """The energy of this rank's part and its gradient by local nodes; collective."""
+        """Return the energy of this rank's cells and its gradient by local nodes; collective."""
         nodes, V = self._nodes(), self._u.function_space
-        for seen, energy, forces in self._seen:
-            if np.array_equal(nodes, seen):
+        for nodes_before, energy, forces in self._evaluations:
+            if np.array_equal(nodes, nodes_before):
                 return energy, forces
         try:
-            energy, gradient = self._charged.evaluate(nodes, self._cells.own_range)
+            energy, gradient = self._charges.evaluate(nodes, self._cells.own_range)
         except PartsTooNear:  # there is no such equilibrium
             k = self._cells.nodes.shape[1]
             energy, gradient = np.nan, np.full((len(self._cells.own_range), k, 3), np.nan)
@@ -305,35 +334,43 @@ class InteractionTerm:
             V.dofmap.list[: len(self._cells.own_range)],
             self._scale * gradient,
         )
-        self._seen.appendleft((nodes, self._scale * energy, forces))
+        self._evaluations.appendleft((nodes, self._scale * energy, forces))
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
-            self._foreseen.learn(global_values(self._u).ravel(), forces)
+            self._extrapolation.learn(global_values(self._u).ravel(), forces)
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
-        """(copies * cells, k, 3) deformed nodes of all cells; charges are made anew if what makes
-        them changed.
+        """Return the deformed nodes (copies * cells, k, 3) of all cells; collective.
+
+        Charges are computed again if placement, remanence or thickness changed.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
-        own = self_field(self._sight)
-        factor, of_nodes = (
+        field_of_model = self_field(self._view)
+        thickness, of_nodes = (
             self._model.thickness,
-            own.Br.x.array.reshape(-1, 3)[own.Br.function_space.dofmap.list],
+            field_of_model.Br.x.array.reshape(-1, 3)[field_of_model.Br.function_space.dofmap.list],
         )
-        given: tuple[Array, ...] = (r0, self._cells.gather_values(of_nodes))
-        if factor is not None:
-            given += (self._cells.gather_values(factor.x.array[factor.function_space.dofmap.list]),)
-        if len(self._given) != len(given) or not all(map(np.array_equal, given, self._given)):
-            self._given, self._stiff = given, None
-            self._seen.clear()
-            self._foreseen = Foreseen(self._blocks, self._turns, alone=self._comm.size == 1)
-            for name in ("_charged", "_near"):
+        inputs: tuple[Array, ...] = (r0, self._cells.gather_values(of_nodes))
+        if thickness is not None:
+            inputs += (
+                self._cells.gather_values(thickness.x.array[thickness.function_space.dofmap.list]),
+            )
+        if len(self._inputs_of_charges) != len(inputs) or not all(
+            map(np.array_equal, inputs, self._inputs_of_charges)
+        ):
+            self._inputs_of_charges, self._latest_hessians = inputs, None
+            self._evaluations.clear()
+            self._extrapolation = Foreseen(
+                self._blocks, self._rotations, alone=self._comm.size == 1
+            )
+            for name in ("_charges", "_singular_pairs"):
                 self.__dict__.pop(name, None)
         return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
 
-    def _turns(self, u: Array, before: Array) -> Array:
-        """(nodes, 4) quaternions of the rotations of all nodes from one state to another, scalar
-        last.
+    def _rotations(self, u: Array, before: Array) -> Array:
+        """Return the rotations of all nodes from one displacement to another.
+
+        They are quaternions (nodes, 4), scalar last.
         """
         r0, nodes = global_values(self._model.r0), self._cells.nodes
         element = self._u.function_space.element.basix_element
@@ -348,60 +385,66 @@ class InteractionTerm:
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
-    def _charged(self) -> InteractingCharges:
-        shape, cells, edges = self._all()
+    def _charges(self) -> InteractingCharges:
+        shape, cells, edges = self._cells_and_charged_edges()
         return InteractingCharges(
-            shape, self._parts, cells, edges, self._comm, self._near, self._copies
+            shape, self._part_of_cells, cells, edges, self._comm, self._singular_pairs, self._copies
         )
 
     @cached_property
-    def _near(self) -> SingularPairs | None:
-        shape, cells, edges = self._all()
-        if not self._itself:
+    def _singular_pairs(self) -> SingularPairs | None:
+        shape, cells, edges = self._cells_and_charged_edges()
+        if not self._acts_on_itself:
             return None
         return SingularPairs(
             shape, self._corners, cells, edges, self._cells.own_range, self._comm, self._copies
         )
 
-    def _all(self, *, include_uncharged: bool = False) -> tuple[MagnetisedShell, Ints, Ints]:
+    def _cells_and_charged_edges(
+        self, *, include_uncharged: bool = False
+    ) -> tuple[MagnetisedShell, Ints, Ints]:
         """The cells of all ranks, and their edges that are charged, or `may` be by any remanence;
         collective.
         """
-        own = self_field(self._sight)
-        shape, (cells, edges) = own.shape({}), own.chargeable if include_uncharged else own.edges
-        thick = shape.thick and (shape.thick[0], self._given[2])
-        r0, remanence = self._given[0][self._cells.nodes], self._given[1]
-        everywhere = MagnetisedShell(
-            shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thick
+        field_of_model = self_field(self._view)
+        shape, (cells, edges) = (
+            field_of_model.shape({}),
+            field_of_model.chargeable if include_uncharged else field_of_model.edges,
         )
-        own_cells, every = np.asarray(cells) + self._cells.own_range.start, self._comm
-        return everywhere, gather_rows(every, own_cells), gather_rows(every, np.asarray(edges))
+        thickness_factor = shape.thick and (shape.thick[0], self._inputs_of_charges[2])
+        r0, remanence = self._inputs_of_charges[0][self._cells.nodes], self._inputs_of_charges[1]
+        everywhere = MagnetisedShell(
+            shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thickness_factor
+        )
+        own_cells, comm = np.asarray(cells) + self._cells.own_range.start, self._comm
+        return everywhere, gather_rows(comm, own_cells), gather_rows(comm, np.asarray(edges))
 
     @cached_property
     def _copies(self) -> Copies:
-        """What is modelled, and the images that make the whole of a half or a sector."""
+        """The modelled cells, and the images that make the whole of a half or a sector."""
         if self._model.multiplicity == 1:
             return NO_IMAGES
-        own, mirror = self_field(self._sight), self._sight.mirror
+        field_of_model, mirror = self_field(self._view), self._view.mirror
         assert mirror
-        return Copies(tuple(mirror.images), own.sign_of_images({}))
+        return Copies(tuple(mirror.images), field_of_model.sign_of_images({}))
 
     @cached_property
     def _corners(self) -> Ints:
-        """(copies * cells, 3) numbers of corners; on a mirror plane an image has that of its
-        original; collective.
+        """(copies * cells, 3) numbers of corners; collective.
+
+        A corner on a mirror plane and its image have one number.
         """
         r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]
         places = self._copies.nodes_of_all(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
         for later, x in enumerate(places):
             for earlier in range(later):
-                same = np.abs(x - places[earlier]).max(axis=1) < SAME
-                numbers[later][same] = numbers[earlier][same]
+                is_shared = np.abs(x - places[earlier]).max(axis=1) < IMAGE_TOLERANCE
+                numbers[later][is_shared] = numbers[earlier][is_shared]
         return np.concatenate([of_copy[corners] for of_copy in numbers])
 
     @cached_property
-    def _parts(self) -> Ints:
+    def _part_of_cells(self) -> Ints:
         """(copies * cells,) the part of each cell; collective."""
         V, corners = self._u.function_space, self._corners
         if len(self._copies.images) == 1:
@@ -414,6 +457,6 @@ class InteractionTerm:
         return np.asarray(np.unique(part_of_corner[corners[:, 0]], return_inverse=True)[1])
 
     @property
-    def _sight(self) -> Sight:
+    def _view(self) -> Sight:
         mirror = self._model.mirror if self._model.multiplicity > 1 else None  # type: ignore[attr-defined]  # of shells
         return Sight(self._model, 1.0, 1.0, mirror, 0.0, False)

@@ -1,4 +1,4 @@
-"""A field that rigid motions carry and factors multiply, with its derivatives by their amplitudes.
+"""The field of a moving source, with its derivatives by the amplitudes of its motions and factors.
 
 A motion with the velocity w(x) = A x + v carries a field B along: dB/dmu = A B - G w, with the
 gradient G of B. Its own gradient needs the second derivatives H of B. So place and angle of a
@@ -22,11 +22,11 @@ FieldInSpace = Callable[[Array], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True)
 class MovingField:
-    """A field that some amplitudes drive.
+    """A field that amplitudes move and multiply.
 
     Attributes
     ----------
-    of
+    at_rest
         The field where all amplitudes are zero.
     motions
         Translations and rotations, carried out one after the other; none is both.
@@ -34,32 +34,35 @@ class MovingField:
         Amplitude -> change of the factor of the field for an amplitude of one.
     """
 
-    of: FieldInSpace
+    at_rest: FieldInSpace
     motions: Sequence[RigidMotion] = ()
     factors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The amplitudes."""
+        """Names of the amplitudes."""
         return (*(motion.name for motion in self.motions), *self.factors)
 
     def at(self, x: Array, mu: Mapping[str, float]) -> "FieldAtPlaces":
-        """The field at places."""
+        """Return the field at places x (n, 3) over R, for amplitudes mu."""
         Q, t = combined_motion(self.motions, mu)
-        B, G, H = self.of((x - t) @ Q)
-        turned = (
+        B, G, H = self.at_rest((x - t) @ Q)
+        rotated = (
             B @ Q.T,
             np.einsum("ai,bj,nij->nab", Q, Q, G, optimize=True),
             np.einsum("ai,bj,ck,nijk->nabc", Q, Q, Q, H, optimize=True),
         )
-        return FieldAtPlaces(self, x, dict(mu), *turned)
+        return FieldAtPlaces(self, x, dict(mu), *rotated)
 
 
 @dataclass(frozen=True)
 class FieldAtPlaces:
-    """A driven field at some places x, for some amplitudes; B, G and H are without the factors."""
+    """A moving field at places x (n, 3) for amplitudes mu.
 
-    driven: MovingField
+    B (n, 3), gradient G (n, 3, 3) and second derivatives H (n, 3, 3, 3) are without the factors.
+    """
+
+    moving_field: MovingField
     x: Array
     mu: Mapping[str, float]
     B: Array
@@ -68,43 +71,53 @@ class FieldAtPlaces:
 
     @property
     def value(self) -> tuple[Array, Array, Array]:
-        """B and its derivatives."""
+        """B (n, 3) and its first and second derivatives, times the factors."""
         s = self._factor()
         return s * self.B, s * self.G, s * self.H
 
-    def by(self, name: str) -> tuple[Array, Array]:
-        """dB/dmu (n, 3) and its gradient."""
-        if name in self.driven.factors:
+    def derivative(self, name: str) -> tuple[Array, Array]:
+        """Return dB/dmu (n, 3) by the amplitude `name`, and its gradient (n, 3, 3)."""
+        if name in self.moving_field.factors:
             s = self._factor(name)
             return s * self.B, s * self.G
-        C, slope = self._along(name)
+        C, slope = self._motion_rate(name)
         return self._factor() * C, self._factor() * slope
 
-    def twice(self, name: str, other: str) -> Array:
-        """d2B/dmu_i dmu_j (n, 3)."""
-        scaled = [each for each in (name, other) if each in self.driven.factors]
-        moving = [motion.name for motion in self.driven.motions if motion.name in (name, other)]
-        if len(scaled) == 2:
-            return self._factor(*scaled) * self.B
-        if scaled:
-            return self._factor(*scaled) * self._along(moving[0])[0]
-        C, slope = self._along(moving[0])  # the motion that is carried out first, or the only one
-        A, v = self._velocity(moving[-1])
+    def second_derivative(self, name: str, other: str) -> Array:
+        """Return d2B/dmu_i dmu_j (n, 3) by two amplitudes."""
+        factor_names = [
+            amplitude for amplitude in (name, other) if amplitude in self.moving_field.factors
+        ]
+        motion_names = [
+            motion.name for motion in self.moving_field.motions if motion.name in (name, other)
+        ]
+        if len(factor_names) == 2:
+            return self._factor(*factor_names) * self.B
+        if factor_names:
+            return self._factor(*factor_names) * self._motion_rate(motion_names[0])[0]
+        C, slope = self._motion_rate(
+            motion_names[0]
+        )  # the motion that is carried out first, or the only one
+        A, v = self._velocity(motion_names[-1])
         rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, self.x @ A.T + v)
         return self._factor() * rate
 
-    def _factor(self, *by: str) -> float:
-        """The product of all factors, differentiated by some amplitudes."""
-        if len(set(by)) < len(by):
+    def _factor(self, *differentiated_by: str) -> float:
+        """Return the product of all factors, differentiated by some amplitudes."""
+        if len(set(differentiated_by)) < len(differentiated_by):
             return 0.0  # each is linear
-        changes = self.driven.factors.items()
+        changes = self.moving_field.factors.items()
         return float(
             np.prod(
-                [change if name in by else 1 + change * self.mu[name] for name, change in changes]
+                [
+                    change if name in differentiated_by else 1 + change * self.mu[name]
+                    for name, change in changes
+                ]
             )
         )
 
-    def _along(self, name: str) -> tuple[Array, Array]:
+    def _motion_rate(self, name: str) -> tuple[Array, Array]:
+        """Return dB/dmu by a motion, and its gradient, without the factors."""
         A, v = self._velocity(name)
         w = self.x @ A.T + v
         C = self.B @ A.T - np.einsum("nij,nj->ni", self.G, w)
@@ -114,18 +127,18 @@ class FieldAtPlaces:
         return C, slope
 
     def _velocity(self, name: str) -> Velocity:
-        """That of a motion, which later ones carry along."""
-        motions = self.driven.motions
+        """Return A and v of the velocity of a motion, which later motions carry along."""
+        motions = self.moving_field.motions
         number = next(i for i, motion in enumerate(motions) if motion.name == name)
-        own = motions[number]
-        A = np.asarray(np.cross(np.eye(3), own.turn), dtype=np.float64)
-        v = own.shift - A @ own.centre
+        motion = motions[number]
+        A = np.asarray(np.cross(np.eye(3), motion.turn), dtype=np.float64)
+        v = motion.shift - A @ motion.centre
         Q, t = combined_motion(motions[number + 1 :], self.mu)
         A = Q @ A @ Q.T
         return A, np.asarray(Q @ v - A @ t)
 
 
 def combined_motion(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
-    """x -> Q x + t of all motions together."""
+    """Return Q (3, 3) and t (3,) of x -> Q x + t, all motions together."""
     origin, *ends = apply_motions(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)

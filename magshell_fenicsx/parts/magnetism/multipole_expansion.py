@@ -1,5 +1,4 @@
-"""The energy of charges far from each other, by multipoles of boxes of cells (the fast multipole
-method).
+"""The energy of charges far from each other by the fast multipole method.
 
 The moments M of the charges in a box about its middle, which does not move, are polynomials of
 their places, and the energy is a quadratic form of them, E = sum of M_A . G_AB M_B/2 over boxes far
@@ -27,7 +26,7 @@ from magshell_fenicsx.parts.magnetism.turned import Kept, Turning
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in pairs.c
+SECOND_DERIVATIVES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in pairs.c
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Surface:
 
     r: Array
     n: Array
-    up: tuple[Array, Array]
+    dual_basis: tuple[Array, Array]
 
     @classmethod
     def of(cls, nodes: Array, tables: Array) -> "Surface":
@@ -49,7 +48,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class PlacedCharges:
-    """Charges where they are.
+    """Charges at their present places.
 
     Attributes
     ----------
@@ -57,9 +56,9 @@ class PlacedCharges:
         (COUNT, charges) harmonics about the middles of their boxes, over their width; in the order
         of boxes.
     surfaces
-        Of each kind.
+        Mid-surfaces of each kind of elements.
     heights
-        (rows, P, L) over the mid-surface, of each kind.
+        (rows, P, L) heights of the charges over the mid-surface, of each kind.
     """
 
     Y: Array
@@ -79,10 +78,12 @@ class MultipoleExpansion:
     """
 
     def __init__(
-        self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own: range, pairs: Pairs
+        self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own_cells: range, pairs: Pairs
     ) -> None:
         self._tree, self._kinds, self._pairs, self._leaf = tree, kinds, pairs, tree.levels[-1]
-        self._own = [(cells >= own.start) & (cells < own.stop) for cells, _ in kinds]
+        self._own_rows = [
+            (cells >= own_cells.start) & (cells < own_cells.stop) for cells, _ in kinds
+        ]
         box = np.concatenate(
             [self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds]
         )
@@ -92,177 +93,224 @@ class MultipoleExpansion:
         self._q = np.concatenate([points.q.ravel() for _, points in kinds])[self._order]
         self._octants = [list(_octants(level.keys)) for level in tree.levels]
 
-    def placed(self, nodes: Array) -> PlacedCharges:
-        """The charges on cells with nodes (cells, k, 3)."""
+    def place_charges(self, nodes: Array) -> PlacedCharges:
+        """Return the charges on cells with nodes (cells, k, 3)."""
         surfaces = [Surface.of(nodes[cells], points.tables) for cells, points in self._kinds]
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
-        both = zip(surfaces, heights, strict=True)
-        x = [(s.r[:, :, None] + z[..., None] * s.n[:, :, None]).reshape(-1, 3) for s, z in both]
+        points_of_kinds = zip(surfaces, heights, strict=True)
+        x = [
+            (surface.r[:, :, None] + heights_of_kind[..., None] * surface.n[:, :, None]).reshape(
+                -1, 3
+            )
+            for surface, heights_of_kind in points_of_kinds
+        ]
         return PlacedCharges(
             harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width),
             surfaces,
             heights,
         )
 
-    def add(self, at: PlacedCharges, *, bent: bool) -> float:
-        """The energy of own cells, half of each pair's; first and, if `bent`, second derivatives go
-        to points' sums.
+    def add(self, placed: PlacedCharges, *, with_second_derivatives: bool) -> float:
+        """Return the energy of own cells, half of each pair's, and add derivatives to points' sums.
+
+        First derivatives are added, and second ones if `with_second_derivatives`.
         """
-        N, L = derivatives(), self.onto(self._summed(self._q * at.Y))[..., 0]
-        slopes = [*N, *(N[i] @ N[j] for i, j in SECOND)] if bent else N
-        of_box = np.stack([L, *(L @ each for each in slopes)], axis=-1)
-        values = np.empty((len(self._q), of_box.shape[-1]))
-        for box, first, end in zip(
+        N, L = derivatives(), self.local_expansions(self._moments(self._q * placed.Y))[..., 0]
+        matrices = (
+            [*N, *(N[i] @ N[j] for i, j in SECOND_DERIVATIVES)] if with_second_derivatives else N
+        )
+        expansion_of_boxes = np.stack([L, *(L @ weighted for weighted in matrices)], axis=-1)
+        values = np.empty((len(self._q), expansion_of_boxes.shape[-1]))
+        for box, first, last in zip(
             self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
         ):
-            values[self._order[first:end]] = at.Y[:, first:end].T @ of_box[box]
+            values[self._order[first:last]] = placed.Y[:, first:last].T @ expansion_of_boxes[box]
         values *= self._leaf.width ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
         energy, start = 0.0, 0
-        for (_, points), z, own in zip(self._kinds, at.heights, self._own, strict=True):
+        for (_, points), heights, own_rows in zip(
+            self._kinds, placed.heights, self._own_rows, strict=True
+        ):
             stop = start + points.q.size
-            each = points.q[own, ..., None] * values[start:stop].reshape(*points.q.shape, -1)[own]
-            z, start, energy = z[own, ..., None], stop, energy + each[..., 0].sum() / 2
-            f, K = each[..., 1:4], each[..., 4:]
-            parts = [f, z * f, *([K, z * K, z * z * K] if bent else [])]
-            sums = np.concatenate([part.sum(axis=2) for part in parts], axis=-1)
-            points.sums[own, :, : sums.shape[-1]] += sums
+            weighted = (
+                points.q[own_rows, ..., None]
+                * values[start:stop].reshape(*points.q.shape, -1)[own_rows]
+            )
+            heights, start, energy = (
+                heights[own_rows, ..., None],
+                stop,
+                energy + weighted[..., 0].sum() / 2,
+            )
+            f, K = weighted[..., 1:4], weighted[..., 4:]
+            columns = [
+                f,
+                heights * f,
+                *([K, heights * K, heights * heights * K] if with_second_derivatives else []),
+            ]
+            sums = np.concatenate([part.sum(axis=2) for part in columns], axis=-1)
+            points.sums[own_rows, :, : sums.shape[-1]] += sums
         return float(energy)
 
-    def by_charges(
+    def charge_derivatives(
         self,
         nodes: Array,
-        moved: Complex,
+        moved_nodes: Complex,
         kinds: Sequence[tuple[Ints, Points]],
         weights: Weights,
         *,
         heights: bool = False,
     ) -> list[list[Array]]:
-        """Derivatives of the energy of all, and of its rate, by the charges, of own cells: of each
-        kind, like `q`.
+        """Return derivatives of the energy and its rate by the charges of own cells, for each kind.
 
-        Beside each, if asked for, those by the `heights` of the charges over the mid-surface.
+        They are like `q`. With `heights`, derivatives by the heights of the charges over the
+        mid-surface follow.
 
         Parameters
         ----------
-        moved
+        moved_nodes
             (cells, k, 3) the nodes, with rates times `COMPLEX_STEP` as imaginary parts.
         """
-        Y, N, width = self.placed(nodes).Y, derivatives(), self._leaf.width
-        at = [places(points, np.arange(len(points.q)), moved[cells]) for cells, points in kinds]
+        Y, N, width = self.place_charges(nodes).Y, derivatives(), self._leaf.width
+        places_of_kinds = [
+            places(points, np.arange(len(points.q)), moved_nodes[cells]) for cells, points in kinds
+        ]
 
-        def along(v: NDArray[np.floating[Any]], Y: Array) -> Array:
+        def directional_derivatives(v: NDArray[np.floating[Any]], Y: Array) -> Array:
             return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
         rate = (
-            np.concatenate([x.reshape(-1, 3) for _, _, x in at])[self._order].imag
+            np.concatenate([x.reshape(-1, 3) for _, _, x in places_of_kinds])[self._order].imag
             / COMPLEX_STEP
             / width
         )
-        dY = along(rate, Y)
-        L, dL = (self.onto(self._summed(self._q * values))[..., 0] for values in (Y, dY))
-        wanted: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
+        dY = directional_derivatives(rate, Y)
+        L, dL = (
+            self.local_expansions(self._moments(self._q * values))[..., 0] for values in (Y, dY)
+        )
+        factors_and_rates: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
         if heights:
-            normals = [np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3) for _, n, x in at]
+            normals = [
+                np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3)
+                for _, n, x in places_of_kinds
+            ]
             upwards = np.concatenate(normals)[self._order] / width
             n, dn = upwards.real, upwards.imag / COMPLEX_STEP
-            nY = along(n, Y)
-            wanted.append((self._q, nY, np.asarray(along(rate, nY) + along(dn, Y))))
+            nY = directional_derivatives(n, Y)
+            factors_and_rates.append(
+                (
+                    self._q,
+                    nY,
+                    np.asarray(directional_derivatives(rate, nY) + directional_derivatives(dn, Y)),
+                )
+            )
         split = np.cumsum([points.q.size for _, points in kinds])[:-1]
-        found = list[list[Array]]()
-        for factor, values, rates in wanted:
-            by = np.empty(len(self._q))
-            for box, first, end in zip(
+        derivatives_by_kind = list[list[Array]]()
+        for factor, values, rates in factors_and_rates:
+            by_charges = np.empty(len(self._q))
+            for box, first, last in zip(
                 self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
             ):
-                y, dy = values[:, first:end], rates[:, first:end]
-                of = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
-                by[self._order[first:end]] = of / width
-            by[self._order] *= factor
-            each = zip(np.split(by, split), kinds, self._own, strict=True)
-            found.append(
+                y, dy = values[:, first:last], rates[:, first:last]
+                by_moments = weights.energy * (L[box] @ y) + weights.force * (
+                    L[box] @ dy + dL[box] @ y
+                )
+                by_charges[self._order[first:last]] = by_moments / width
+            by_charges[self._order] *= factor
+            split_by_kind = zip(np.split(by_charges, split), kinds, self._own_rows, strict=True)
+            derivatives_by_kind.append(
                 [
-                    part.reshape(points.q.shape) * own[:, None, None]
-                    for part, (_, points), own in each
+                    part.reshape(points.q.shape) * own_rows[:, None, None]
+                    for part, (_, points), own_rows in split_by_kind
                 ]
             )
-        return [list(each) for each in zip(*found, strict=True)]
+        return [list(split_by_kind) for split_by_kind in zip(*derivatives_by_kind, strict=True)]
 
-    def _summed(self, values: Array) -> Array:
-        """Moments (boxes, COUNT, 1) from what charges (COUNT, charges) have, in the order of
-        boxes."""
+    def _moments(self, values: Array) -> Array:
+        """Return moments (boxes, COUNT, 1), sums of values (COUNT, charges) in order of boxes."""
         M = np.zeros((len(self._leaf.keys), COUNT, 1))
         M[self._filled, :, 0] = np.add.reduceat(values, self._first, axis=1).T
         return M
 
-    def onto(self, M: Array) -> Array:
-        """L = G M times the width, of the boxes (boxes, COUNT, n) of the finest level."""
+    def local_expansions(self, M: Array) -> Array:
+        """Return L = G M times the width, for moments M (boxes, COUNT, n) of the finest level."""
         levels, moments = self._tree.levels, [M]
         for k, level in reversed(list(enumerate(levels))[1:]):
-            up = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
+            moments_of_parents = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
             for Z, boxes in self._octants[k]:
-                up[level.parent[boxes]] += _times(Z, moments[0][boxes])
-            moments.insert(0, up)
+                moments_of_parents[level.parent[boxes]] += _matrix_products(Z, moments[0][boxes])
+            moments.insert(0, moments_of_parents)
         L = np.zeros_like(moments[0])
         for k, (level, of_level) in enumerate(zip(levels, moments, strict=True)):
             if k:
-                down = np.empty_like(of_level)
+                expansions = np.empty_like(of_level)
                 for Z, boxes in self._octants[k]:
-                    down[boxes] = _times(Z.T, L[level.parent[boxes]]) / 2  # over half the width
-                L = down
+                    expansions[boxes] = (
+                        _matrix_products(Z.T, L[level.parent[boxes]]) / 2
+                    )  # over half the width
+                L = expansions
             self._pairs.translate(
                 level.one, level.other, level.offset, ends(), self._tree.G, of_level, L
             )
         return L
 
-    def beside(self, own: range) -> NDArray[np.bool_]:
-        """(own, cells) whether two cells are in one box of the finest level, or in boxes that
-        touch.
-        """
-        at = self._leaf.keys[self._leaf.of_cell, 2:]
-        return np.asarray(np.abs(at[own.start : own.stop, None] - at).max(axis=-1) <= 1)
+    def adjacent_cells(self, own_cells: range) -> NDArray[np.bool_]:
+        """Return (own cells, cells) whether two cells share a box or have adjacent boxes."""
+        grid_places = self._leaf.keys[self._leaf.of_cell, 2:]
+        return np.asarray(
+            np.abs(grid_places[own_cells.start : own_cells.stop, None] - grid_places).max(axis=-1)
+            <= 1
+        )
 
-    def between(self, moments: Array) -> tuple[Ints, Array]:
-        """The box of each cell, and G times the sums over boxes of what cells (cells, COUNT, n)
-        have.
+    def local_expansions_of_cells(self, moments: Array) -> tuple[Ints, Array]:
+        """Return the box of each cell, and the local expansions of all boxes.
+
+        `moments` (cells, COUNT, n) are first summed over boxes.
         """
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
         np.add.at(M, self._leaf.of_cell, moments)
-        return self._leaf.of_cell, np.asarray(self.onto(M) / self._leaf.width, dtype=np.float64)
+        return self._leaf.of_cell, np.asarray(
+            self.local_expansions(M) / self._leaf.width, dtype=np.float64
+        )
 
-    def jacobian(self, at: PlacedCharges) -> Array:
-        """(cells, COUNT, 3 k) derivatives of the moments of each cell's box by its nodes."""
+    def jacobian(self, placed: PlacedCharges) -> Array:
+        """Return derivatives (cells, COUNT, 3 k) of the moments of each cell's box by its nodes."""
         N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
         slopes = np.empty((3, len(self._q), COUNT))
         for i in range(3):
-            slopes[i, self._order] = (self._q * (N[i] @ at.Y)).T / self._leaf.width
-        for (cells, points), z, surface in zip(self._kinds, at.heights, at.surfaces, strict=True):
+            slopes[i, self._order] = (self._q * (N[i] @ placed.Y)).T / self._leaf.width
+        for (cells, points), heights, surface in zip(
+            self._kinds, placed.heights, placed.surfaces, strict=True
+        ):
             stop, T = start + points.q.size, points.tables
-            each, start = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT), stop
-            B[cells] += np.einsum("pk,irpa->raki", T[:, 0], each.sum(axis=3), optimize=True)
-            turned = np.einsum("rpl,irpla->irpa", z, each, optimize=True)
+            slopes_of_kind, start = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT), stop
+            B[cells] += np.einsum(
+                "pk,irpa->raki", T[:, 0], slopes_of_kind.sum(axis=3), optimize=True
+            )
+            moments_by_normal = np.einsum("rpl,irpla->irpa", heights, slopes_of_kind, optimize=True)
             for d in range(2):
-                along = np.einsum("rpi,irpa->rpa", surface.up[d], turned, optimize=True)
+                moments_by_tangent = np.einsum(
+                    "rpi,irpa->rpa", surface.dual_basis[d], moments_by_normal, optimize=True
+                )
                 B[cells] -= np.einsum(
-                    "pk,rpi,rpa->raki", T[:, 1 + d], surface.n, along, optimize=True
+                    "pk,rpi,rpa->raki", T[:, 1 + d], surface.n, moments_by_tangent, optimize=True
                 )
         return B.reshape(len(B), COUNT, 3 * k)
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Nodes of cells.
+class CellNodes:
+    """Numbers of the nodes of cells.
 
     Attributes
     ----------
     nodes
-        (cells, k) global numbers, of what is modelled.
+        (modelled cells, k) global numbers of nodes.
     own
         The cells of this rank.
     rows
-        (own cells, k) local numbers.
+        (own cells, k) local numbers of nodes.
     numbers
-        (local nodes,) global ones.
+        (local nodes,) global numbers of nodes.
     turn
         (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
     """
@@ -273,9 +321,11 @@ class Cells:
     numbers: Ints
     turn: Array
 
-    def of_copies(self, v: Array, sign: float) -> Array:
-        """Changes (3 nodes, n) as those of the nodes of all copies' cells (copies * cells, 3 k,
-        n)."""
+    def changes_of_copies(self, v: Array, sign: float) -> Array:
+        """Return changes (copies * cells, 3 k, n) of all copies from those of nodes (3 nodes, n).
+
+        `sign` is -1 for changes that are opposite in the images.
+        """
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
         each = [
             sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)
@@ -284,8 +334,8 @@ class Cells:
             [x[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n) for x in each]
         )
 
-    def summed(self, f: Array) -> Array:
-        """What own cells (own, 3 k, n) add up to (3 local nodes, n)."""
+    def sum_at_nodes(self, f: Array) -> Array:
+        """Sum values of own cells (own cells, 3 k, n) at nodes, (3 local nodes, n)."""
         summed_up = np.zeros((len(self.numbers), 3, f.shape[-1]))
         np.add.at(summed_up, self.rows, f.reshape(*self.rows.shape, 3, -1))
         return summed_up.reshape(3 * len(self.numbers), -1)
@@ -301,7 +351,7 @@ class InteractionHessian:
         See `MultipoleExpansion.jacobian`.
     sign
         -1 of additions to u that are opposite in the images.
-    beside
+    is_adjacent
         Which of the stored blocks are of nodes of cells in boxes that touch.
     """
 
@@ -309,9 +359,9 @@ class InteractionHessian:
     far: MultipoleExpansion
     B: Array
     scale: float
-    cells: Cells
+    cells: CellNodes
     sign: float
-    beside: NDArray[np.bool_]
+    is_adjacent: NDArray[np.bool_]
     turning: Turning
 
     @cached_property
@@ -320,35 +370,42 @@ class InteractionHessian:
         return self.near.matrix(self.sign)
 
     def turned(self, q: Array) -> SinglePrecisionBlocks | None:
-        """The blocks `beside` where nodes are turned by q (nodes, 4); None of several images."""
-        return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept)
+        """Return the blocks `is_adjacent` where nodes are rotated by q (nodes, 4).
+
+        None with several images.
+        """
+        return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept_blocks)
 
     @cached_property
-    def _kept(self) -> Kept:
-        return self.turning.kept(self.near, self.beside)
+    def _kept_blocks(self) -> Kept:
+        return self.turning.kept(self.near, self.is_adjacent)
 
     def times_far(self, v: Array) -> Array:
         """See `assembly.dense_tangent.DenseHessian`."""
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
-        of_cell, onto = self.far.between(_each(self.B, self.cells.of_copies(v, self.sign)))
-        return self.scale * self.cells.summed(
-            _each(self.B[own_cells].transpose(0, 2, 1), onto[of_cell[own_cells]])
+        of_cell, local_expansions = self.far.local_expansions_of_cells(
+            _cellwise_products(self.B, self.cells.changes_of_copies(v, self.sign))
+        )
+        return self.scale * self.cells.sum_at_nodes(
+            _cellwise_products(
+                self.B[own_cells].transpose(0, 2, 1), local_expansions[of_cell[own_cells]]
+            )
         )
 
 
-def _each(B: Array, v: Array) -> Array:
-    """Products of matrices (cells, m, n) with columns (cells, n, columns)."""
+def _cellwise_products(B: Array, v: Array) -> Array:
+    """Return products (cells, m, columns) of matrices B (cells, m, n) and v (cells, n, columns)."""
     return np.asarray(
         np.einsum("cmn,cn->cm", B, v[..., 0])[..., None] if v.shape[-1] == 1 else B @ v
     )
 
 
-def _times(Z: Array, M: Array) -> Array:
+def _matrix_products(Z: Array, M: Array) -> Array:
     return (M[..., 0] @ Z.T)[..., None] if M.shape[-1] == 1 else np.asarray(Z @ M)
 
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
-    """Boxes that are the same of the eight in their parents, and the shift to these."""
+    """Yield the shift to the parent, and the boxes with this place in it, for each of the eight."""
     bits = keys[:, 2:] & 1
     number = bits @ np.array([4, 2, 1])
     for k in map(int, np.unique(number)):

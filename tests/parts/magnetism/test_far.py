@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism import coulomb, tree
 from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
-from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian, Cells
+from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian, CellNodes
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
 from magshell_fenicsx.parts.magnetism.turned import Turning
@@ -73,8 +73,8 @@ def test_far_sum_against_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     monkeypatch.setattr(coulomb, "PRECISION", 1e-8)
     found = []
-    for apart in (tree.APART, 0.0):
-        monkeypatch.setattr(tree, "APART", apart)
+    for apart in (tree.MAX_RADII_OVER_DISTANCE, 0.0):
+        monkeypatch.setattr(tree, "MAX_RADII_OVER_DISTANCE", apart)
         charges, nodes = charged()
         own = range(len(nodes))
         found.append(charges.evaluate(nodes, own))
@@ -103,10 +103,10 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     stiffness = Stiffness(beside, 1.0, numbers, numbers, np.eye(3)[None])
     _, gradient = charges.evaluate(nodes, own, stiffness)
-    cells = Cells(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
+    cells = CellNodes(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
     kept, turning = np.ones(len(stiffness.columns), dtype=bool), Turning(MPI.COMM_SELF)
     acting = InteractionHessian(
-        stiffness, far, far.jacobian(far.placed(nodes)), 1.0, cells, 1.0, kept, turning
+        stiffness, far, far.jacobian(far.place_charges(nodes)), 1.0, cells, 1.0, kept, turning
     )
     product = acting.near_blocks @ v.ravel() + acting.times_far(v.reshape(-1, 1))[:, 0]
     ways = ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))

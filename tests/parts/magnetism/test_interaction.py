@@ -411,7 +411,7 @@ def test_a_step_without_interaction_is_refused(model: Any, tmp_path: Path) -> No
 def test_models_that_are_too_large(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(interacting, "LARGEST", 100)
+    monkeypatch.setattr(interacting, "MAX_UNKNOWNS", 100)
     strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
     with pytest.raises(
         CaseError, match="as all of them act on each other, at most 100 are allowed"
@@ -585,7 +585,7 @@ def test_derivatives_by_the_remanence(model: Any, tmp_path: Path, interaction: s
         term.by_field("Br", v, *weights) for weights in ((1.0, 0.0), (0.0, 1.0))
     )
     change, before = rng.standard_normal(len(Br.x.array)), Br.x.array.copy()
-    own, forces, energies = self_field(term._sight), list[float](), list[float]()
+    own, forces, energies = self_field(term._view), list[float](), list[float]()
     own.edges = own.chargeable  # the change has charges on edges between cells
     for side in (1, -1):
         Br.x.array[:], b = before + side * change, np.zeros(len(u.x.array))
@@ -676,7 +676,7 @@ def test_close_faces_by_remanence(model: Any, tmp_path: Path) -> None:
     strips(tmp_path / "strips.msh", 4.0, 2.0, 0.33, 1.5)
     scene = Scene(case_of(tmp_path / "strips.msh", 0.3, mesh={"degree": 2}))
     (term,) = (each for each in scene.model.system.terms if each.name == "interaction")
-    nodes, own, charged = term._nodes(), term._cells.own_range, term._charged
+    nodes, own, charged = term._nodes(), term._cells.own_range, term._charges
     assert charged.rules(nodes, own)[1].any()
     rates = 0.01 * np.cos(3.0 * np.arange(nodes.size)).reshape(nodes.shape)
     energy, slope = charged.evaluate(nodes, own)

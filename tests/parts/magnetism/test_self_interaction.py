@@ -226,10 +226,10 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
     term._u.x.array[:] = 0.0
-    flat = term.both(inexact=False)[0]
-    turned, times = flat.turned(term._turns(bend.ravel(), 0 * bend.ravel())), term._blocks.times
+    flat = term.even_and_odd_hessians(inexact=False)[0]
+    turned, times = flat.turned(term._rotations(bend.ravel(), 0 * bend.ravel())), term._blocks.times
     stored, rest = flat.near_blocks, flat.near_blocks.copy()
-    rest.data[flat.beside] = 0.0
+    rest.data[flat.is_adjacent] = 0.0
     exact, rounding = (
         stored @ v.ravel(),
         np.finfo(np.float32).eps * (np.abs(stored.toarray()) @ np.abs(v.ravel())),

@@ -20,7 +20,7 @@ from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.parts.magnetism.applied import crossing
+from magshell_fenicsx.parts.magnetism.applied import crossed_place
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
@@ -337,10 +337,10 @@ def test_thin_magnet_in_the_way() -> None:
         case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]).context
     )
     x = np.array([[0.01, 0.02, 0.3], [5.0, 0, 0.3]])
-    found = crossing(plate.distance, x, x - [0, 0, 0.7])
+    found = crossed_place(plate.distance, x, x - [0, 0, 0.7])
     assert found is not None
     assert plate.distance(found[None])[0] < 0
-    assert crossing(plate.distance, x, x - [0, 0, 0.29]) is None
+    assert crossed_place(plate.distance, x, x - [0, 0, 0.29]) is None
     steps = [
         {"kind": "field", "points": 1},
         {"kind": "source", "move": [0, 0, "60 mm"], "points": 1},
