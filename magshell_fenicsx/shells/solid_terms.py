@@ -160,7 +160,7 @@ class TermFactory:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
         law, n0, *given = self._of_sheet(sheet, soft, applied)
-        density = Density(sheet.of_body, (law, scale, n0, h, *given), VALUE + GRADIENT)
+        density = Density(sheet.energy_in_solid, (law, scale, n0, h, *given), VALUE + GRADIENT)
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
@@ -173,7 +173,7 @@ class TermFactory:
         law, n0, *given = self._of_sheet(sheet, field.soft, applied)
         densities = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            densities[axis] = Density(sheet.induced_in_body, (law, *self._constants(e), n0, *given))
+            densities[axis] = Density(sheet.induced_in_solid, (law, *self._constants(e), n0, *given))
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
     def _of_sheet(

@@ -218,7 +218,7 @@ class EnergyFactory:
         sheet, scale = Sheet(field), self._constant(soft.scale)
         law, *given = self._of_sheet(sheet, soft, applied)
         parts = FIRST if field.uniform else MOVED
-        density = Density(per_area(sheet.of_surface), (law, scale, *given), parts=parts)
+        density = Density(per_area(sheet.energy_per_area), (law, scale, *given), parts=parts)
         return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:

@@ -219,7 +219,8 @@ class AppliedField:
                 description = getattr(
                     field, "nowhere", "is where magnetic.applied has no finite value"
                 )
-                return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {description}"
+                place = f"({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g})"
+                return f"the shell\'s point (x, y, z)/R = {place} {description}"
         return ""
 
 

@@ -19,8 +19,9 @@ FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
 def directions(
     programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float
 ) -> Array:
-    """Unit vectors (steps + 1, 3) of the field before each step and after the last, in a turned
-    frame.
+    """Return unit vectors (steps + 1, 3) of the field before each step and after the last.
+
+    They are in a frame turned by `turn` about e3 (rad).
     """
     vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
@@ -31,19 +32,20 @@ def directions(
 
 
 def components(direction: Array, field: Magnetisation | None) -> Array:
-    """A direction by the amplitudes of `FIELD`; a field in space has one amplitude in each
-    direction.
+    """Return a direction's components for the amplitudes of `FIELD`.
+
+    A field in space has one amplitude for all directions.
     """
     return np.ones(1) if field is None or field.in_space else np.array(field.axes) @ direction
 
 
 def field_at(mu: Mapping[str, float]) -> Array:
-    """The components of the field, from all amplitudes."""
+    """Return the components of the field, from all amplitudes."""
     return np.array([mu[name] for name in FIELD if name in mu])
 
 
 def straight(direction: Array) -> dict[str, Curve]:
-    """The components of a field t along a direction."""
+    """Return curves of the components of a field of strength t along a direction."""
 
     def curve(c: float) -> Curve:
         return lambda t: (c * t, c, 0.0)
@@ -51,10 +53,10 @@ def straight(direction: Array) -> dict[str, Curve]:
     return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
 
 
-def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
-    """The components of a field that has turned by t (rad) from one direction towards another."""
-    rest = after - (before @ after) * before
-    away = rest / np.linalg.norm(rest)
+def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
+    """Return curves of the components of a field turned by t (rad) from `start` towards `end`."""
+    normal_part = end - (start @ end) * start
+    towards = normal_part / np.linalg.norm(normal_part)
 
     def curve(b: float, a: float) -> Curve:
         return lambda t: (
@@ -63,35 +65,34 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
             -b * cos(t) - a * sin(t),
         )
 
-    parts = zip(FIELD, size * before, size * away, strict=False)
+    parts = zip(FIELD, size * start, size * towards, strict=False)
     return {name: curve(float(b), float(a)) for name, b, a in parts}
 
 
 def as_a_whole(name: str, total: float) -> dict[str, Curve]:
-    """The amplitude of the rotation of a field in space, which is 1 at the angle `total` (rad)."""
+    """Return the curve of the rotation of a field in space: amplitude 1 at angle `total` (rad)."""
     return {name: lambda t: (t / total, 1 / total, 0.0)}
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:
-    """The magnitude of the field with the sign of the case's field, or with its own where it has
-    not turned.
-    """
-    first, across, third = (mu.get(name, 0.0) for name in FIELD)
-    return copysign(hypot(first, across, third), sense) if across or third else first
+    """Return the magnitude of the field with the sign `sense`, or its own if it has not turned."""
+    first, second, third = (mu.get(name, 0.0) for name in FIELD)
+    return copysign(hypot(first, second, third), sense) if second or third else first
 
 
 def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: float = 1.0) -> float:
-    """The angle between the field and its first direction (degrees); `sense` is the sign of the
-    case's field.
+    """Return the angle between the field and its first direction (degrees).
+
+    `sense` is the sign of the case's field.
     """
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
-        now = combined_motion(field.turns, mu)[0] @ first
-        normal = np.cross(first, now)
-        planar = all(np.abs(np.cross(axis, one.turn)).max() < 1e-9 for one in field.turns)
-        across = float(normal @ axis) if planar else float(np.linalg.norm(normal))
-        return degrees(atan2(across, float(first @ now)))
-    along, across, third = (mu.get(name, 0.0) for name in FIELD)
-    if not (across or third):
+        direction = combined_motion(field.turns, mu)[0] @ first
+        normal = np.cross(first, direction)
+        planar = all(np.abs(np.cross(axis, motion.turn)).max() < 1e-9 for motion in field.turns)
+        second = float(normal @ axis) if planar else float(np.linalg.norm(normal))
+        return degrees(atan2(second, float(first @ direction)))
+    along, second, third = (mu.get(name, 0.0) for name in FIELD)
+    if not (second or third):
         return 0.0
-    return degrees(atan2(hypot(across, third) if third else sense * across, sense * along))
+    return degrees(atan2(hypot(second, third) if third else sense * second, sense * along))

@@ -1,4 +1,4 @@
-"""What is magnetised, and by which field."""
+"""The magnetisation of a model, and the applied field, in the model's frame."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ PLACES = 50  # on each rank, where a field and its images are compared
 
 @dataclass(frozen=True)
 class Magnetisation:
-    """What is magnetised and how it is modelled.
+    """Remanence, susceptibility and applied field of a model, with the law of their energy.
 
     Attributes
     ----------
@@ -55,9 +55,9 @@ class Magnetisation:
     law
         Whether the remanence moves with F, as in the paper, or with its rotation R.
     soft
-        What is soft; None without. Alone, it leaves `remanent` zero.
+        The soft-magnetic material; None without one. Alone, it leaves `remanent` zero.
     tesla
-        What a remanence of length one is, in T; 1 if the case has no flux densities.
+        The flux density of a remanence of length one in T; 1 if the case has no flux densities.
     metres
         R in m; 0 if the case has no lengths with units, or no flux densities.
     absent
@@ -85,12 +85,13 @@ class Magnetisation:
 
     @property
     def uniform(self) -> bool:
-        """Whether the applied flux density is."""
+        """Whether the applied flux density is uniform."""
         return self.gradient is None and self.in_space is None
 
     def at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The applied flux density (..., 3) at points r (..., 3), so that of a uniform one lambda_m
-        is the size.
+        """Return the applied flux density (..., 3) at deformed places r (..., 3).
+
+        A uniform one has the magnitude lambda_m.
         """
         along = mu.get("lambda_m", 0.0)
         if self.in_space and not along:
@@ -109,9 +110,7 @@ class Magnetisation:
         return np.asarray(uniform + along * r @ self.gradient.T)
 
     def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
-        """1 if the mirror images of the applied field continue it, -1 if their opposites do;
-        collective.
-        """
+        """Return 1 if mirror images continue the applied field, -1 if opposites do; collective."""
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
         images = self.at(mu, mirror.image(x)) @ mirror.reflection
@@ -120,8 +119,9 @@ class Magnetisation:
         )
 
     def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
-        """With patterns in place of what is given by named patches of a mesh with so many cells on
-        this rank.
+        """Return the magnetisation with patterns in place of values of named patches.
+
+        `patches` has the cells of each patch, of `cells` on this rank.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class Magnetisation:
             If there is no such patch.
         """
         remanent = by_patch(self.patches, patches, cells) if self.patches else self.remanent
-        soft = self.soft and self.soft.on(
+        soft = self.soft and self.soft.with_patches(
             lambda of: by_patch(of, patches, cells, "magnetic.susceptibility")
         )
         return replace(self, remanent=remanent, soft=soft)

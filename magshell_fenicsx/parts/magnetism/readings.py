@@ -1,5 +1,4 @@
-"""What is observed of a magnetised shell: what sensors read, and what a field induces in a soft
-one.
+"""Observables of a magnetised shell: sensors, induced polarisation, the field and the moment.
 
 The solver takes long to import, and a case that is only checked needs no more than the names: its
 imports are late.
@@ -41,9 +40,7 @@ register(
 
 
 class FieldSeen(Seen):
-    """How strong the field is and how far it has turned, columns of every run; and the moment of
-    what is magnetised.
-    """
+    """Strength and angle of the field, columns of every run, and the magnetic moment."""
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return ()
@@ -60,23 +57,25 @@ class FieldSeen(Seen):
     def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
 
-        of = magnetisation_of(sight.loads)
-        if of is None or of.absent:
+        magnetisation = magnetisation_of(sight.loads)
+        if magnetisation is None or magnetisation.absent:
             return {}
-        at = sight.model.system.at_state(state)
-        moment = at.evaluate(lambda: magnetic_moment(sight, state.mu)) @ rotation(sight.azimuth)
-        size = of.tesla * of.metres**3 / MU_0 if of.metres else 1.0
-        unit = "√(E/μ0) R³" if of.soft and of.soft.alone else "|Br| R³/μ0"
+        at_state = sight.model.system.at_state(state)
+        moment = at_state.evaluate(lambda: magnetic_moment(sight, state.mu)) @ rotation(
+            sight.azimuth
+        )
+        size = magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
+        unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
         return {
             "magnetic_moment": {
                 "value": (size * moment).tolist(),
-                "unit": "A m²" if of.metres else unit,
+                "unit": "A m²" if magnetisation.metres else unit,
             }
         }
 
 
 class SoftSeen(Seen):
-    """The mean polarisation that the field induces."""
+    """Mean polarisation that the field induces."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         from magshell_fenicsx.models.shell.patterns import by_patch
@@ -92,10 +91,10 @@ class SoftSeen(Seen):
         field = sight.loads.magnetic
         if field is None or field.soft is None:
             return {}
-        at, forms = sight.model.system.at_state(state), sight.model.observed
-        J = np.array([at.integral(forms[f"induced {axis}"]) for axis in "xyz"]) / at.integral(
-            forms["induced volume"]
-        )
+        at_state, forms = sight.model.system.at_state(state), sight.model.observed
+        J = np.array(
+            [at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"]
+        ) / at_state.integral(forms["induced volume"])
         if 1 not in sight.model.axes:  # of a meridian, with which they turn
             J[:2] = 0.0
         if sight.mirror:
@@ -107,7 +106,7 @@ class SoftSeen(Seen):
 
 
 class SensorsSeen(Seen):
-    """What sensors read."""
+    """Readings of sensors."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         from scipy.spatial import cKDTree
@@ -115,12 +114,12 @@ class SensorsSeen(Seen):
         if not loads.sensors or surface.nodes.shape[1] < 3:  # of a chart `sensors.depth` knows
             return
         corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
-        spread = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
-        near = cKDTree(np.einsum("mk,nki->nmi", spread, corners).reshape(-1, 3))
-        for each in loads.sensors:
-            if near.query(each.place)[0] < each.half:
+        barycentric = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
+        surface_points = cKDTree(np.einsum("mk,nki->nmi", barycentric, corners).reshape(-1, 3))
+        for sensor in loads.sensors:
+            if surface_points.query(sensor.place)[0] < sensor.half:
                 raise CaseError(
-                    f"sensors.{each.name}.position: is in the shell, within half its thickness of "
+                    f"sensors.{sensor.name}.position: is in the shell, within half its thickness of "
                     "it: place it outside"
                 )
 
@@ -147,54 +146,73 @@ class SensorsSeen(Seen):
         )
 
         matching = [
-            (each, i)
-            for each in sight.loads.sensors
-            for i, name in enumerate(each.columns)
+            (sensor_of_columns, i)
+            for sensor_of_columns in sight.loads.sensors
+            for i, name in enumerate(sensor_of_columns.columns)
             if name == column
         ]
         if not matching:
             return None
-        (sensor, i), own = matching[0], self_field(sight)
+        (sensor, i), self_field_of_model = matching[0], self_field(sight)
         e = sensor.own * rotation(sight.azimuth)[:, i]
         system = sight.model.system
-        at, nodes = system.at_state(state), sight.model.r0.function_space.dofmap.list
+        at_state, nodes = system.at_state(state), sight.model.r0.function_space.dofmap.list
 
-        def derived() -> tuple[Array, Array]:
-            into, part = own.derivatives(state.mu, sensor.place, e), np.zeros_like(system.u.x.array)
-            size = into.by_u.shape[2]
-            np.add.at(part.reshape(-1, size), nodes[: len(into.by_u)], into.by_u)
-            return part, into.by_remanence
+        def nodal_derivatives() -> tuple[Array, Array]:
+            derivatives, by_u = (
+                self_field_of_model.derivatives(state.mu, sensor.place, e),
+                np.zeros_like(system.u.x.array),
+            )
+            size = derivatives.by_u.shape[2]
+            np.add.at(by_u.reshape(-1, size), nodes[: len(derivatives.by_u)], derivatives.by_u)
+            return by_u, derivatives.by_remanence
 
-        part, by_remanence = at.evaluate(derived)
+        by_u, by_remanence = at_state.evaluate(nodal_derivatives)
         by_mu = dict[str, float]()
         applied = sight.loads.magnetic
         if applied and (sensor.total or applied.soft):
-            names = {"lambda_m", *ACROSS, *(name for each in applied.driven for name in each.names)}
+            names = {
+                "lambda_m",
+                *ACROSS,
+                *(name for sensor_of_columns in applied.driven for name in sensor_of_columns.names),
+            }
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
                 size = DIFFERENCE_STEP * (abs(value) or 1.0)
-                moved = (
-                    (way, State(state.u, {**state.mu, name: value + way * size}))
-                    for way, _ in DIFFERENCE_WEIGHTS
+                moved_states = (
+                    (steps, State(state.u, {**state.mu, name: value + steps * size}))
+                    for steps, _ in DIFFERENCE_WEIGHTS
                 )
                 values = {
-                    way: self._readings(sight, moved_state, [sensor])[0][i]
-                    for way, moved_state in moved
+                    steps: self._readings(sight, moved_state, [sensor])[0][i]
+                    for steps, moved_state in moved_states
                 }
-                by_mu[name] = float(sum(w / size * values[way] for way, w in DIFFERENCE_WEIGHTS))
+                by_mu[name] = float(
+                    sum(w / size * values[steps] for steps, w in DIFFERENCE_WEIGHTS)
+                )
         value = float(self._readings(sight, state, [sensor])[0][i])
-        return Slope(value, at.summed(part), by_mu, own.Br, by_remanence)
+        return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
 
-    def _readings(self, sight: Sight, state: "State", of: Sequence[Sensor]) -> Array:
-        """(n, 3) of each, in the case's frame."""
-        places, total = np.array([each.place for each in of]), np.array([each.total for each in of])
-        own, applied = (
-            np.array([getattr(each, name) for each in of])[:, None] for name in ("own", "applied")
+    def _readings(self, sight: Sight, state: "State", sensors: Sequence[Sensor]) -> Array:
+        """Return the readings (sensors, 3) in the frame of the case."""
+        places, reads_total = (
+            np.array([sensor.place for sensor in sensors]),
+            np.array([sensor.total for sensor in sensors]),
         )
-        return field_at(sight, state, places, own, np.where(total[:, None], applied, 0.0))
+        own_units, applied_units = (
+            np.array([getattr(sensor, name) for sensor in sensors])[:, None]
+            for name in ("own", "applied")
+        )
+        return field_at(
+            sight, state, places, own_units, np.where(reads_total[:, None], applied_units, 0.0)
+        )
 
 
 def field_at(
-    sight: Sight, state: "State", places: Array, own: Array | float, applied: Array | float
+    sight: Sight,
+    state: "State",
+    places: Array,
+    own_factor: Array | float,
+    applied_factor: Array | float,
 ) -> Array:
     """The field (n, 3) at places (n, 3) over R of the model's frame, in the frame of the case;
     collective.
@@ -203,19 +221,22 @@ def field_at(
 
     Parameters
     ----------
-    own, applied
+    own_factor, applied_factor
         What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n,
         1), or of all.
     """
     from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 
-    def present() -> Array:
+    def own_field_there() -> Array:
         if magnetisation_of(sight.loads) is None:
             return np.zeros_like(places)
-        shell = self_field(sight)
-        return own * shell.B(shell.families(state.mu)[1], state.mu, places)
+        field_of_model = self_field(sight)
+        return own_factor * field_of_model.B(field_of_model.families(state.mu)[1], state.mu, places)
 
-    B, outside = sight.model.system.at_state(state).evaluate(present), sight.loads.magnetic
-    if outside and np.any(applied):
-        B = B + applied * outside.at(state.mu, places)
+    B, applied_field = (
+        sight.model.system.at_state(state).evaluate(own_field_there),
+        sight.loads.magnetic,
+    )
+    if applied_field and np.any(applied_factor):
+        B = B + applied_factor * applied_field.at(state.mu, places)
     return np.asarray(B @ rotation(sight.azimuth))

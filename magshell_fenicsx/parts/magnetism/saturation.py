@@ -1,5 +1,4 @@
-"""Langevin's law in a thin sheet: its energy in a field, known with three derivatives at the points
-of a model.
+"""Langevin's law in a thin sheet: its energy in a field, with three derivatives at points.
 
 Along b = mu0 H the material has mu0 M = J L(3 chi b/J), L(x) = coth x - 1/x, that is chi k b with k
 = 3 L(x)/x, and the coenergy w = chi b² W/2 with W = 6 ln (sinh x/x)/x²; both are functions of y =
@@ -29,64 +28,69 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.memo import PointField, at_quadrature
 
 Array = NDArray[np.float64]
-ORDERS = [
-    (i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]
-]  # of derivatives by p and s
+# orders of derivatives by p and s
+ORDERS = [(i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]]
 SIZE = 2 + len(ORDERS)  # numbers of a polynomial: p and s, then its coefficients
-NEAR = 1.0  # y below which a series is summed; its terms are those of y/pi²
-TERMS = 18
-STEPS = 100  # of Newton's method at most, some six in practice
+SERIES_LIMIT = 1.0  # y below which a series is summed; its terms are those of y/pi²
+SERIES_TERMS = 18
+MAX_NEWTON_STEPS = 100  # of Newton's method at most, some six in practice
 
 
 def _series() -> Array:
-    """The coefficients of k, from its equation."""
+    """Return the coefficients of k(y), from its differential equation."""
     a = [1.0]
-    for n in range(1, TERMS):
+    for n in range(1, SERIES_TERMS):
         a.append(-sum(a[i] * a[n - 1 - i] for i in range(n)) / (3 * (2 * n + 3)))
     return np.array(a)
 
 
 RATIO = np.polynomial.Polynomial(_series())
-COENERGY = np.polynomial.Polynomial(_series() / np.arange(1, TERMS + 1))
+COENERGY = np.polynomial.Polynomial(_series() / np.arange(1, SERIES_TERMS + 1))
 
 
 def ratio(y: Array) -> Array:
-    """k of y."""
-    far = np.maximum(y, NEAR)
-    x = np.sqrt(far)
+    """Return k(y)."""
+    y_above = np.maximum(y, SERIES_LIMIT)
+    x = np.sqrt(y_above)
     return np.asarray(
-        np.where(y < NEAR, RATIO(np.minimum(y, NEAR)), 3 * (x / np.tanh(x) - 1) / far)
+        np.where(
+            y < SERIES_LIMIT, RATIO(np.minimum(y, SERIES_LIMIT)), 3 * (x / np.tanh(x) - 1) / y_above
+        )
     )
 
 
 def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
-    """k' and k'' of y."""
-    near, far, close = np.minimum(y, NEAR), np.maximum(y, NEAR), y < NEAR
-    x = np.sqrt(far)
+    """Return k'(y) and k''(y)."""
+    y_below, y_above, is_below = (
+        np.minimum(y, SERIES_LIMIT),
+        np.maximum(y, SERIES_LIMIT),
+        y < SERIES_LIMIT,
+    )
+    x = np.sqrt(y_above)
     c, inverse = 1 / np.tanh(x), 4 * np.exp(-2 * x) / np.expm1(-2 * x) ** 2  # coth x and 1/sinh² x
-    first = (1.5 * (c / x - inverse) - k) / far
-    second = (0.75 * (2 * c * inverse - inverse / x - c / far) / x - 2 * first) / far
-    return np.where(close, RATIO.deriv()(near), first), np.where(
-        close, RATIO.deriv(2)(near), second
+    first = (1.5 * (c / x - inverse) - k) / y_above
+    second = (0.75 * (2 * c * inverse - inverse / x - c / y_above) / x - 2 * first) / y_above
+    return np.where(is_below, RATIO.deriv()(y_below), first), np.where(
+        is_below, RATIO.deriv(2)(y_below), second
     )
 
 
 def coenergy(y: Array) -> Array:
-    """W of y."""
-    far = np.maximum(y, NEAR)
-    x = np.sqrt(far)
+    """Return W(y)."""
+    y_above = np.maximum(y, SERIES_LIMIT)
+    x = np.sqrt(y_above)
     log = x + np.log(-np.expm1(-2 * x) / (2 * x))
-    return np.asarray(np.where(y < NEAR, COENERGY(np.minimum(y, NEAR)), 6 * log / far))
+    return np.asarray(
+        np.where(y < SERIES_LIMIT, COENERGY(np.minimum(y, SERIES_LIMIT)), 6 * log / y_above)
+    )
 
 
-def across(chi: Array, p: Array, s: Array, J: float) -> Array:
-    """|b_n|: Newton's method from below, where the function is concave, and between the bounds that
-    it has.
-    """
+def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
+    """Return |b_n| by Newton's method from below, where the function is concave, within bounds."""
     scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
     lowest = normal / (1 + chi)
     b = lowest
-    for _ in range(STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         y = scale * (s + b**2)
         k = ratio(y)
         change = (normal - b * (1 + chi * k)) / (
@@ -99,17 +103,18 @@ def across(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 
 def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) -> Array:
-    """mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1), of the normals
-    n.
+    """Return mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1).
+
+    `n` (..., 3) are the normals, `J` is the saturation.
     """
     s = np.sum(along * along, axis=-1, keepdims=True)
-    kappa = chi * ratio((3 * chi / J) ** 2 * (s + across(chi, normal**2, s, J) ** 2))
+    kappa = chi * ratio((3 * chi / J) ** 2 * (s + normal_field(chi, normal**2, s, J) ** 2))
     return np.asarray(kappa * (along + normal / (1 + kappa) * n))
 
 
-def expanded(chi: Array, p: Array, s: Array, J: float) -> Array:
-    """p, s and the coefficients of the polynomial (..., SIZE); see `energy`."""
-    b, scale = across(chi, p, s, J), (3 * chi / J) ** 2
+def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
+    """Return p, s and the coefficients of the energy's polynomial (..., SIZE); see `energy`."""
+    b, scale = normal_field(chi, p, s, J), (3 * chi / J) ** 2
     y = scale * (s + b**2)
     k = ratio(y)
     k1, k2 = slopes_of_ratio(y, k)
@@ -138,13 +143,13 @@ def expanded(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 
 def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
-    """e from the polynomial P (`SIZE`,)."""
+    """Return e(p, s) from the polynomial P (`SIZE`,)."""
     dp, ds = p - P[0], s - P[1]
     return sum(P[2 + number] * dp**i * ds**j for number, (i, j) in enumerate(ORDERS))
 
 
 def induced(P: Sequence[Expr], B: Expr, normal: Expr, n: Expr) -> Expr:
-    """mu0 M at the present field, which is -de/dB."""
+    """Return mu0 M = -de/dB at the present field."""
     by_normal, by_along = (P[2 + ORDERS.index(order)] for order in ((1, 0), (0, 1)))
     return -2 * (by_along * (B - normal * n) + by_normal * normal * n)
 
@@ -153,16 +158,16 @@ def point_field(
     field: PointField,
     chi: fem.Constant | fem.Function,
     J: float,
-    present: Callable[[], Sequence[tuple[Array, Array]]],
-    by: Callable[[], tuple[Any, ...]],
+    fields_and_normals: Callable[[], Sequence[tuple[Array, Array]]],
+    inputs: Callable[[], tuple[Any, ...]],
 ) -> PointField:
     """Let a field of twice `SIZE` numbers follow the polynomials at u and at u = 0.
 
     Parameters
     ----------
-    present
+    fields_and_normals
         The field and the normals (cells, points, 3) at both.
-    by
+    inputs
         The values that these depend on.
     """
 
@@ -171,12 +176,12 @@ def point_field(
             at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
         )
         polynomials = []
-        for B, n in present():
+        for B, n in fields_and_normals():
             p = np.sum(B * n, axis=-1) ** 2
             s = np.maximum(np.sum(B * B, axis=-1) - p, 0.0)
-            polynomials.append(expanded(np.broadcast_to(numbers, p.shape), p, s, J))
+            polynomials.append(expand_energy(np.broadcast_to(numbers, p.shape), p, s, J))
         return np.concatenate(polynomials, axis=-1)
 
-    own = chi.x.array if isinstance(chi, fem.Function) else chi.value
-    field.compute_by(values, lambda: (own, *by()))
+    values_of_chi = chi.x.array if isinstance(chi, fem.Function) else chi.value
+    field.compute_by(values, lambda: (values_of_chi, *inputs()))
     return field

@@ -1,4 +1,4 @@
-"""Sensors of the magnetic field: where they are, and what they read."""
+"""Sensors of the magnetic field: their section, places and units."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,10 @@ from magshell_fenicsx.shape.reference_shell import Coordinates
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 Array = NDArray[np.float64]
-STEPS, DIFFERENCE = 8, 1e-6  # of Gauss's and Newton's method for the nearest place of a surface
+NEWTON_STEPS, DIFFERENCE_STEP = (
+    8,
+    1e-6,
+)  # of Gauss's and Newton's method for the nearest place of a surface
 
 
 class SensorSection(Section):
@@ -68,21 +71,26 @@ class Sensor:
 
 
 def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
-    """The sensors of a case, in a frame turned about e3 (rad)."""
-    given: dict[str, SensorSection] = context.sections.get("sensors") or {}
-    shell, own = context.shell, units(context)
+    """Return the sensors of a case, in a frame turned by `turn` about e3 (rad)."""
+    sections: dict[str, SensorSection] = context.sections.get("sensors") or {}
+    shell, field_units = context.shell, units(context)
     R, half = shell.reference, 0.5 / shell.R_over_h
     return tuple(
         Sensor(
-            name, rotation(turn) @ np.array(each.position) / R, each.field == "total", *own, half
+            name,
+            rotation(turn) @ np.array(section.position) / R,
+            section.field == "total",
+            *field_units,
+            half,
         )
-        for name, each in given.items()
+        for name, section in sections.items()
     )
 
 
 def units(context: Context) -> tuple[float, float]:
-    """What a remanence of length one and an applied field of lambda_m = 1 are: in T, or over |Br|;
-    nan if unknown.
+    """Return the flux densities of a remanence of length one and of lambda_m = 1.
+
+    They are in T, or over |Br|; nan if unknown.
     """
     magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None:
@@ -100,24 +108,24 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
     key = "sensors"
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that something is magnetised, whose field can be read."""
+        """Refuse a case in which nothing is magnetised."""
         refuse_unfit_reading(self.key, context)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """See that no sensor is in the undeformed shell."""
-        for name, each in self.given.items():
+        """Refuse sensors in the undeformed shell."""
+        for name, section in self.given.items():
             if not name.isidentifier():
                 raise CaseError(
                     f"sensors: {name}: a name is made of letters, digits and _, as it begins "
                     "names of columns"
                 )
-            refuse_unknown_field(f"sensors.{name}", each.field, context)
+            refuse_unknown_field(f"sensors.{name}", section.field, context)
             shell = context.shell
             if (
                 not isinstance(shell, MeshSurface)
-                and depth(shell, np.array(each.position) / shell.reference) < 0
+                and depth(shell, np.array(section.position) / shell.reference) < 0
             ):
-                x, y, z = each.position
+                x, y, z = section.position
                 raise CaseError(
                     f"sensors.{name}.position: ({x:g}, {y:g}, {z:g}) is in the shell, within half "
                     "its thickness of the mid-surface: place it outside"
@@ -125,7 +133,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
 
 
 def refuse_unfit_reading(key: str, context: Context) -> None:
-    """See that a field can be read where a key asks for it.
+    """Refuse a key that asks for a field which cannot be read.
 
     Raises
     ------
@@ -139,15 +147,15 @@ def refuse_unfit_reading(key: str, context: Context) -> None:
         context.needs(key, "the area as drawn")
 
 
-def refuse_unknown_field(key: str, wanted: str, context: Context) -> None:
-    """See that the strength of the applied field is known, if the total one is wanted.
+def refuse_unknown_field(key: str, field: str, context: Context) -> None:
+    """Refuse the total field where the strength of the applied one is unknown.
 
     Raises
     ------
     CaseError
         With the key.
     """
-    if wanted == "total" and not np.isfinite(units(context)[1]):
+    if field == "total" and not np.isfinite(units(context)[1]):
         raise CaseError(
             f"{key}.field: total: lambda_m does not say how strong the applied field is: give "
             "remanent.flux_density and applied.flux_density, or field: own"
@@ -155,7 +163,7 @@ def refuse_unknown_field(key: str, wanted: str, context: Context) -> None:
 
 
 def is_read(context: Context) -> bool:
-    """Whether a case asks for the field at places outside the shell."""
+    """Return whether a case asks for the field at places outside the shell."""
     return bool(context.sections.get("sensors") or context.sections.get("field_maps"))
 
 
@@ -164,16 +172,21 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
     inside."""
     from magshell_fenicsx.shape.outline import outline  # reads meshes
 
-    drawn = outline(shell)
-    chart, half = np.asarray(drawn.inverse(x), dtype=float), 0.5 / shell.R_over_h
-    for _ in range(STEPS):
-        steps = np.vstack([chart, *(chart + DIFFERENCE * e for e in np.eye(len(chart)))])
-        foot, *there = drawn.embedding(steps)
+    outline_of_shell = outline(shell)
+    chart, half = np.asarray(outline_of_shell.inverse(x), dtype=float), 0.5 / shell.R_over_h
+    for _ in range(NEWTON_STEPS):
+        steps = np.vstack([chart, *(chart + DIFFERENCE_STEP * e for e in np.eye(len(chart)))])
+        foot, *neighbours = outline_of_shell.embedding(steps)
         change = np.linalg.lstsq(
-            np.array([each - foot for each in there]).T / DIFFERENCE, x - foot, rcond=None
+            np.array([place - foot for place in neighbours]).T / DIFFERENCE_STEP,
+            x - foot,
+            rcond=None,
         )[0]
-        again = np.asarray(drawn.inverse(drawn.embedding((chart + change)[None])[0]), dtype=float)
-        if not np.isfinite(again).all():
+        next_chart = np.asarray(
+            outline_of_shell.inverse(outline_of_shell.embedding((chart + change)[None])[0]),
+            dtype=float,
+        )
+        if not np.isfinite(next_chart).all():
             break
-        chart = again
-    return float(np.linalg.norm(x - drawn.embedding(chart[None])[0])) - half
+        chart = next_chart
+    return float(np.linalg.norm(x - outline_of_shell.embedding(chart[None])[0])) - half

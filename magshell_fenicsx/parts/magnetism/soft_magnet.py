@@ -37,16 +37,16 @@ TERM = "soft magnetism"
 
 @dataclass(frozen=True)
 class SoftMagnet:
-    """What is soft.
+    """Soft-magnetic material of a shell.
 
     Attributes
     ----------
     susceptibility
-        A number, or a pattern of numbers (cells, nodes, 1).
+        A number mu_r - 1, or a pattern of numbers (cells, nodes, 1).
     scale
         sqrt(mu0 E)/|Br|; 1 without remanence.
     tesla
-        What lambda_m = 1 is in T; 1 if the case has no flux densities.
+        The flux density of lambda_m = 1 in T; 1 if the case has no flux densities.
     alone
         Whether nothing is remanent.
     patches
@@ -62,16 +62,16 @@ class SoftMagnet:
     patches: Mapping[str, Array] | None = None
     saturation: float | None = None
 
-    def on(self, carried: "Callable[[Mapping[str, Array]], Pattern]") -> "SoftMagnet":
-        """With a pattern in place of patches."""
+    def with_patches(self, pattern_of: "Callable[[Mapping[str, Array]], Pattern]") -> "SoftMagnet":
+        """Return the same material with a pattern in place of patches."""
         return (
-            replace(self, susceptibility=carried(self.patches), patches=None)
+            replace(self, susceptibility=pattern_of(self.patches), patches=None)
             if self.patches
             else self
         )
 
-    def at(self, r0: Array, n0: Array) -> Array:
-        """The susceptibility (...) at places (..., 3)."""
+    def susceptibility_at(self, r0: Array, n0: Array) -> Array:
+        """Return the susceptibility (...) at undeformed places and normals (..., 3)."""
         chi = self.susceptibility
         return np.asarray(chi(r0, n0)[..., 0] if callable(chi) else np.full(r0.shape[:-1], chi))
 
@@ -79,11 +79,11 @@ class SoftMagnet:
         """mu0 M (..., 3) in the unit of B at places of the undeformed shell, with the present
         normals n (..., 3).
         """
-        chi = self.at(r0, n0)[..., None]
-        across = np.sum(n * B, axis=-1, keepdims=True)
+        chi = self.susceptibility_at(r0, n0)[..., None]
+        normal_field = np.sum(n * B, axis=-1, keepdims=True)
         if self.saturation is None:
-            return np.asarray(chi * (B - chi / (1 + chi) * across * n))
-        return saturation.polarisation(chi, B - across * n, across, n, self.saturation)
+            return np.asarray(chi * (B - chi / (1 + chi) * normal_field * n))
+        return saturation.polarisation(chi, B - normal_field * n, normal_field, n, self.saturation)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Sheet:
 
     @cached_property
     def amplitudes(self) -> tuple[str, ...]:
-        """The amplitudes of the field's parts."""
+        """Names of the amplitudes of the field's uniform parts."""
         from magshell_fenicsx.parts.magnetism.magnetised import ACROSS  # it needs this module
 
         return ("lambda_m", *(() if self.field.in_space else ACROSS[: len(self.field.across)]))
@@ -112,7 +112,7 @@ class Sheet:
         return [field.applied, *field.across, *([] if field.gradient is None else [field.gradient])]
 
     def fields(self, x0: Expr, u: Expr, given: Sequence[Expr]) -> tuple[Expr, Expr]:
-        """The applied field at the displacement u and at u = 0."""
+        """Return the applied field at the displacement u and at u = 0."""
         count = len(self.amplitudes)
         numbers, parts = given[:count], given[count:]
         if self.field.in_space:
@@ -130,35 +130,37 @@ class Sheet:
         amplitudes: Sequence[fem.Constant],
         applied: "AppliedField | None",
         field: PointField,
-        follows: Sequence[fem.Function],
-        placed: Callable[[], Sequence[Array]],
+        followed: Sequence[fem.Function],
+        places_and_normals: Callable[[], Sequence[Array]],
     ) -> PointField:
-        """Let a field have what is known of the material at u and at u = 0.
+        """Let a field follow the polynomials of the energy at u and at u = 0 (`saturation`).
 
         Parameters
         ----------
-        follows
+        followed
             Placement and displacement.
-        placed
+        places_and_normals
             Gives x0, u, n and n0 (cells, points, 3) at the points of the field.
         """
         assert self.saturation is not None
 
-        def present() -> list[tuple[Array, Array]]:
-            x0, u, n, n0 = placed()
+        def fields_and_normals() -> list[tuple[Array, Array]]:
+            x0, u, n, n0 = places_and_normals()
             values = applied.polynomial.values if applied else None
-            return list(zip(self._known(amplitudes, values, x0, u), (n, n0), strict=True))
+            return list(
+                zip(self._fields_at_points(amplitudes, values, x0, u), (n, n0), strict=True)
+            )
 
-        def by() -> tuple[Any, ...]:
+        def inputs() -> tuple[Any, ...]:
             renewed = [applied.polynomial.renew()] if applied else []
-            return *(f.x.array for f in follows), *(a.value for a in amplitudes), *renewed
+            return *(f.x.array for f in followed), *(a.value for a in amplitudes), *renewed
 
-        return saturation.point_field(field, chi, self.saturation, present, by)
+        return saturation.point_field(field, chi, self.saturation, fields_and_normals, inputs)
 
-    def _known(
+    def _fields_at_points(
         self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array
     ) -> list[Array]:
-        """Both fields (cells, points, 3) at points, as `fields`."""
+        """Return the values (cells, points, 3) of both `fields` at points."""
         numbers = [float(each.value) for each in amplitudes]
         if polynomials is not None:
             return [numbers[0] * polynomials[..., 6:9], numbers[0] * polynomials[..., 3:6]]
@@ -167,55 +169,60 @@ class Sheet:
         G = np.zeros((3, 3)) if self.field.gradient is None else numbers[0] * self.field.gradient
         return [B + x @ G.T for x in (x0 + u, x0)]
 
-    def of_surface(self, r0: Jet, u: Jet, law: Expr, s: Expr, *given: Expr) -> Expr:
-        """The energy over E h per area, without its value at u = 0 in this field.
+    def energy_per_area(self, r0: Jet, u: Jet, law: Expr, s: Expr, *given: Expr) -> Expr:
+        """Return the energy over E h per area, less its value at u = 0 in this field.
 
         `law` is the susceptibility or, of what saturates, the polynomials at u and at u = 0.
         """
         (B, B0), (present, at_first) = self.fields(r0.r, u.r, given), self._halves(law)
         return s**2 * (
-            self.of_field(present, B, kin.normal(r0 + u))
-            - self.of_field(at_first, B0, kin.normal(r0))
+            self.energy_in_field(present, B, kin.normal(r0 + u))
+            - self.energy_in_field(at_first, B0, kin.normal(r0))
         )
 
     def induced(self, r0: Jet, u: Jet, law: Expr, e: Expr, *given: Expr) -> Expr:
-        """The polarisation along a vector, in the unit of lambda_m."""
+        """Return the polarisation along a vector e, in the unit of lambda_m."""
         B, _ = self.fields(r0.r, u.r, given)
         return ufl.dot(e, self.polarisation(self._halves(law)[0], B, kin.normal(r0 + u)))
 
-    def of_body(
+    def energy_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
     ) -> Expr:
         """The same of a body, in units of E h R²: its layers are sheets, with the normal n0
         before."""
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
         return (
-            s**2 * (self.of_field(present, B, across(H, n0)) - self.of_field(at_first, B0, n0)) / h
+            s**2
+            * (
+                self.energy_in_field(present, B, deformed_normal(H, n0))
+                - self.energy_in_field(at_first, B0, n0)
+            )
+            / h
         )
 
-    def induced_in_body(
+    def induced_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, e: Expr, n0: Expr, *given: Expr
     ) -> Expr:
-        """As `induced`."""
+        """Return the polarisation along a vector e in a solid, in the unit of lambda_m."""
         B, _ = self.fields(X, u, given)
-        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, across(H, n0)))
+        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, deformed_normal(H, n0)))
 
     def polarisation(self, law: Any, B: Expr, n: Expr) -> Expr:
-        """mu0 M, that of a linear material chi (B_t + B_n n/(1 + chi))."""
+        """Return mu0 M; of a linear material it is chi (B_t + B_n n/(1 + chi))."""
         normal = ufl.dot(B, n)
         if self.saturation is not None:
             return saturation.induced(law, B, normal, n)
         return law * (B - law / (1 + law) * normal * n)
 
-    def of_field(self, law: Any, B: Expr, n: Expr) -> Expr:
-        """The energy over E h and s², that of a linear material -mu0 M.B/2."""
+    def energy_in_field(self, law: Any, B: Expr, n: Expr) -> Expr:
+        """Return the energy over E h and s²; of a linear material it is -mu0 M.B/2."""
         if self.saturation is None:
             return -ufl.dot(B, self.polarisation(law, B, n)) / 2
         normal = ufl.dot(B, n) ** 2
         return saturation.energy(law, normal, ufl.dot(B, B) - normal)
 
     def _halves(self, law: Expr) -> tuple[Any, Any]:
-        """What is known of the material at u and at u = 0."""
+        """Return the material's data at u and at u = 0: susceptibilities or polynomials."""
         if self.saturation is None:
             chi = law[0] if law.ufl_shape else law  # a field (1,), or a constant
             return chi, chi
@@ -224,12 +231,12 @@ class Sheet:
 
     @property
     def saturation(self) -> float | None:
-        """Of what is soft."""
+        """The largest polarisation of the material; None without saturation."""
         return self.field.soft.saturation if self.field.soft else None
 
 
-def across(H: Expr, n0: Expr) -> Expr:
-    """The normal of a layer of a body, cof F n0 over its length."""
+def deformed_normal(H: Expr, n0: Expr) -> Expr:
+    """Return the deformed normal of a layer of a solid: cof F n0 over its length, F = 1 + H."""
     F = ufl.Identity(3) + H
     f = [F[:, i] for i in range(3)]
     cofactor = ufl.as_tensor(

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from magshell_fenicsx.parts.magnetism.saturation import ORDERS, expanded, polarisation, ratio
+from magshell_fenicsx.parts.magnetism.saturation import ORDERS, expand_energy, polarisation, ratio
 
 POINTS = [
     (chi, n, t)
@@ -41,7 +41,7 @@ def test_energy_and_polarisation(chi: float, normal: float, along: float) -> Non
     w = quad(lambda x: langevin(x), 0, 3 * chi * size, epsabs=0, epsrel=1e-12, limit=200)[0] / (
         3 * chi
     )
-    found = expanded(*map(np.array, (chi, normal**2, along**2)), 1.0)
+    found = expand_energy(*map(np.array, (chi, normal**2, along**2)), 1.0)
     assert found[2] == pytest.approx(-w - (normal - b) ** 2 / 2, rel=1e-10)
     J = langevin(3 * chi * size) / size * np.array([along, 0, b])
     n = np.array([0.0, 0, 1])
@@ -61,7 +61,7 @@ def test_derivatives(order: tuple[int, int]) -> None:
     def at(order: tuple[int, int], move: float) -> np.ndarray:
         given = [normal**2, along**2]
         given[which] = given[which] * (1 + move)
-        values = expanded(chi, *given, 1.0)[..., 2 + ORDERS.index(order)]
+        values = expand_energy(chi, *given, 1.0)[..., 2 + ORDERS.index(order)]
         return np.asarray(values * factorial(order[0]) * factorial(order[1]))
 
     step = 2e-3
