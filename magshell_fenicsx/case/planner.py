@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
-from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
+from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS, LocalImperfection, different, leaves, spots
 from magshell_fenicsx.parts.laminate import Laminated, laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
@@ -124,7 +124,7 @@ def make_problem(
     refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     energies = surface_terms(context, terms)
     parts = _left(case, drawn, energies)
-    parts += leaves(imperfections, perfect, each=bool(case.patches))
+    parts += leaves(imperfections, perfect, one_by_one=bool(case.patches))
     parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
     axisymmetric, plane = (False, plane) if plane else _symmetry(case, drawn, parts)
     half = plane is not None
@@ -192,7 +192,7 @@ def make_problem(
         raise CaseError(
             f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half"
         )
-    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else (), size)
+    shape = _matched(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
     span = drawn.meridian if axisymmetric else None
     if not axisymmetric:
         Vertices.of(case, points, drawn, size, turn).refuse_near(shape, beyond)
@@ -387,7 +387,7 @@ def imperfect(
 
 
 def _matched(
-    shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...], size: Grading
+    shape: Chart, local: Sequence[LocalImperfection], rims: tuple[Array, ...], size: Grading
 ) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
@@ -412,7 +412,7 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     perfect = ground.perfect
     parts = [
         shape_constraint(case.shell, perfect),
-        *leaves(flaws(case.imperfections, ground), perfect, each=bool(case.patches)),
+        *leaves(flaws(case.imperfections, ground), perfect, one_by_one=bool(case.patches)),
         *(plies.leaves(case.context, perfect) if (plies := Laminated.of(case.context)) else ()),
     ]
     vectors = [unit(v) for part in parts for v in part.vectors]

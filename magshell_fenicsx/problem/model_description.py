@@ -4,7 +4,7 @@ from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, plane_text
-from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
+from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS
 from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Context
@@ -79,8 +79,8 @@ def _imperfections_text(context: Context, rims: int) -> str:
         words = [f"{count} of kind {kind}" for kind, count in kinds.items()]
     warning = ""
     is_mesh_file = isinstance(context.shell, MeshSurface)
-    if any(section.patch for section in sections) and (is_mesh_file or rims > MOST_RIMS):
-        reason = "of a mesh file" if is_mesh_file else f"of more than {MOST_RIMS}"
+    if any(section.patch for section in sections) and (is_mesh_file or rims > MAX_RIMS):
+        reason = "of a mesh file" if is_mesh_file else f"of more than {MAX_RIMS}"
         warning = f"; elements lie across the rims of dimples, {reason}: k_d is then less exact"
     return f"imperfections: {', '.join(words)}{warning}"
 

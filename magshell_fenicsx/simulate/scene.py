@@ -32,7 +32,7 @@ from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
-from magshell_fenicsx.parts.supports.motion import UNHELD
+from magshell_fenicsx.parts.supports.motion import UNHELD_CONDITIONS
 from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
@@ -94,7 +94,7 @@ def build_meridian(problem: Problem) -> Meridian:
     }
     points = {name: span.locate_named(named[name], x) for name, x in problem.points.items()}
     pieces = [(piece.name, piece.ends) for piece in span.shell_meridians]
-    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD]
+    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS]
     vertices = meridian_vertices(problem)
     return make_meridian(
         span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints

@@ -28,17 +28,20 @@ if TYPE_CHECKING:  # SciPy and the solver take their time, and a case alone does
 Array = NDArray[np.float64]
 PLACES = (("x", "y", "z"), ("polar", "azimuth"), ("azimuth", "z"))
 ANGLES = ("polar", "azimuth")
-MOST_ROWS = 300_000
-MOST_H, MOST_R = 50.0, 0.5  # largest |w0| over h and over R
-FAR = 0.5  # distance over R beyond which a place is not of this shell
-SAME = 0.2  # of the typical distance of neighbours, below which values are averaged
-HOLE, GAPS = (
+MAX_ROWS = 300_000
+MAX_DEPTH_OVER_H, MAX_DEPTH_OVER_R = 50.0, 0.5  # largest |w0| over h and over R
+MAX_DISTANCE_OVER_R = 0.5  # distance over R beyond which a place is not of this shell
+MERGE_DISTANCE = 0.2  # of the typical distance of neighbours, below which values are averaged
+MAX_HOLE, MAX_HOLE_OVER_SPACING = (
     3.0,
     4.0,
 )  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
-SMALLEST, SHOWN = 0.45, 2.0  # element size over sqrt(R h), and over the length of the sharpest bend
-STEPS, STEP = 30, 1e-5  # of Newton's method, and of differences in the chart
-AROUND = 12  # nodes of a mesh file that a quadric goes through
+MIN_ELEMENT_SIZE, SIZE_OVER_BEND = (
+    0.45,
+    2.0,
+)  # element size over sqrt(R h), and over the length of the sharpest bend
+NEWTON_STEPS, CHART_STEP = 30, 1e-5  # of Newton's method, and of differences in the chart
+NODES_PER_QUADRIC = 12  # nodes of a mesh file that a quadric goes through
 _fits: dict[tuple[str | None, ...], "_Fit"] = {}  # a run plans its case several times
 
 
@@ -70,18 +73,22 @@ class DataSection(FileKeys, ImperfectionSection):
         CaseError
             If the file cannot be read, or its values are not of this shell.
         """
-        this = (self.digest, str(self.path), str(self.noise), *ground.identity)
-        if this not in _fits:
+        fit_key = (self.digest, str(self.path), str(self.noise), *ground.identity)
+        if fit_key not in _fits:
             if len(_fits) > 3:
                 _fits.clear()
             lengths = Lengths(ground.h, ground.R, ground.with_units)
             try:
-                _fits[this] = _fitted(self.noise, read_scan(self.path, lengths, self.files), ground)
+                _fits[fit_key] = _fitted(
+                    self.noise, read_scan(self.path, lengths, self.files), ground
+                )
             except TableError as e:
                 raise CaseError(f"{key}.file: {self.file}: {e}") from None
-        fit = _fits[this]
+        fitted = _fits[fit_key]
         return Flaw(
-            Factored(fit.function, self.amplitude), fit.size, account=f"{self.file}: {fit.account}"
+            Factored(fitted.function, self.amplitude),
+            fitted.size,
+            account=f"{self.file}: {fitted.account}",
         )
 
 
@@ -151,7 +158,7 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         If it cannot be read, or has not the columns.
     """
     columns, units = read_table(file, files or Files())
-    wanted = next(
+    place_columns = next(
         (
             names
             for names in PLACES
@@ -159,17 +166,17 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         ),
         None,
     )
-    if wanted is None:
+    if place_columns is None:
         raise TableError(
             f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, "
             "w0, or x, y, z of the real surface, or polar, azimuth, w0 of a sphere, or azimuth, "
             "z, w0 of a cylinder"
         )
-    names = [*wanted, *(["w0"] if "w0" in columns else [])]
+    names = [*place_columns, *(["w0"] if "w0" in columns else [])]
     if (
         "w0" in units
         and units["w0"] is None
-        and any(units[name] for name in wanted if name not in ANGLES)
+        and any(units[name] for name in place_columns if name not in ANGLES)
     ):
         raise TableError(
             "column w0: has no unit, but the places have one: write w0 [h] or a length, such as "
@@ -193,18 +200,18 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
         rows = np.column_stack([np.ravel(column) for column in np.broadcast_arrays(*columns)])
     except ValueError:
         raise TableError("its arrays have different lengths") from None
-    if len(rows) > MOST_ROWS:
+    if len(rows) > MAX_ROWS:
         raise TableError(
-            f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average "
+            f"has {len(rows)} rows; allowed at most {MAX_ROWS}: leave out rows, or average "
             "neighbours"
         )
-    good = np.isfinite(rows).all(axis=1)
-    if good.sum() < max(20, len(rows) // 2):
+    is_finite = np.isfinite(rows).all(axis=1)
+    if is_finite.sum() < max(20, len(rows) // 2):
         raise TableError(
-            f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of "
-            "the rows"
+            f"has {is_finite.sum()} rows of finite numbers in {len(rows)}; needed are 20, and "
+            "half of the rows"
         )
-    return Scan(dict(zip(names, rows[good].T, strict=True)), int((~good).sum()))
+    return Scan(dict(zip(names, rows[is_finite].T, strict=True)), int((~is_finite).sum()))
 
 
 @dataclass(frozen=True)
@@ -224,7 +231,7 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
 
     h, surface = ground.h, ground.perfect.sample()
     places, w0 = _on_surface(scan, ground, surface)
-    if not np.abs(w0).max() <= min(MOST_H * h, MOST_R):
+    if not np.abs(w0).max() <= min(MAX_DEPTH_OVER_H * h, MAX_DEPTH_OVER_R):
         unit = (
             "; without a unit in the header, w0 is over h"
             if scan.w0 is not None
@@ -232,30 +239,34 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
         )
         raise TableError(
             f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most "
-            f"{min(MOST_H, MOST_R / h):.4g}{unit}"
+            f"{min(MAX_DEPTH_OVER_H, MAX_DEPTH_OVER_R / h):.4g}{unit}"
         )
-    given = len(w0)
+    count = len(w0)
     tree = scipy.spatial.cKDTree(places)
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
-    gaps = tree.query(surface)[0]
-    if gaps.max() > max(HOLE * sqrt(h), GAPS * spacing):
-        where = place_text(surface[np.argmax(gaps)])
+    distances = tree.query(surface)[0]
+    if distances.max() > max(MAX_HOLE * sqrt(h), MAX_HOLE_OVER_SPACING * spacing):
+        place = place_text(surface[np.argmax(distances)])
         raise TableError(
-            f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole "
-            "is too large to guess; give values there, w0 = 0 where the shell is perfect"
+            f"no value lies within {distances.max():.3g} R of the place {place} over R, where the "
+            "hole is too large to guess; give values there, w0 = 0 where the shell is perfect"
         )
-    places, w0 = _merged(places, w0, SAME * spacing)
+    places, w0 = _averaged_in_cubes(places, w0, MERGE_DISTANCE * spacing)
     noise = None if standard is None else standard * h
     function = fit_scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
-        f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, residual of the fit "
+        f"{count} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, residual of the fit "
         f"{function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), largest "
-        f"gap {gaps.max():.3g} R"
+        f"gap {distances.max():.3g} R"
     )
-    lost = f", {scan.lost} rows without a number left out" if scan.lost else ""
+    lost_rows = f", {scan.lost} rows without a number left out" if scan.lost else ""
     return _Fit(
-        function, max(SHOWN * _bend(function, surface, sqrt(h)), SMALLEST * sqrt(h)), account + lost
+        function,
+        max(
+            SIZE_OVER_BEND * _sharpest_bend(function, surface, sqrt(h)), MIN_ELEMENT_SIZE * sqrt(h)
+        ),
+        account + lost_rows,
     )
 
 
@@ -279,12 +290,12 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
             [rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]
         ), w0
     x = np.column_stack([columns[name] for name in "xyz"])
-    away = scipy.spatial.cKDTree(surface).query(x)[0]
-    if away.max() > FAR:
-        row = int(np.argmax(away))
+    distance = scipy.spatial.cKDTree(surface).query(x)[0]
+    if distance.max() > MAX_DISTANCE_OVER_R:
+        row = int(np.argmax(distance))
         raise TableError(
-            f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the "
-            "columns their unit, such as x [mm], or turn and move them to the shell's frame"
+            f"the place {place_text(x[row])} over R is {distance[row]:.3g} R from the shell: give "
+            "the columns their unit, such as x [mm], or turn and move them to the shell's frame"
         )
     places, heights = feet(ground.perfect, x)
     if w0 is None:
@@ -299,7 +310,7 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
     return places, w0
 
 
-def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
+def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     """Means over cubes of this size, so that no two places are the same."""
     _, cell = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
@@ -309,7 +320,7 @@ def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     ) / count
 
 
-def _bend(function: "ScatteredSpline", x: Array, length: float) -> float:
+def _sharpest_bend(function: "ScatteredSpline", x: Array, length: float) -> float:
     """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over
     a length over R.
     """
@@ -334,18 +345,18 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
         r = np.linalg.norm(x, axis=1)
         return x / r[:, None], r - 1
     sample = perfect.sample()
-    nearest, again = np.unique(scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True)
-    chart = np.array([perfect.inverse(place) for place in sample[nearest]])[again]
+    nearest, of_nearest = np.unique(scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True)
+    chart = np.array([perfect.inverse(place) for place in sample[nearest]])[of_nearest]
     for _ in range(
-        STEPS
+        NEWTON_STEPS
     ):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
-        along = [
-            (perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * STEP)
-            for e in STEP * np.eye(2)
+        tangents = [
+            (perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * CHART_STEP)
+            for e in CHART_STEP * np.eye(2)
         ]
-        J = np.stack(along, axis=-1)
-        off = np.einsum("nij,ni->nj", J, x - perfect.perfect(chart))
-        step = np.linalg.solve(np.einsum("nij,nik->njk", J, J), off[..., None])[..., 0]
+        J = np.stack(tangents, axis=-1)
+        residual = np.einsum("nij,ni->nj", J, x - perfect.perfect(chart))
+        step = np.linalg.solve(np.einsum("nij,nik->njk", J, J), residual[..., None])[..., 0]
         chart = chart + np.clip(step, -0.2, 0.2)
         if np.abs(step).max() < 1e-12:
             break
@@ -359,14 +370,14 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
 
     nodes = np.unique(nodes.round(14), axis=0)
     tree = scipy.spatial.cKDTree(nodes[:, :3])
-    near = tree.query(x, AROUND)[1]
-    centre, normal = nodes[near[:, 0], :3], nodes[near[:, 0], 3:]
+    nearest = tree.query(x, NODES_PER_QUADRIC)[1]
+    centre, normal = nodes[nearest[:, 0], :3], nodes[nearest[:, 0], 3:]
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
     first /= np.linalg.norm(first, axis=1)[:, None]
     frame = np.stack([first, np.cross(normal, first), normal], axis=1)
     s, t, z = np.moveaxis(
-        np.einsum("nkj,nij->nki", nodes[near, :3] - centre[:, None], frame), -1, 0
+        np.einsum("nkj,nij->nki", nodes[nearest, :3] - centre[:, None], frame), -1, 0
     )
     quadric = (
         np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]

@@ -14,9 +14,9 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw, Imperfection
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
-DEEPEST = 0.5  # over R
-WIDE = 1e5  # over R: elements of any size show it
-ALIKE = 0.2  # of the surface: where so much needs small elements, all get them
+MAX_DEPTH = 0.5  # over R
+MAX_ELEMENT_SIZE = 1e5  # over R: elements of any size show it
+MAX_LOCAL_SHARE = 0.2  # of the surface: where so much needs small elements, all get them
 
 
 class FormulaSection(ImperfectionSection):
@@ -42,29 +42,31 @@ class FormulaSection(ImperfectionSection):
         """
         x = ground.perfect.sample()
         deviation = ByFormula(self.w0, self.amplitude / ground.R_over_h)
-        bad = x[~(np.abs(deviation(x)) <= DEEPEST)]
-        if len(bad):
-            place = ", ".join(f"{c:.3g}" for c in bad[0])
+        bad_places = x[~(np.abs(deviation(x)) <= MAX_DEPTH)]
+        if len(bad_places):
+            place = ", ".join(f"{c:.3g}" for c in bad_places[0])
             raise CaseError(
                 f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
                 f"radius, at (x, y, z)/R = ({place})"
             )
-        largest, derived = (
+        largest, with_derivatives = (
             np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
             formula_with_derivatives(self.w0),
         )
 
         def sizes(places: Array) -> Array:
             """2.5/k of the wave with the depth of the whole and the curvature of each place."""
-            taylor = derived(places)
+            taylor = with_derivatives(places)
             curved = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
             depth = max(largest, float(np.ptp(np.nan_to_num(taylor.value))))
             return np.asarray(2.5 * np.sqrt(depth / 2 / np.maximum(curved, 1e-300 + 1e-12 * depth)))
 
         at_sample = sizes(x)
-        size = float(at_sample.min()) if largest > 0 and at_sample.min() < WIDE else np.inf
-        local = not (at_sample < 2 * size).mean() > ALIKE
-        return Flaw(deviation, size, sizes=sizes if local else None)
+        size = (
+            float(at_sample.min()) if largest > 0 and at_sample.min() < MAX_ELEMENT_SIZE else np.inf
+        )
+        is_local = not (at_sample < 2 * size).mean() > MAX_LOCAL_SHARE
+        return Flaw(deviation, size, sizes=sizes if is_local else None)
 
 
 @dataclass(frozen=True)

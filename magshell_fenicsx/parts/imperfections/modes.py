@@ -22,9 +22,13 @@ if TYPE_CHECKING:  # SciPy takes its time, and a case alone does not need it
 
 Array = NDArray[np.float64]
 Shape = Callable[[Array], Array]
-EQUAL = 1e-4  # part of the largest value within which crests and troughs are equally large
-BESIDE = 0.3  # over R, largest distance of a place of the shell from the nodes of a mode
-SHOWN = 1.2  # of sqrt(R h): elements that show a mode
+CREST_TOLERANCE = (
+    1e-4  # part of the largest value within which crests and troughs are equally large
+)
+MAX_DISTANCE_OVER_R = (
+    0.3  # over R, largest distance of a place of the shell from the nodes of a mode
+)
+SIZE_OVER_WIDTH = 1.2  # of sqrt(R h): elements that show a mode
 
 
 class ModesSection(FileKeys, ImperfectionSection):
@@ -91,21 +95,21 @@ class ModesSection(FileKeys, ImperfectionSection):
             If no mode with an amplitude moves the shell.
         """
 
-        def own(mode: Mode) -> Shape | None:
+        def part_of(mode: Mode) -> Shape | None:
             if not isinstance(mode, OfShells):
                 return mode
-            return Placed(mode.parts[name], place) if place and name in mode.parts else None
+            return PlacedMode(mode.parts[name], place) if place and name in mode.parts else None
 
-        parts = [own(mode) for mode in modes[: len(self.amplitudes)]]
-        counted = [
+        parts = [part_of(mode) for mode in modes[: len(self.amplitudes)]]
+        moving_parts = [
             part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude
         ]
-        if counted and not any(counted):
+        if moving_parts and not any(moving_parts):
             raise ValueError(
                 f"amplitudes: of the {len(parts)} lowest modes of all shells together those with "
                 "an amplitude do not move it: give more, and 0 for those of other shells"
             )
-        self._shapes = tuple(part or _still for part in parts)
+        self._shapes = tuple(part or _zero_mode for part in parts)
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`; modes that are not yet computed are zero.
@@ -127,7 +131,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             for a, name in zip(self.amplitudes, names, strict=False)
         ]
         account = ", ".join(words) or "modes that the run computes"
-        return Flaw(Modes(shapes, amplitudes), SHOWN * sqrt(h), account=account)
+        return Flaw(Modes(shapes, amplitudes), SIZE_OVER_WIDTH * sqrt(h), account=account)
 
 
 @dataclass(frozen=True)
@@ -166,17 +170,17 @@ class Mirrored:
     sign: float
 
     def __call__(self, places: Array) -> Array:
-        beyond = self.mirror.signed_distance(places) < 0
-        on_this_side = np.where(beyond[:, None], self.mirror.image(places), places)
-        return np.asarray(self.shape(on_this_side) * np.where(beyond, self.sign, 1.0))
+        is_beyond = self.mirror.signed_distance(places) < 0
+        on_this_side = np.where(is_beyond[:, None], self.mirror.image(places), places)
+        return np.asarray(self.shape(on_this_side) * np.where(is_beyond, self.sign, 1.0))
 
 
-def _still(places: Array) -> Array:
+def _zero_mode(places: Array) -> Array:
     return np.zeros(len(places))
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedMode:
     """A mode in the frame of a shell that has its place among others."""
 
     shape: Shape
@@ -229,15 +233,15 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
         fields = read_vtk(section.files.content(section.path), section.path.suffix).point_data
         r0, w = (np.asarray(fields[name], dtype=float) for name in ("r0", "mode_w"))
     except Exception as e:  # VTK and pyvista raise many types
-        said = getattr(e, "strerror", None) or e
+        message = getattr(e, "strerror", None) or e
         raise CaseError(
-            f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {said}"
+            f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {message}"
         ) from None
     if r0.shape != (len(w), 3) or not (
         np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0
     ):
         raise CaseError(f"{key}: the mode has no finite displacement")
-    if scipy.spatial.cKDTree(r0).query(sample)[0].max() > BESIDE:
+    if scipy.spatial.cKDTree(r0).query(sample)[0].max() > MAX_DISTANCE_OVER_R:
         raise CaseError(
             f"{key}: is the mode of another shell: it does not reach all places of this one"
         )
@@ -249,6 +253,6 @@ def over_largest(places: Array, w: Array) -> Array:
     in any order.
     """
     size = np.abs(w)
-    near = np.flatnonzero(size > (1 - EQUAL) * size.max())
-    first = near[np.lexsort(places[near].round(6).T)[-1]]
+    largest_places = np.flatnonzero(size > (1 - CREST_TOLERANCE) * size.max())
+    first = largest_places[np.lexsort(places[largest_places].round(6).T)[-1]]
     return np.asarray(w / np.copysign(size.max(), w[first]))

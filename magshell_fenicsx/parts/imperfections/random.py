@@ -23,8 +23,8 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
-WAVES = 512
-AT_ONCE = 4096  # places
+WAVE_COUNT = 512
+PLACES_AT_ONCE = 4096  # places
 
 
 class RandomSection(ImperfectionSection):
@@ -81,7 +81,7 @@ class RandomSection(ImperfectionSection):
             raise ValueError(
                 f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}"
             ) from None
-        return {f"dimples.{i}": each for i, each in enumerate(sections)}
+        return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
         """See `ImperfectionSection`; of the field, which the length of correlation shows."""
@@ -108,14 +108,14 @@ class Waves:
         """(4, N): the components of k and the phase."""
         import scipy
 
-        bits = np.random.PCG64(self.seed).random_raw(4 * WAVES).reshape(4, WAVES)
+        bits = np.random.PCG64(self.seed).random_raw(4 * WAVE_COUNT).reshape(4, WAVE_COUNT)
         uniform = ((bits >> np.uint64(11)) + 0.5) / 2.0**53
         return np.vstack([scipy.special.ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
 
     def __call__(self, places: Array) -> Array:
         w0 = np.empty(len(places))
-        for i in range(0, len(places), AT_ONCE):
-            x = places[i : i + AT_ONCE]
+        for i in range(0, len(places), PLACES_AT_ONCE):
+            x = places[i : i + PLACES_AT_ONCE]
             angles = self._waves[3] + sum(x[:, j : j + 1] * self._waves[j] for j in range(3))
-            w0[i : i + AT_ONCE] = np.cos(angles).sum(axis=1)
-        return self.delta * sqrt(2 / WAVES) * w0
+            w0[i : i + PLACES_AT_ONCE] = np.cos(angles).sum(axis=1)
+        return self.delta * sqrt(2 / WAVE_COUNT) * w0

@@ -24,18 +24,18 @@ from magshell_fenicsx.shape.reference_shell import AngularDistance, StraightDist
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, common_azimuth
 
 Array = NDArray[np.float64]
-SAME = 1e-9  # of the largest w0
-PARTS = (0.2, 0.5, 0.8)  # of the reach, at which a local imperfection is compared
-IMAGE = (
+EQUALITY_TOLERANCE = 1e-9  # of the largest w0
+COMPARED_PARTS_OF_REACH = (0.2, 0.5, 0.8)  # of the reach, at which a local imperfection is compared
+IMAGE_TOLERANCE = (
     1e-12  # places, depths and widths that differ by less are equal: of w0 that is far below SAME
 )
-FIRST = 3  # imperfections without an image that are looked at before all places are
-CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
-STEPS, ROUNDS = 40, 12
-SAME_RIM = 0.02  # of the element size
-MOST_RIMS = 60  # more would take gmsh minutes
-WIDEST = 4.0  # distance in the chart over the distance on the surface
-AXIS = 1e-9  # over R
+FIRST_COMPARED = 3  # imperfections without an image that are looked at before all places are
+CONTOUR_CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
+CONTOUR_STEPS, FALSE_POSITION_ROUNDS = 40, 12
+RIM_TOLERANCE = 0.02  # of the element size
+MAX_RIMS = 60  # more would take gmsh minutes
+MAX_CHART_STRETCH = 4.0  # distance in the chart over the distance on the surface
+AXIS_TOLERANCE = 1e-9  # over R
 
 
 @dataclass(frozen=True)
@@ -90,20 +90,24 @@ class _Sum:
     def numbers(self) -> _Numbers | None:
         """What it is made of, if that is local deviations alone: there may be thousands."""
         local = [d for d in self.deviations if isinstance(d, Local)]
-        kinds = list(dict.fromkeys(type(d) for d in local))
+        classes = list(dict.fromkeys(type(d) for d in local))
         angles = [d.distance.axis for d in local if isinstance(d.distance, AngularDistance)]
         places = angles or [
             d.distance.place for d in local if isinstance(d.distance, StraightDistance)
         ]
         if not places or len(places) < len(self.deviations):
             return None
-        shapes = [(d.width, kinds.index(type(d))) for d in local]
-        rows = np.round(np.column_stack([places, shapes]) / IMAGE) * IMAGE
+        shapes = [(d.width, classes.index(type(d))) for d in local]
+        rows = np.round(np.column_stack([places, shapes]) / IMAGE_TOLERANCE) * IMAGE_TOLERANCE
         rows, number = np.unique(rows, axis=0, return_inverse=True)
         depths = np.bincount(number.ravel(), [d.depth for d in local])
-        kept = np.abs(depths) > IMAGE * np.abs(depths).max()
-        profiles = [kind.profile for kind in kinds]
-        return _Numbers(rows[kept], depths[kept], bool(angles), profiles) if kept.any() else None
+        is_kept = np.abs(depths) > IMAGE_TOLERANCE * np.abs(depths).max()
+        profiles = [kind.profile for kind in classes]
+        return (
+            _Numbers(rows[is_kept], depths[is_kept], bool(angles), profiles)
+            if is_kept.any()
+            else None
+        )
 
     def mirrored(self, mirror: Mirror) -> bool | None:
         """Whether it is its own image, by its numbers; None if they do not say."""
@@ -111,71 +115,82 @@ class _Sum:
         if numbers is None or (numbers.angles and mirror.offset):
             return None
         rows, depths = numbers.rows, numbers.depths
-        away, image = numbers.tree.query(np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]]))
-        alone = (away > 4 * IMAGE) | (np.abs(depths[image] - depths) > IMAGE * np.abs(depths).max())
-        if not alone.any():
+        distance, image = numbers.tree.query(
+            np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]])
+        )
+        has_no_image = (distance > 4 * IMAGE_TOLERANCE) | (
+            np.abs(depths[image] - depths) > IMAGE_TOLERANCE * np.abs(depths).max()
+        )
+        if not has_no_image.any():
             return True if len(np.unique(image)) == len(image) else None
-        centres = rows[np.flatnonzero(alone)[:FIRST], :3]
+        centres = rows[np.flatnonzero(has_no_image)[:FIRST_COMPARED], :3]
         differs = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
-        return False if differs > 2 * SAME * np.abs(depths).sum() else None
+        return False if differs > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
 
 
-def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[SymmetryConstraint]:
+def leaves(
+    flaws: Mapping[str, Flaw], drawn: Outline, *, one_by_one: bool
+) -> list[SymmetryConstraint]:
     """What imperfections leave.
 
     Parameters
     ----------
     drawn
         The perfect shell.
-    each
+    one_by_one
         Whether each must be its own image, as patches with names are.
     """
     if not flaws:
         return []
-    grouped = [[flaw] for flaw in flaws.values()] if each else [list(flaws.values())]
+    grouped = [[flaw] for flaw in flaws.values()] if one_by_one else [list(flaws.values())]
     groups = [_Sum([flaw.deviation for flaw in group]) for group in grouped]
 
     sample = cache(lambda: _sample(flaws, drawn))
 
     def mirrors(mirror: Mirror) -> bool:
-        unsure = []
+        undecided = []
         for group in groups:
             if (answer := group.mirrored(mirror)) is False:
                 return False
             if answer is None:
-                unsure.append(group)
-        return all(_same(group(sample()), group(mirror.image(sample()))) for group in unsure)
+                undecided.append(group)
+        return all(
+            _are_equal(group(sample()), group(mirror.image(sample()))) for group in undecided
+        )
 
     centres = [flaw.centre for flaw in flaws.values() if flaw.centre is not None]
-    off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS]
+    off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
     reason = None
     if off and drawn.round:
         reason = "an imperfection is off the axis"
     elif drawn.meridian:
         places = drawn.meridian.interior_sample()
-        turned = [
+        rotated = [
             np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
         ]
-        if not all(_same(turned[0], w0) for w0 in turned):
+        if not all(_are_equal(rotated[0], w0) for w0 in rotated):
             reason = "an imperfection differs around e3"
     if not drawn.round:
         return [SymmetryConstraint(reason, (), mirrors)]
     if common_azimuth(off) is None:
-        return [SymmetryConstraint(reason, (), mirrors, azimuths=_between(off))]
+        return [SymmetryConstraint(reason, (), mirrors, azimuths=_azimuths_of_planes(off))]
     return [SymmetryConstraint(reason, off, mirrors)]
 
 
-def _between(centres: Sequence[Array]) -> tuple[float, ...]:
+def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
     """Azimuths (rad) of the planes through e3 that map the first place to itself or to one at the
     same distance.
     """
     first, *others = centres
-    alike = [
+    at_same_distance = [
         x
         for x in others
-        if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS and abs(x[2] - first[2]) < AXIS
+        if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS_TOLERANCE
+        and abs(x[2] - first[2]) < AXIS_TOLERANCE
     ]
-    return tuple((atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *alike))
+    return tuple(
+        (atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *at_same_distance)
+    )
 
 
 def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
@@ -188,17 +203,22 @@ def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
         chart = drawn.inverse(flaw.centre)
         if len(chart) == 2:
             places += [
-                drawn.perfect(contour(key, flaw, drawn, 0.0, chart, part)[::7]) for part in PARTS
+                drawn.perfect(contour(key, flaw, drawn, 0.0, chart, part)[::7])
+                for part in COMPARED_PARTS_OF_REACH
             ]
     return np.concatenate(places)
 
 
-def _same(w0: Array, image: Array) -> bool:
-    return bool((np.abs(w0 - image) <= SAME * max(np.abs(w0).max(), np.abs(image).max())).all())
+def _are_equal(w0: Array, image: Array) -> bool:
+    return bool(
+        (
+            np.abs(w0 - image) <= EQUALITY_TOLERANCE * max(np.abs(w0).max(), np.abs(image).max())
+        ).all()
+    )
 
 
 @dataclass(frozen=True)
-class Spot:
+class LocalImperfection:
     """A local imperfection in the chart.
 
     Attributes
@@ -230,7 +250,9 @@ class Spot:
         ]
 
 
-def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:
+def spots(
+    flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float
+) -> list[LocalImperfection]:
     """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
 
     Parameters
@@ -243,30 +265,36 @@ def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> lis
     CaseError
         If one reaches around the shell.
     """
-    placed = []
+    local_imperfections = []
     for key, flaw in flaws:
         if flaw.centre is None:
             continue
-        if drawn.disc and np.hypot(*flaw.centre[:2]) < AXIS:
-            placed.append(Spot(np.zeros(2), flaw.reach, flaw.size, circle=True, jumps=flaw.rim))
+        if drawn.disc and np.hypot(*flaw.centre[:2]) < AXIS_TOLERANCE:
+            local_imperfections.append(
+                LocalImperfection(np.zeros(2), flaw.reach, flaw.size, circle=True, jumps=flaw.rim)
+            )
             continue
         centre = drawn.inverse(rotation(turn) @ flaw.centre)
         curve = contour(key, flaw, drawn, turn, centre, 1.0)
         radius = float(np.linalg.norm(curve - centre, axis=1).max())
-        placed.append(Spot(centre, radius, flaw.size, False, flaw.rim, curve if flaw.rim else None))
-    return placed
+        local_imperfections.append(
+            LocalImperfection(
+                centre, radius, flaw.size, False, flaw.rim, curve if flaw.rim else None
+            )
+        )
+    return local_imperfections
 
 
-def different(local: Iterable[Spot]) -> tuple[Array, ...]:
+def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
     """The rims that need edges of elements; of several that are nearly the same, the first."""
-    kept: list[Array] = []
+    rims: list[Array] = []
     for spot in local:
         rim = spot.rim
         if rim is not None and all(
-            np.abs(rim - other).max() > SAME_RIM * spot.size for other in kept
+            np.abs(rim - other).max() > RIM_TOLERANCE * spot.size for other in rims
         ):
-            kept.append(rim)
-    return tuple(kept)
+            rims.append(rim)
+    return tuple(rims)
 
 
 def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, part: float) -> Array:
@@ -274,34 +302,43 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     from its centre.
     """
     assert flaw.distance
-    distance, Q, wanted = flaw.distance, rotation(turn), part * flaw.reach
-    angles = np.arange(CORNERS) * 2 * np.pi / CORNERS
+    distance, Q, reach = flaw.distance, rotation(turn), part * flaw.reach
+    angles = np.arange(CONTOUR_CORNERS) * 2 * np.pi / CONTOUR_CORNERS
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
-    def beyond(t: Array) -> Array:
+    def distance_beyond(t: Array) -> Array:
         """On each ray the distance at (..., corners) of the chart, less the one that is wanted."""
         chart = centre + t[..., None] * rays
-        return distance(drawn.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - wanted
+        return distance(drawn.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
-    tried = np.linspace(0, WIDEST * wanted, STEPS + 1)[1:]
-    outside = beyond(np.tile(tried[:, None], CORNERS)) >= 0
-    if not outside.any(axis=0).all():
+    ray_lengths = np.linspace(0, MAX_CHART_STRETCH * reach, CONTOUR_STEPS + 1)[1:]
+    is_outside = distance_beyond(np.tile(ray_lengths[:, None], CONTOUR_CORNERS)) >= 0
+    if not is_outside.any(axis=0).all():
         raise CaseError(
             f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: "
             "it would reach around the shell or its axis"
         )
-    high = tried[outside.argmax(axis=0)]
-    low, below, above = high - tried[0], beyond(high - tried[0]), beyond(high)
-    for _ in range(ROUNDS):  # of the rule of false position, where the end that stays counts half
-        middle = high - above * (high - low) / (above - below)
-        between = beyond(middle)
-        crossed = between * above < 0
-        low, below = np.where(crossed, high, low), np.where(crossed, above, below / 2)
-        high, above = middle, np.where(between == 0, 1e-300, between)
+    high = ray_lengths[is_outside.argmax(axis=0)]
+    low, distance_low, distance_high = (
+        high - ray_lengths[0],
+        distance_beyond(high - ray_lengths[0]),
+        distance_beyond(high),
+    )
+    for _ in range(
+        FALSE_POSITION_ROUNDS
+    ):  # of the rule of false position, where the end that stays counts half
+        middle = high - distance_high * (high - low) / (distance_high - distance_low)
+        distance_at_middle = distance_beyond(middle)
+        is_crossed = distance_at_middle * distance_high < 0
+        low, distance_low = (
+            np.where(is_crossed, high, low),
+            np.where(is_crossed, distance_high, distance_low / 2),
+        )
+        high, distance_high = middle, np.where(distance_at_middle == 0, 1e-300, distance_at_middle)
     return np.asarray(centre + high[:, None] * rays)
 
 
-def images(spot: Spot, drawn: Outline) -> list[Array]:
+def images(spot: LocalImperfection, drawn: Outline) -> list[Array]:
     """Its centre (2,), and the same across glued sides of a grid."""
     if not (grid := drawn.grid):
         return [spot.centre]

@@ -220,7 +220,7 @@ class AppliedField:
                     field, "nowhere", "is where magnetic.applied has no finite value"
                 )
                 place = f"({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g})"
-                return f"the shell\'s point (x, y, z)/R = {place} {description}"
+                return f"the shell's point (x, y, z)/R = {place} {description}"
         return ""
 
 

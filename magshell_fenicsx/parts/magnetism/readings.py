@@ -119,8 +119,8 @@ class SensorsSeen(Seen):
         for sensor in loads.sensors:
             if surface_points.query(sensor.place)[0] < sensor.half:
                 raise CaseError(
-                    f"sensors.{sensor.name}.position: is in the shell, within half its thickness of "
-                    "it: place it outside"
+                    f"sensors.{sensor.name}.position: is in the shell, within half its thickness "
+                    "of it: place it outside"
                 )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:

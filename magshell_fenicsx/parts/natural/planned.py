@@ -1,4 +1,4 @@
-"""The natural shape of a case in the model's frame, and the symmetry that it leaves."""
+"""The natural shape of a case in the model's frame, and the symmetry that it preserves."""
 
 from collections.abc import Callable, Mapping
 
@@ -19,13 +19,14 @@ from magshell_fenicsx.shape.shell_sections import MeshSurface, PlateSurface, She
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 Array = NDArray[np.float64]
-SAME = 1e-9  # of the largest value: differences that are rounding
+EQUALITY_TOLERANCE = 1e-9  # over the largest value: smaller differences are rounding
 MERIDIAN = "meridian"
 
 
 def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natural | None:
-    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of
-    `Problem`.
+    """Return the natural shape in a frame turned by `turn` about e3 (rad); None without one.
+
+    `within` has the rims of patches by name, see `Problem`.
     """
     section = context.of(NaturalSection)
     if section is None:
@@ -33,27 +34,30 @@ def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natu
     Q, R = rotation(turn), context.shell.reference
 
     def varying(
-        value: object, whole: Callable[[object], list[float | str]], factor: float
+        value: object, components_of: Callable[[object], list[float | str]], factor: float
     ) -> Varying | None:
         if value is None:
             return None
         if isinstance(value, UserField):
             return value.mapped(
-                lambda numbers: factor * _completed(numbers, stretch=whole is _stretches)
+                lambda numbers: (
+                    factor * _three_numbers(numbers, stretch=components_of is _stretches)
+                )
             )
         if not isinstance(value, dict):
-            parts = whole(value)
+            parts = components_of(value)
             if any(isinstance(v, str) for v in parts):
                 return FormulaVectors([formula_function(v) for v in parts], Q, R, factor)
             return factor * np.array(parts, dtype=float)
         vectors = {
-            name: factor * np.array(whole(each), dtype=float) for name, each in value.items()
+            name: factor * np.array(components_of(patch_value), dtype=float)
+            for name, patch_value in value.items()
         }
         if isinstance(context.shell, MeshSurface):
             return vectors
-        outside = vectors.get("rest", np.zeros(3))
+        rest = vectors.get("rest", np.zeros(3))
         return WithinRims(
-            tuple((inside, vectors.get(name, outside)) for name, inside in within.items()), outside
+            tuple((inside, vectors.get(name, rest)) for name, inside in within.items()), rest
         )
 
     curvature, stretch = (
@@ -64,8 +68,9 @@ def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natu
 
 
 def frame(context: Context, turn: float) -> Pattern:
-    """A pattern whose part in the surface is the first direction of the frame, in a frame turned
-    about e3 (rad).
+    """Return a pattern whose part in the surface is the first direction of the natural frame.
+
+    The model's frame is turned by `turn` about e3 (rad).
     """
     direction = along(context)
     if direction == MERIDIAN:
@@ -79,24 +84,28 @@ def frame(context: Context, turn: float) -> Pattern:
 
 
 def along(context: Context) -> list[float | str] | str:
-    """The first direction of the frame, by default where the case has no natural shape."""
+    """Return the first direction of the frame, the default one without a natural shape."""
     flat = isinstance(context.shell, MeshSurface | PlateSurface)
     flat = flat or (isinstance(context.shell, ShellSection) and context.shell.geometry == "strip")
     natural = context.of(NaturalSection)
     return (natural and natural.along) or ([1.0, 0.0, 0.0] if flat else MERIDIAN)
 
 
-def uneven(context: Context) -> bool:
-    """Whether the frame counts: something is not the same in all directions."""
+def is_anisotropic(context: Context) -> bool:
+    """Return whether curvature or stretch differ with direction, so that the frame matters."""
     section = context.of(NaturalSection)
     assert section
     values = [section.curvature, section.stretch]
-    each = [v for value in values for v in (value.values() if isinstance(value, dict) else [value])]
-    return any(isinstance(v, list) for v in each) or any(given.size > 1 for given in section.given)
+    patch_values = [
+        v for value in values for v in (value.values() if isinstance(value, dict) else [value])
+    ]
+    return any(isinstance(v, list) for v in patch_values) or any(
+        field.size > 1 for field in section.given
+    )
 
 
 def askew(context: Context, outline: Outline) -> str | None:
-    """Why the natural shape cannot be turned about e3; None if it can."""
+    """Return why the natural shape is not axisymmetric about e3; None if it is."""
     section = context.of(NaturalSection)
     assert section
     direction, R = along(context), context.shell.reference
@@ -105,7 +114,7 @@ def askew(context: Context, outline: Outline) -> str | None:
     if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *patch_constraint])):
         return "the natural curvature twists: k12 is not zero"
     upright = [v == 0 for v in direction] == [True, True, False]
-    if uneven(context) and direction != MERIDIAN and not upright:
+    if is_anisotropic(context) and direction != MERIDIAN and not upright:
         return "the natural shape is not along the meridians"
     if outline.meridian and not all(
         scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts
@@ -115,23 +124,37 @@ def askew(context: Context, outline: Outline) -> str | None:
 
 
 def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
-    """Whether a plane mirrors the natural shape; patches are mapped onto themselves."""
+    """Return whether a plane mirrors the natural shape; patches are mapped onto themselves."""
     section = context.of(NaturalSection)
     assert section
     if section.given:
         return False
     x, R, direction = outline.sample(), context.shell.reference, along(context)
 
-    def alike(text: float | str, sign: float = 1.0) -> bool:
-        own, of_image = (formula_function(text)(*(R * places).T) for places in (x, mirror.image(x)))
-        size = np.abs(own).max(initial=0.0)
-        return bool(np.isfinite(own).all() and (np.abs(own - sign * of_image) <= SAME * size).all())
+    def is_mirrored(text: float | str, sign: float = 1.0) -> bool:
+        values, of_image = (
+            formula_function(text)(*(R * places).T) for places in (x, mirror.image(x))
+        )
+        size = np.abs(values).max(initial=0.0)
+        return bool(
+            np.isfinite(values).all()
+            and (np.abs(values - sign * of_image) <= EQUALITY_TOLERANCE * size).all()
+        )
 
-    twists = [c[2] for c in _each(section.curvature) if len(c) == 3]
-    even = [v for c in (*_each(section.curvature), *_each(section.stretch)) for v in c[:2]]
-    if not (all(alike(v) for v in even) and all(alike(v, -1.0) for v in twists)):
+    twists = [c[2] for c in _components_of_patches(section.curvature) if len(c) == 3]
+    even_components = [
+        v
+        for c in (
+            *_components_of_patches(section.curvature),
+            *_components_of_patches(section.stretch),
+        )
+        for v in c[:2]
+    ]
+    if not (
+        all(is_mirrored(v) for v in even_components) and all(is_mirrored(v, -1.0) for v in twists)
+    ):
         return False
-    if not uneven(context):
+    if not is_anisotropic(context):
         return True
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
@@ -140,12 +163,16 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
         for p in (x, mirror.image(x))
     )
     return any(
-        bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all())
+        bool(
+            (
+                np.abs(d @ mirror.reflection - sign * image) <= EQUALITY_TOLERANCE * np.abs(d).max()
+            ).all()
+        )
         for sign in (1, -1)
     )
 
 
-def _each(value: object) -> list[list[float | str]]:
+def _components_of_patches(value: object) -> list[list[float | str]]:
     return [components(v) for v in (value.values() if isinstance(value, dict) else [value])]
 
 
@@ -155,14 +182,14 @@ def _curvatures(value: object) -> list[float | str]:
 
 
 def _stretches(value: object) -> list[float | str]:
-    """Less one; of one number the thickness grows too."""
+    """Return stretches less one, (t1, t2, thickness); of one number the thickness grows too."""
     values = components(value)
-    less = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in values]
-    return [*less, 0.0] if len(values) == 2 else less * 3
+    strains = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in values]
+    return [*strains, 0.0] if len(values) == 2 else strains * 3
 
 
-def _completed(numbers: Array, *, stretch: bool) -> Array:
-    """The same (..., 1, 2 or 3) of a function of a program as three numbers."""
+def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
+    """Return values (..., 1, 2 or 3) of a program's function as three numbers."""
     if stretch and numbers.shape[-1] == 2:
         return np.concatenate([numbers - 1, np.zeros_like(numbers[..., :1])], axis=-1)
     if stretch:
@@ -175,10 +202,10 @@ def _completed(numbers: Array, *, stretch: bool) -> Array:
 
 
 def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
-    """The symmetry that the natural shape leaves."""
-    chosen = along(context) if uneven(context) else MERIDIAN
-    fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
-    vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
+    """Return the symmetry that the natural shape preserves."""
+    direction = along(context) if is_anisotropic(context) else MERIDIAN
+    fixed = not isinstance(direction, str) and all(isinstance(v, float | int) for v in direction)
+    vectors = [unit(np.array(direction, dtype=float))] if fixed else []
     return [
         SymmetryConstraint(
             askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror)
@@ -187,7 +214,7 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """What grows."""
+    """Describe what grows."""
     if not loads.natural:
         return Account(left_out=["natural shape: as drawn"])
     names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)

@@ -1,6 +1,4 @@
-"""The natural shape: the curvature and size that the shell would have without stress, and their
-growth as a load.
-"""
+"""The natural shape: the section of curvature and size without stress, and growth as a load."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -25,13 +23,14 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 _PER_LENGTH = re.compile(
-    rf"\s*(?P<number>{_NUMBER})[\s*]*(?:1?\s*/\s*(?P<below>[^\W\d]+)|(?P<power>[^\W\d]+)\s*(?:\*\*|\^)\s*-1)\s*"
+    rf"\s*(?P<number>{_NUMBER})[\s*]*"
+    r"(?:1?\s*/\s*(?P<below>[^\W\d]+)|(?P<power>[^\W\d]+)\s*(?:\*\*|\^)\s*-1)\s*"
 )
 PLACE = ("x", "y", "z", "pi")
 
 
 def per_length(value: Any) -> Any:
-    """Text such as "5/m" or "5 m^-1" as a number in 1/m; all else, formulas too, as it is."""
+    """Return text such as "5/m" or "5 m^-1" as a number in 1/m, and all else as it is."""
     matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
     unit = matched and (matched["below"] or matched["power"])
     if not matched or unit in PLACE:
@@ -40,31 +39,34 @@ def per_length(value: Any) -> Any:
 
 
 def _components(
-    numbers: int, least: float, most: float, *, lengths: bool = False
+    numbers: int, minimum: float, maximum: float, *, lengths: bool = False
 ) -> BeforeValidator:
-    """One value, a list of this many, or a mapping of patches to either; a value is a number or a
-    formula.
+    """Return a validator of one value, a list of `numbers`, or a mapping of patches to either.
+
+    A value is a number within bounds, or a formula.
     """
 
-    def one(value: Any) -> Any:
+    def checked_number(value: Any) -> Any:
         value = per_length(value) if lengths else value
         if isinstance(value, str):
             formula(value)
         elif (
             isinstance(value, bool)
             or not isinstance(value, int | float)
-            or not least <= value <= most
+            or not minimum <= value <= maximum
         ):
             raise ValueError(
-                f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, "
-                "y, z"
+                f"{value!r}: allowed are numbers from {minimum:g} to {maximum:g}, and formulas of "
+                "x, y, z"
             )
         return value
 
-    def some(value: Any) -> Any:
+    def checked_list(value: Any) -> Any:
         if isinstance(value, list) and len(value) != numbers:
             raise ValueError(f"a list has {numbers} values, this has {len(value)}")
-        return [one(v) for v in value] if isinstance(value, list) else one(value)
+        return (
+            [checked_number(v) for v in value] if isinstance(value, list) else checked_number(value)
+        )
 
     def read(value: Any) -> Any:
         if isinstance(value, UserField):
@@ -72,22 +74,22 @@ def _components(
                 raise ValueError(f"a function of {value.size} numbers; allowed are 1 and {numbers}")
             return value
         if not isinstance(value, dict):
-            return value if value is None else some(value)
+            return value if value is None else checked_list(value)
         if not value:
             raise ValueError("a mapping names at least one patch")
-        for name, each in value.items():
+        for name, patch_value in value.items():
             if any(
                 isinstance(v, str) and per_length(v) is v
-                for v in (each if isinstance(each, list) else [each])
+                for v in (patch_value if isinstance(patch_value, list) else [patch_value])
             ):
                 raise ValueError(f"{name}: of a patch numbers, no formulas")
-        return {name: some(each) for name, each in value.items()}
+        return {name: checked_list(patch_value) for name, patch_value in value.items()}
 
     kind = Number | Annotated[list[Number], Field(min_length=numbers, max_length=numbers)]
     return BeforeValidator(read, json_schema_input_type=kind | dict[str, kind] | None)
 
 
-CURVATURE = 1e6  # of a natural shape by formula, over 1/R
+MAX_CURVATURE = 1e6  # of a natural shape by formula, over 1/R
 Number = float | str
 Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
 Values = Annotated[
@@ -129,7 +131,7 @@ class NaturalSection(Section, Ability):
 
     @property
     def given(self) -> list[UserField]:
-        """Those that are functions of a program."""
+        """Curvature and stretch that are functions of a program."""
         return [value for value in (self.curvature, self.stretch) if isinstance(value, UserField)]
 
     @property
@@ -143,12 +145,12 @@ class NaturalSection(Section, Ability):
         ]
 
     def refuse_unfit(self, context: Context) -> None:
-        """A function of a program is one of the mid-surface."""
+        """Refuse functions of a program in a solid: they are functions on the mid-surface."""
         if self.given:
             context.needs("natural", "a mid-surface", hint="of a solid give numbers and formulas")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """A stretch makes a shell larger than it was drawn, without stress."""
+        """Withdraw the drawn area where a stretch makes the shell larger without stress."""
         return {} if self.stretch is None else {"the area as drawn": "leave out natural.stretch"}
 
     def patches(self) -> dict[str, Iterable[str]]:
@@ -167,10 +169,13 @@ class NaturalSection(Section, Ability):
         )  # the solver takes long to import
 
         R = context.shell.reference
-        bounds = {"stretch": (SMALLEST, LARGEST), "curvature": (-CURVATURE / R, CURVATURE / R)}
-        for name, (least, most) in bounds.items():
+        bounds = {
+            "stretch": (SMALLEST, LARGEST),
+            "curvature": (-MAX_CURVATURE / R, MAX_CURVATURE / R),
+        }
+        for name, (minimum, maximum) in bounds.items():
             value = getattr(self, name)
-            yield Formulas(f"natural.{name}", components(value), least, most, R)
+            yield Formulas(f"natural.{name}", components(value), minimum, maximum, R)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.natural.planned import (
@@ -181,7 +186,7 @@ class NaturalSection(Section, Ability):
 
 
 def components(value: Any) -> list[float | str]:
-    """The numbers and formulas of a curvature or stretch, none of patches and functions."""
+    """Return the numbers and formulas of a curvature or stretch, none of patches and functions."""
     return (
         value
         if isinstance(value, list)

@@ -79,7 +79,7 @@ class Natural:
 
     @property
     def amplitudes(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the amplitudes."""
         given = {CURVATURE: self.curvature, STRETCH: self.stretch}
         return tuple(name for name, value in given.items() if value is not None)
 
@@ -87,61 +87,68 @@ class Natural:
         self,
         patches: Mapping[str, NDArray[np.bool_]],
         cells: int,
-        carried: Callable[[UserField], Pattern] | None = None,
+        pattern_of: Callable[[UserField], Pattern] | None = None,
     ) -> "Natural":
-        """The same with a vector for each cell where it is given by patches, and with given fields
-        as patterns.
+        """Return the shape with vectors for each cell in place of patches, and patterns of fields.
 
         Raises
         ------
         MeshError
             If there is no such patch.
         """
-        given = {"curvature": self.curvature, "stretch": self.stretch}
+        values = {"curvature": self.curvature, "stretch": self.stretch}
         by_cell = {
             key: by_patch(value, patches, cells, f"natural.{key}")
-            for key, value in given.items()
+            for key, value in values.items()
             if isinstance(value, Mapping)
         }
-        varying = {key: value for key, value in given.items() if isinstance(value, UserField)}
+        varying = {key: value for key, value in values.items() if isinstance(value, UserField)}
         return replace(
-            self, **by_cell, **{key: carried(value) for key, value in varying.items() if carried}
+            self,
+            **by_cell,
+            **{key: pattern_of(value) for key, value in varying.items() if pattern_of},
         )
 
     def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
-        """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells,
-        nodes, 3).
+        """Return T and kappa (..., 3, 3) in space, and t (...), at undeformed places.
+
+        Places and normals are (cells, nodes, 3).
         """
         stretch, curvature = (_values(value, r0, n0) for value in (self.stretch, self.curvature))
-        t1, t2 = self._frame(r0, n0, (stretch[..., 0] != stretch[..., 1]) | _uneven(curvature))
+        t1, t2 = self._frame(
+            r0, n0, (stretch[..., 0] != stretch[..., 1]) | _is_anisotropic(curvature)
+        )
         return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
 
     def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
-        """Derivatives (..., 3) by kappa_11, kappa_22 and kappa_12 from those (..., 6) by kappa's
-        field.
+        """Return derivatives (..., 3) by kappa_11, kappa_22 and kappa_12, from those by the field.
+
+        `forces` (..., 6) are derivatives by the six numbers of kappa in the field.
         """
         t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
         ones = (_tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3))
-        return np.stack([np.sum(forces * one, axis=-1) for one in ones], axis=-1)
+        return np.stack([np.sum(forces * unit_tensor, axis=-1) for unit_tensor in ones], axis=-1)
 
     @property
     def formulas(self) -> FormulaGroup | None:
-        """Those of stretch and curvature."""
-        given = (getattr(each, "formulas", None) for each in (self.stretch, self.curvature))
-        several = [each for each in given if each]
+        """Formulas of stretch and curvature; None without any."""
+        groups = (getattr(value, "formulas", None) for value in (self.stretch, self.curvature))
+        known_groups = [value for value in groups if value]
         return (
-            replace(several[0], functions=[f for one in several for f in one.functions])
-            if several
+            replace(
+                known_groups[0], functions=[f for group in known_groups for f in group.functions]
+            )
+            if known_groups
             else None
         )
 
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """t1 and t2 (cells, nodes, 3); zero where nobody needs them and they are not there."""
+        """Return t1 and t2 (cells, nodes, 3); zero where they do not exist and are not needed."""
         d = self.along(r0, n0)
         d = d - np.einsum("...i,...i->...", d, n0)[..., None] * n0
         length = np.linalg.norm(d, axis=-1, keepdims=True)
-        if (bad := needed & ~(length[..., 0] > NORMAL)).any():
-            x, y, z = r0[bad][0]
+        if (has_no_direction := needed & ~(length[..., 0] > NORMAL)).any():
+            x, y, z = r0[has_no_direction][0]
             raise MeshError(
                 f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, "
                 f"{y:.3g}, {z:.3g})"
@@ -151,16 +158,14 @@ class Natural:
 
 
 def meridians(r0: Array, n0: Array) -> Array:
-    """Along the meridians, across circles about e3: e_theta x n; on the axis, where there are none,
-    e1.
-    """
+    """Return the directions (..., 3) of meridians, e_theta x n; on the axis e1."""
     x, y = r0[..., 0], r0[..., 1]
     off = np.hypot(x, y)[..., None] > NORMAL
     return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
 
 
 def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.Function:
-    """The natural shape in every cell of V, free to jump between cells; collective.
+    """Return the natural shape as a field that may jump between cells of V; collective.
 
     Raises
     ------
@@ -168,22 +173,22 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
         On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no
         direction.
     """
-    said, element = None, V.element.basix_element
+    message, element = None, V.element.basix_element
     r0, n0, _ = cells.at(element.points)
     try:
         _refuse_unfit(natural, r0, n0)
         T, kappa, t = natural.at(r0, n0)
     except MeshError as e:
-        said = str(e)
-    if problems := [text for text in V.mesh.comm.allgather(said) if text]:
+        message = str(e)
+    if problems := [text for text in V.mesh.comm.allgather(message) if text]:
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
     field = OfPlacement(
         Q, "natural", lambda r: natural_field(natural, cells_of(r), r.function_space)
     )
     values = _numbers(T, kappa, t)
-    if any(getattr(each, "by_formula", False) for each in (natural.stretch, natural.curvature)):
-        of = fitted(
+    if any(getattr(value, "by_formula", False) for value in (natural.stretch, natural.curvature)):
+        fitted_numbers = fitted(
             lambda x, n: _numbers(*natural.at(x, n)),
             cells,
             values,
@@ -192,34 +197,32 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
             bounded=True,
             formulas=natural.formulas,
         )
-        values = of.nodal
+        values = fitted_numbers.nodal
     field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
     return field
 
 
 def _numbers(T: Array, kappa: Array, t: Array) -> Array:
-    """Those of a field."""
+    """Return the numbers (..., SIZE) of a field."""
     return np.concatenate([kappa[..., *FIELD], T[..., *FIELD], t[..., None]], axis=-1)
 
 
 def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
     stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
-    fine = {
+    is_valid = {
         f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST)
         & (stretch <= LARGEST),
         "curvature: has no finite value (or one above 1e6/R)": np.abs(curvature) <= 1e6,
     }
-    for what, good in fine.items():
-        if not good.all():
-            x, y, z = r0[~good.all(axis=-1)][0]
-            raise MeshError(f"natural.{what} at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
+    for description, valid in is_valid.items():
+        if not valid.all():
+            x, y, z = r0[~valid.all(axis=-1)][0]
+            raise MeshError(f"natural.{description} at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A natural shape in the densities of a model: its field, see `natural_field`, and its
-    amplitudes; None for 0.
-    """
+    """A natural shape in the densities of a model: its field and its amplitudes; None for 0."""
 
     field: fem.Function
     curvature: fem.Constant | None
@@ -227,7 +230,7 @@ class Shape:
 
     @classmethod
     def of(cls, field: fem.Function, natural: Natural, shared: Constants) -> "Shape":
-        """With amplitudes that all terms of a model share, kept in `known`."""
+        """Return the shape with amplitudes from `shared`, which all terms of a model use."""
         domain = field.function_space.mesh
         amplitudes = {
             name: shared.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes
@@ -241,12 +244,13 @@ class Shape:
 
     @property
     def values(self) -> tuple[Array, ...] | None:
-        """On which the natural volume depends; None if that is the undeformed one."""
+        """Values that the natural volume depends on; None if it is the undeformed one."""
         return None if self.stretch is None else (self.field.x.array, self.stretch.value)
 
     def volume(self, first: Array, points: Array) -> Array:
-        """Natural over undeformed volume (cells, places), of a surface with these tangents (2,
-        cells, places, 3).
+        """Return natural over undeformed volume (cells, places).
+
+        `first` (2, cells, places, 3) are the tangents of the surface.
         """
         assert self.stretch is not None
         return np.asarray(
@@ -254,42 +258,49 @@ class Shape:
         )
 
     def volumes(self, first: Array, points: Array) -> Array:
-        """Its coefficients (4, cells, places) by powers of the amplitude of the stretch: det(1 + mu
-        T) (1 + mu t).
+        """Return the coefficients (4, cells, places) of det(1 + mu T) (1 + mu t) by powers of mu.
+
+        mu is the amplitude of the stretch.
         """
         numbers = at_quadrature(self.field, points)
         T = np.empty((*numbers.shape[:2], 3, 3))
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
-        a = np.moveaxis(first, 0, -2)
-        mixed = np.linalg.solve(a @ np.swapaxes(a, -1, -2), a @ T @ np.swapaxes(a, -1, -2))
+        tangents = np.moveaxis(first, 0, -2)
+        mixed = np.linalg.solve(
+            tangents @ np.swapaxes(tangents, -1, -2), tangents @ T @ np.swapaxes(tangents, -1, -2)
+        )
         t, trace, det = numbers[..., 12], np.trace(mixed, axis1=-2, axis2=-1), np.linalg.det(mixed)
         return np.array([np.ones_like(t), trace + t, det + trace * t, det * t])
 
     def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
-        """The natural forms at a point where the field and the amplitudes have these values."""
-        given = list(amplitudes)
+        """Return the natural forms at a point where the field and the amplitudes have values."""
+        values = list(amplitudes)
         bent, stretched = (
-            given.pop(0) if p is not None else None for p in (self.curvature, self.stretch)
+            values.pop(0) if p is not None else None for p in (self.curvature, self.stretch)
         )
         return _forms(r0, field, bent, stretched)
 
 
-def _forms(r0: Jet, field: Expr, bent: Expr | None, stretched: Expr | None) -> Forms:
+def _forms(
+    r0: Jet, field: Expr, curvature_factor: Expr | None, stretch_factor: Expr | None
+) -> Forms:
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
-    kappa = ufl.zero((2, 2)) if bent is None else bent * covariant(r0, field, 0)
-    if stretched is None:
+    kappa = (
+        ufl.zero((2, 2)) if curvature_factor is None else curvature_factor * covariant(r0, field, 0)
+    )
+    if stretch_factor is None:
         return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
-    t = stretched * field[12]
-    mixed = stretched * ufl.dot(up, covariant(r0, field, 6))
+    t = stretch_factor * field[12]
+    mixed = stretch_factor * ufl.dot(up, covariant(r0, field, 6))
     U = ufl.Identity(2) + mixed
     twice = 2 * mixed + ufl.dot(mixed, mixed)  # U^2 - 1
     metric = a0 + ufl.dot(a0, twice)
     grown = (ufl.sym(ufl.dot(b0, twice)) - t * b0) / (1 + t)
     return Forms(
         ufl.dot(a0, twice) / 2,
-        grown if bent is None else grown + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
+        grown if curvature_factor is None else grown + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
         metric,
         ufl.inv(metric),
         ufl.det(U),
@@ -298,7 +309,7 @@ def _forms(r0: Jet, field: Expr, bent: Expr | None, stretched: Expr | None) -> F
 
 
 def grown(density: Density, shape: Shape) -> Density:
-    """A density that takes `natural` forms, of that shape."""
+    """Return a density with natural forms, from one that takes `natural`."""
 
     def of(*arguments: Expr) -> Expr:
         count = len(arguments) - len(shape.parameters)
@@ -313,7 +324,7 @@ def grown(density: Density, shape: Shape) -> Density:
 
 
 def covariant(r0: Jet, field: Expr, first: int) -> Expr:
-    """The components in the surface's coordinates of a symmetric tensor in space."""
+    """Return the components in the surface's coordinates of a symmetric tensor in space."""
     xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
     S = ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     S1, S2 = ufl.dot(S, r0.r1), ufl.dot(S, r0.r2)
@@ -328,13 +339,14 @@ def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
     return value(r0, n0) if callable(value) else np.broadcast_to(value, r0.shape)
 
 
-def _uneven(curvature: Array) -> NDArray[np.bool_]:
+def _is_anisotropic(curvature: Array) -> NDArray[np.bool_]:
     return np.asarray((curvature[..., 0] != curvature[..., 1]) | (curvature[..., 2] != 0))
 
 
 def _tensor(components: Array, t1: Array, t2: Array) -> Array:
-    """Of S_11, S_22 and perhaps S_12 in a frame; S_22 times the unit tensor, exactly, where it is
-    isotropic.
+    """Return the tensor (..., 3, 3) with components S_11, S_22 and perhaps S_12 in a frame.
+
+    Where it is isotropic it is S_22 times the unit tensor, exactly.
     """
 
     def product(a: Array, b: Array) -> Array:
@@ -348,9 +360,9 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
 
 
 def body_shape(
-    natural: Natural, body: BodyMesh, V: fem.FunctionSpace, free: dict[str, fem.Constant]
+    natural: Natural, body: BodyMesh, V: fem.FunctionSpace, shared: dict[str, fem.Constant]
 ) -> Shape:
-    """The natural shape of a body; collective.
+    """Return the natural shape of a solid; collective.
 
     Raises
     ------
@@ -365,30 +377,30 @@ def body_shape(
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
     field = fem.Function(Q, name="natural")
     rows = field.x.array.reshape(-1, HEIGHT_AT + 1)
-    given = numbers.x.array.reshape(-1, SIZE)[numbers.function_space.dofmap.list]
-    rows[Q.dofmap.list] = np.concatenate([given, normals, z[..., None]], axis=-1)
-    return Shape.of(field, natural, free)
+    shell_numbers = numbers.x.array.reshape(-1, SIZE)[numbers.function_space.dofmap.list]
+    rows[Q.dofmap.list] = np.concatenate([shell_numbers, normals, z[..., None]], axis=-1)
+    return Shape.of(field, natural, shared)
 
 
 def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
-    """What grows there, a tensor in space, where the field and the amplitudes have these values."""
-    given = list(amplitudes)
-    bent, stretched = (
-        given.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch)
+    """Return the growth tensor G in space at a point with values of field and amplitudes."""
+    values = list(amplitudes)
+    curvature_factor, stretch_factor = (
+        values.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch)
     )
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
     n = n / ufl.sqrt(ufl.dot(n, n))
-    across = ufl.outer(n, n)
-    P = ufl.Identity(3) - across
+    normal_projection = ufl.outer(n, n)
+    P = ufl.Identity(3) - normal_projection
     s, U = 1, P
-    if stretched is not None:
+    if stretch_factor is not None:
         s, U = (
-            1 + stretched * field[12],
-            P + stretched * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P)),
+            1 + stretch_factor * field[12],
+            P + stretch_factor * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P)),
         )
-    if bent is not None:
-        U = U - s * z * bent * ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
-    return U + s * across
+    if curvature_factor is not None:
+        U = U - s * z * curvature_factor * ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
+    return U + s * normal_projection
 
 
 def _tensor_in_space(field: Expr, first: int) -> Expr:

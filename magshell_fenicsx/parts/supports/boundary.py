@@ -42,7 +42,7 @@ class HeldSection(Section):
 
 
 def _condition(value: Any) -> Any:
-    """One message for a union."""
+    """Validate a condition, with one message for all kinds."""
     if isinstance(value, HeldSection) or (
         isinstance(value, str) and value in get_args(EdgeCondition)
     ):
@@ -75,7 +75,7 @@ class BoundarySection(Section, Ability):
     ]
 
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
-        """Name -> condition."""
+        """Return name -> condition."""
         return dict(self.__pydantic_extra__ or {})
 
     def warning(self, context: Context, places: Array) -> str | None:
@@ -94,8 +94,7 @@ class BoundarySection(Section, Ability):
         )
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that the names of points are free, and that a geometry has the edges that are
-        named."""
+        """Refuse names of points that are taken, and of edges that the geometry does not have."""
         refuse_taken(context.points)
         shell = context.shell
         edges = EDGES[shell.geometry] if isinstance(shell, ShellSection) else ()
@@ -106,7 +105,7 @@ class BoundarySection(Section, Ability):
                 )
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """With an edge in a mirror plane the case is a part of a shape."""
+        """Withdraw the whole shell where an edge lies in a mirror plane: the case is a part."""
         part = "symmetry" in self.conditions().values()
         return (
             {"the whole shell": "with boundary: symmetry the case is a part of it alone"}
@@ -118,10 +117,10 @@ class BoundarySection(Section, Ability):
     def fixes(self) -> bool:
         """Whether an edge or a point is held in all directions."""
         return any(
-            len(each.components) == 3
-            if isinstance(each, HeldSection)
-            else each in ("clamped", "simply supported", "hinged")
-            for each in self.conditions().values()
+            len(condition.components) == 3
+            if isinstance(condition, HeldSection)
+            else condition in ("clamped", "simply supported", "hinged")
+            for condition in self.conditions().values()
         )
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
@@ -149,23 +148,23 @@ class BoundarySection(Section, Ability):
         return parts
 
     def _mirrored(self, context: Context, name: str, mirror: Mirror) -> bool:
-        """The other half is held in the same way, and a point that is held is on the plane."""
+        """Return whether the other half is held in the same way, a held point on the plane."""
         conditions = self.conditions()
         condition, other = conditions[name], conditions.get(mirror.image_of_edge(name), "free")
         if isinstance(condition, HeldSection):
-            held, S = (
+            held_projection, S = (
                 np.diag([float(i in condition.components) for i in range(3)]),
                 mirror.reflection,
             )
-            if np.abs(S @ held @ S - held).max() > PARALLEL:
+            if np.abs(S @ held_projection @ S - held_projection).max() > PARALLEL:
                 return False
         place = context.points.get(name)
-        off = (
+        offset = (
             0.0
             if place is None
             else float(mirror.signed_distance(np.array(place) / context.shell.reference))
         )
-        return abs(off) < ROUNDING and condition == other
+        return abs(offset) < ROUNDING and condition == other
 
 
 def refuse_taken(points: Iterable[str]) -> None:

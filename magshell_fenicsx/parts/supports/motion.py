@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-UNHELD = ("free", "symmetry")
+UNHELD_CONDITIONS = ("free", "symmetry")
 
 
 class TurnSection(AboutAxis):
@@ -93,8 +93,8 @@ class EdgeSection(PathStep):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the motion"
             )
-        named = [name for move in self.moves for name in move.supports]
-        if twice := next((name for name in named if named.count(name) > 1), None):
+        supports = [name for move in self.moves for name in move.supports]
+        if twice := next((name for name in supports if supports.count(name) > 1), None):
             raise ValueError(
                 f"moves: {twice}: moves twice in one step; let a later step move it again"
             )
@@ -124,13 +124,15 @@ class EdgeSection(PathStep):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         boundary = context.of(BoundarySection)
         conditions = boundary.conditions() if boundary else {}
-        held = sorted(name for name, condition in conditions.items() if condition not in UNHELD)
+        held_names = sorted(
+            name for name, condition in conditions.items() if condition not in UNHELD_CONDITIONS
+        )
         for i, move in enumerate(self.moves):
             for name in move.supports:
-                if name not in held:
+                if name not in held_names:
                     raise ValueError(
                         f"{step.key}.moves.{i}.supports: {name}: only what boundary holds "
-                        f"(clamped, hinged or held) can move: {', '.join(held) or 'nothing'}"
+                        f"(clamped, hinged or held) can move: {', '.join(held_names) or 'nothing'}"
                     )
 
     def leaves(
@@ -149,57 +151,63 @@ class EdgeSection(PathStep):
         R, turn = context.shell.reference, modelled.turn
         return {
             "moves": tuple(
-                Move(tuple(one.supports), motion(one, step.name, R, turn)) for one in self.moves
+                Move(tuple(move.supports), motion(move, step.name, R, turn)) for move in self.moves
             )
         }
 
 
 def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMotion:
-    """A motion with the amplitude `name`, over the length R."""
-    Q, about, zero = rotation(turn), move.rotation, np.zeros(3)
+    """Return the rigid motion of a section with the amplitude `name`, over the length R."""
+    Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)
     shift = Q @ (np.array(move.translation) / R) if move.translation else zero
-    if about is None:
+    if rotation_section is None:
         return RigidMotion(name, shift, zero, zero)
-    axis = np.array(about.axis) / np.linalg.norm(about.axis)
+    axis = np.array(rotation_section.axis) / np.linalg.norm(rotation_section.axis)
     return RigidMotion(
-        name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R)
+        name,
+        shift,
+        radians(rotation_section.angle) * (Q @ axis),
+        Q @ (np.array(rotation_section.point) / R),
     )
 
 
 def sideways(load: EdgeSection) -> str | None:
-    """Why a motion is not axisymmetric; None if it is."""
-    for one in load.moves:
-        if one.rotation or (one.translation and any(one.translation[:2])):
-            return f"the motion of {one.supports[0]} is not along e3"
+    """Return why a motion is not axisymmetric; None if it is."""
+    for move in load.moves:
+        if move.rotation or (move.translation and any(move.translation[:2])):
+            return f"the motion of {move.supports[0]} is not along e3"
     return None
 
 
 def held_vectors(load: EdgeSection) -> list[Array]:
-    """Unit vectors (3,) that a mirror plane through e3 must hold: translations, and normals of axes
-    of rotation.
+    """Return unit vectors (3,) that a mirror plane through e3 must contain.
+
+    These are translations, and normals of axes of rotation.
     """
-    vectors = [np.array(one.translation) for one in load.moves if one.translation]
-    vectors += [np.cross([0.0, 0.0, 1.0], one.rotation.axis) for one in load.moves if one.rotation]
+    vectors = [np.array(move.translation) for move in load.moves if move.translation]
+    vectors += [
+        np.cross([0.0, 0.0, 1.0], move.rotation.axis) for move in load.moves if move.rotation
+    ]
     return [v / np.linalg.norm(v) for v in vectors if v.any()]
 
 
 def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
-    """Whether a plane maps the motions onto themselves."""
-    motions = {name: motion(one, "", R) for one in load.moves for name in one.supports}
+    """Return whether a plane maps the motions onto themselves."""
+    motions = {name: motion(move, "", R) for move in load.moves for name in move.supports}
     return all(
         mirror.image_of_edge(name) in motions
-        and _is_image(one, motions[mirror.image_of_edge(name)], mirror)
-        for name, one in motions.items()
+        and _is_image(move, motions[mirror.image_of_edge(name)], mirror)
+        for name, move in motions.items()
     )
 
 
-def _is_image(one: RigidMotion, other: RigidMotion, mirror: Mirror) -> bool:
+def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
     """A mirrored rotation runs the other way about the mirrored axis."""
-    S, along = mirror.reflection, other.turn / (np.linalg.norm(other.turn) or 1.0)
-    apart = mirror.image(one.centre) - other.centre
-    size = max(np.abs([one.shift, one.turn]).max(), ROUNDING)
+    S, axis = mirror.reflection, second.turn / (np.linalg.norm(second.turn) or 1.0)
+    offset = mirror.image(first.centre) - second.centre
+    size = max(np.abs([first.shift, first.turn]).max(), ROUNDING)
     return bool(
-        np.abs(S @ one.shift - other.shift).max() < ROUNDING * size
-        and np.abs(S @ one.turn + other.turn).max() < ROUNDING * size
-        and (not other.turns or np.abs(apart - (apart @ along) * along).max() < ROUNDING)
+        np.abs(S @ first.shift - second.shift).max() < ROUNDING * size
+        and np.abs(S @ first.turn + second.turn).max() < ROUNDING * size
+        and (not second.turns or np.abs(offset - (offset @ axis) * axis).max() < ROUNDING)
     )

@@ -1,4 +1,4 @@
-"""Supports that move: what is held, and the bodies that the motions of the loads make of them."""
+"""Supports that move: their unknowns, and the rigid bodies that the loads' motions make of them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ PRECEDENCE: tuple[SupportKind, ...] = ("point", "part", "plane")
 
 @dataclass(frozen=True)
 class Support:
-    """What a named edge, point or patch holds.
+    """Unknowns that a named edge, point or patch holds.
 
     Attributes
     ----------
     dofs
-        Local numbers, with ghosts, of the components of the displacement.
+        Local numbers, with ghosts, of the held components of the displacement.
     edge
         Name of the term that holds the normal of a clamped edge; "" without.
     turn
@@ -50,23 +50,23 @@ class Support:
     @classmethod
     def of(
         cls,
-        held: Iterable[fem.DirichletBC],
+        conditions: Iterable[fem.DirichletBC],
         edge: str = "",
         turn: fem.Constant | None = None,
         *,
         kind: SupportKind = "part",
     ) -> "Support":
-        dofs = [bc.dof_indices()[0] for bc in held]
+        dofs = [bc.dof_indices()[0] for bc in conditions]
         return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, kind)
 
 
 def motions_of(loads: Loads, name: str) -> Sequence[RigidMotion]:
-    """The motions of a support, in the order of the loads."""
+    """Return the motions of a support, in the order of the loads."""
     return [move.motion for move in loads.moves if name in move.names]
 
 
 def rotation_of(loads: Loads, name: str, V: fem.FunctionSpace) -> fem.Constant | None:
-    """The rotation of a clamped edge, to be set; None if no motion turns it."""
+    """Return a constant for the rotation of a clamped edge; None if no motion turns it."""
     turns = any(motion.turns for motion in motions_of(loads, name))
     return fem.Constant(V.mesh, np.eye(3)) if turns else None
 
@@ -75,21 +75,22 @@ def moving(
     r0: fem.Function,
     supports: Mapping[str, Support],
     loads: Loads,
-    pressed: EdgePressure | None = None,
+    edge_pressure: EdgePressure | None = None,
 ) -> PrescribedMotion | None:
-    """The nodes that move; None without motions."""
-    moved = {name: motions_of(loads, name) for name in supports}
+    """Return the prescribed motion of the supports' nodes; None without motions."""
+    motions_of_supports = {name: motions_of(loads, name) for name in supports}
     bodies = [
-        RigidBody(moved[name], s.dofs, s.edge, s.turn)
+        RigidBody(motions_of_supports[name], s.dofs, s.edge, s.turn)
         for name, s in supports.items()
-        if moved[name]
+        if motions_of_supports[name]
     ]
-    return PrescribedMotion(r0, bodies, pressed) if bodies else None
+    return PrescribedMotion(r0, bodies, edge_pressure) if bodies else None
 
 
 def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collection[str]) -> bool:
-    """Whether lids on edges that move close the shell: all edges are held, move, or lie in planes
-    of symmetry.
+    """Return whether closing surfaces on moving edges close the shell.
+
+    All edges must be held, move, or lie in planes of symmetry.
     """
     return (
         bool(loads.moves)
@@ -106,7 +107,7 @@ def pressed_edges(
     unit: float,
     closing: NDArray[np.float64] | None,
 ) -> EdgePressure:
-    """What a live pressure does at the edges that move, of a shell that lids close; collective.
+    """Return the live pressure on the closing surfaces at moving edges; collective.
 
     Edges that move alike have one lid, if together they are closed or end on planes of symmetry.
 
@@ -122,24 +123,24 @@ def pressed_edges(
         A point (3,) of all planes of symmetry; None if they have none.
     """
     comm, x = r0.function_space.mesh.comm, r0.x.array.reshape(-1, 3)
-    alike = dict[tuple[object, ...], list[str]]()
+    edges_by_motion = dict[tuple[object, ...], list[str]]()
     for name in curves:
         if motions := motions_of(loads, name):
-            same = tuple(
+            motion_key = tuple(
                 (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
             )
-            alike.setdefault(same, []).append(name)
+            edges_by_motion.setdefault(motion_key, []).append(name)
     on_planes = np.concatenate(
         [np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)]
     )
     on_any = np.concatenate(comm.allgather(on_planes))
     lids = []
-    for names in alike.values():
+    for names in edges_by_motion.values():
         of_lid = [curves[name] for name in names]
         open_at = end_corners(of_lid, comm)
         if not len(open_at) or (closing is not None and np.isin(open_at, on_any).all()):
             origin = np.zeros(3) if closing is None else closing
             lids.append(Lid.cone(of_lid, x, motions_of(loads, names[0]), origin, comm))
     return EdgePressure(
-        PRESSURE, unit, lids, [curves[name] for names in alike.values() for name in names]
+        PRESSURE, unit, lids, [curves[name] for names in edges_by_motion.values() for name in names]
     )

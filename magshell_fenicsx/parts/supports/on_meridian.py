@@ -1,6 +1,4 @@
-"""Supports of a meridian: displacements that are zero at its ends, and the rigid motions that they
-may stop.
-"""
+"""Supports of a meridian: displacements that are zero at its ends, and rigid motions they stop."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.parts.supports.supports import RIGHT, no_mirror
+from magshell_fenicsx.parts.supports.supports import MIN_CROSSING_COSINE, no_mirror
 
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
@@ -65,11 +63,14 @@ class Supports:
     meridian: Meridian
 
     def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
-        """Of the axisymmetric displacement (U, W)."""
+        """Return the conditions on the axisymmetric displacement (U, W)."""
         return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
 
     def held_waves(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
-        """Of the coefficients (U + V, V, W): a wave m = 1 may move the axis across itself."""
+        """Return the conditions on the coefficients (U + V, V, W) of waves m.
+
+        A wave m = 1 may move the axis across itself.
+        """
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [
             *at_axis,
@@ -92,23 +93,23 @@ class Supports:
 
     def rigid_motions(self, r0: fem.Function) -> RigidMotions:
         """Return the rigid motions of each shell, or of those joined, whatever holds them."""
-        along, around, across = list[Array](), list[Array](), list[Array]()
+        along_motions, around_waves, across_waves = list[Array](), list[Array](), list[Array]()
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
             rho, z, one = np.zeros((3, len(places)))
             nodes = r0.function_space.dofmap.list[cells]
             one[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
             zero = 0.0 * one
-            along.append(np.column_stack([zero, one]).ravel())
-            around.append(np.column_stack([rho, rho, zero]).ravel())
-            across += [
+            along_motions.append(np.column_stack([zero, one]).ravel())
+            around_waves.append(np.column_stack([rho, rho, zero]).ravel())
+            across_waves += [
                 np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])
             ]
-        return RigidMotions(np.array(along), np.array(around), np.array(across))
+        return RigidMotions(np.array(along_motions), np.array(around_waves), np.array(across_waves))
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
-    """The supports that conditions of named ends make, and those of a named point on the axis.
+    """Return the supports that conditions of named ends and points on the axis make.
 
     Raises
     ------
@@ -116,35 +117,37 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
         If an end lies in no plane of symmetry.
     """
     horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
-    named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
+    named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
         end = meridian.ends[name] if name in meridian.ends else meridian.facets_at(name)
-        held = set(condition.components) if isinstance(condition, Held) else set()
+        components = set(condition.components) if isinstance(condition, Held) else set()
         if condition in ("clamped", "simply supported"):
-            held = {*HORIZONTAL, AXIAL}
+            components = {*HORIZONTAL, AXIAL}
         if condition == "plane":
             _refuse_slanting(meridian, name)
             mirror.append(end)
-            held = {AXIAL}
-        if held >= HORIZONTAL:
+            components = {AXIAL}
+        if components >= HORIZONTAL:
             horizontal.append(end)
-        if AXIAL in held:
+        if AXIAL in components:
             axial.append(end)
-        both = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if held >= part)
-        if both:
-            named[name] = end, both
+        held_in_plane = tuple(
+            i for i, part in enumerate((HORIZONTAL, {AXIAL})) if components >= part
+        )
+        if held_in_plane:
+            named_ends[name] = end, held_in_plane
     parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
-    return Supports(meridian.axis, parts[0], parts[1], parts[2], named, meridian)
+    return Supports(meridian.axis, parts[0], parts[1], parts[2], named_ends, meridian)
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:
-    """See that the surface crosses the plane of an end at right angles."""
-    s, near = (
+    """Refuse a surface that does not cross the plane of an end at right angles."""
+    s, offset = (
         meridian.parameter(name),
         PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE,
     )
-    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + near]))
-    if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
+    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + offset]))
+    if abs(z_near - z) < MIN_CROSSING_COSINE * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))
 
 

@@ -1,4 +1,4 @@
-"""Reactions of supports, and those along motions, as columns of path.csv in the case's units."""
+"""Observables of supports: reactions, and their work-conjugates to motions, in the case's units."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
@@ -20,19 +20,20 @@ Array = NDArray[np.float64]
 
 
 def columns(supports: Iterable[str]) -> tuple[str, ...]:
-    """The columns of supports: forces and moments along the axes."""
+    """Return the columns of supports: forces and moments along the axes."""
     return tuple(f"{name}_{kind}{axis}" for name in supports for kind in "fm" for axis in "xyz")
 
 
 def motion_columns(loads: "Loads") -> dict[str, str]:
-    """Amplitude of a motion -> the column of its reaction."""
+    """Return amplitude of a motion -> the column of its reaction."""
     names = list(dict.fromkeys(move.motion.name for move in loads.moves))
     return {name: "reaction" if len(names) == 1 else f"reaction_{name}" for name in names}
 
 
 def motion_size(loads: "Loads", name: str) -> float:
-    """The sum of the lengths of the translations of an amplitude, over R; without any of the angles
-    (rad).
+    """Return the sum of the lengths of an amplitude's translations, over R.
+
+    Without translations, it is the sum of its angles (rad).
     """
     motions = [move.motion for move in loads.moves if move.motion.name == name for _ in move.names]
     shifts = float(sum(np.linalg.norm(motion.shift) for motion in motions))
@@ -40,7 +41,7 @@ def motion_size(loads: "Loads", name: str) -> float:
 
 
 def only_turns(loads: "Loads", name: str) -> bool:
-    """Whether a motion has rotations alone, so that its reaction is a moment."""
+    """Return whether a motion has rotations alone, so that its reaction is a moment."""
     return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
 
@@ -89,7 +90,7 @@ class Moved(Seen):
         }
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        """Forces and moments in the case's units."""
+        """Return amplitudes, reactions, forces and moments, in the case's units."""
         values: dict[str, float] = {}
         for name, column in motion_columns(sight.loads).items():
             values |= {
@@ -119,7 +120,7 @@ def observed_reactions(
     force: float,
     length: float,
 ) -> dict[str, float]:
-    """The values of `columns` of all supports, sorted by support; collective.
+    """Return the values of `columns` of all supports, sorted by support; collective.
 
     Parameters
     ----------
@@ -133,13 +134,15 @@ def observed_reactions(
     )  # the solver takes long to import
 
     by_column: dict[str, float] = {}
-    for name, one in reactions(model, state, mirror).items():
-        values = np.concatenate([force * one.force @ frame, force * length * one.moment @ frame])
+    for name, reaction in reactions(model, state, mirror).items():
+        values = np.concatenate(
+            [force * reaction.force @ frame, force * length * reaction.moment @ frame]
+        )
         by_column |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
     return by_column
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """What moves."""
-    moved = dict.fromkeys(name for move in loads.moves for name in move.names)
-    return Account([f"supports that move: {', '.join(moved)}"] if moved else [])
+    """Describe the supports that move."""
+    moving_supports = dict.fromkeys(name for move in loads.moves for name in move.names)
+    return Account([f"supports that move: {', '.join(moving_supports)}"] if moving_supports else [])

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a support does to the whole shell.
+    """Force and moment of a support on the whole shell.
 
     Attributes
     ----------
@@ -36,13 +36,14 @@ class Reaction:
     point: Array
 
     def image(self, S: Array, point: Array) -> "Reaction":
-        """What the mirror image of the support does; `S` mirrors vectors, and `point` is the image
-        of the point.
+        """Return the reaction of the support's mirror image.
+
+        `S` (3, 3) mirrors vectors, and `point` (3,) is the image of the point.
         """
         return Reaction(S @ self.force, -S @ self.moment, point)
 
     def whole(self, mirror: Mirror) -> "Reaction":
-        """What a support does that is its own image, the point too."""
+        """Return the whole reaction of a support that is its own image, from that of a half."""
         return Reaction(
             mirror.sum_over_images(self.force),
             mirror.sum_over_images(self.moment, -1.0),
@@ -51,7 +52,7 @@ class Reaction:
 
 
 def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
-    """The reactions of all supports in the model's frame; collective.
+    """Return the reactions of all supports in the model's frame; collective.
 
     A point has the force of its node; edges and patches that hold a node together share it equally.
     A clamped edge also makes a couple: its energy is invariant if shell and edge turn together, so
@@ -60,7 +61,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     Parameters
     ----------
     mirror
-        Of a half model or a sector: the reactions are those of the whole shell.
+        Mirror of a half model or a sector: the reactions are those of the whole shell.
     """
     system, comm = model.system, model.system.comm
     R, shares = system.forces(state.u, state.mu), _shares(model)
@@ -90,22 +91,22 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     return _of_whole(by_support, mirror) if mirror else by_support
 
 
-def weights(model: "Observed", name: str, way: Array, mirror: Mirror | None = None) -> Array:
+def weights(model: "Observed", name: str, direction: Array, mirror: Mirror | None = None) -> Array:
     """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a
     way (3,).
 
     As in `reactions`, of the whole shell.
     """
     if mirror and name in mirror.removed_edges:
-        name, way = mirror.removed_edges[name], mirror.reflection @ way
+        name, direction = mirror.removed_edges[name], mirror.reflection @ direction
     elif mirror and mirror.image_of_edge(name) == name:
-        way = mirror.sum_over_images(way)
+        direction = mirror.sum_over_images(direction)
     system = model.system
     axes = system.u.function_space.dofmap.index_map_bs
-    along = (
-        way if axes == 3 else np.array([0.0, way[2]])
+    components = (
+        direction if axes == 3 else np.array([0.0, direction[2]])
     )  # around the axis only that along it is left
-    return np.asarray(_shares(model)[name] * np.tile(along, system.size // axes))
+    return np.asarray(_shares(model)[name] * np.tile(components, system.size // axes))
 
 
 def _shares(model: "Observed") -> dict[str, Array]:
@@ -131,19 +132,21 @@ def _shares(model: "Observed") -> dict[str, Array]:
 
 
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
-    """The reactions of the whole shell from those of a half."""
-    whole, S = dict(half), mirror.reflection
-    for lost, kept in mirror.removed_edges.items():
-        if kept in half:
-            whole[lost] = half[kept].image(S, mirror.image(half[kept].point))
-    for name, one in half.items():
+    """Return the reactions of the whole shell from those of a half."""
+    reactions_of_whole, S = dict(half), mirror.reflection
+    for removed_edge, modelled_edge in mirror.removed_edges.items():
+        if modelled_edge in half:
+            reactions_of_whole[removed_edge] = half[modelled_edge].image(
+                S, mirror.image(half[modelled_edge].point)
+            )
+    for name, reaction in half.items():
         if mirror.image_of_edge(name) == name:
-            whole[name] = one.whole(mirror)
-    return whole
+            reactions_of_whole[name] = reaction.whole(mirror)
+    return reactions_of_whole
 
 
 def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
-    """Corners (2, 3) of a box around places (n, 3) of all ranks, and around their mirror images."""
+    """Return corners (2, 3) of a box around places (n, 3) of all ranks and their mirror images."""
     if mirror:
         places = mirror.with_images(places)
     corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])

@@ -1,5 +1,4 @@
-"""What holds a shell or a solid: displacements that are zero, and whether it is held against rigid
-motions.
+"""Supports of a shell or a solid: displacements that are zero, and rigid motions left free.
 
 Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface
 alone.
@@ -26,15 +25,19 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.supports.moved import Support
 
 Array = NDArray[np.float64]
-ALL = (0, 1, 2)
+ALL_COMPONENTS = (0, 1, 2)
 ROUNDING = 1e-9
-BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
+MAX_OFFSET_FROM_PLANE = (
+    1e-3  # largest distance from its plane at which curved elements leave an edge
+)
 # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
-RIGHT = 0.99
+MIN_CROSSING_COSINE = 0.99
 # of the squares that a rigid motion has where the shell is held, over the largest: rounding
-FREE = 1e-12
+FREE_MOTION_TOLERANCE = 1e-12
 NOT_HELD = "boundary: the shell is not held: it is free to "
-LOOSE = 1e-13  # of a rigid motion's energy, over the sum of magnitudes that it is made of: rounding
+ENERGY_TOLERANCE = (
+    1e-13  # of a rigid motion's energy, over the sum of magnitudes that it is made of: rounding
+)
 
 
 def held_on(
@@ -44,8 +47,9 @@ def held_on(
     axes: Iterable[int],
     nodes: NDArray[np.bool_] | None = None,
 ) -> list[fem.DirichletBC]:
-    """Those components are zero on entities of some dimension, or at some of the `nodes` there
-    alone.
+    """Return conditions that components are zero on entities of dimension `dim`.
+
+    With `nodes`, they hold at these nodes of the entities alone.
     """
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
     conditions = []
@@ -58,14 +62,24 @@ def held_on(
 
 
 def held_at_vertex(
-    V: fem.FunctionSpace, x: Array, axes: Iterable[int], beside: NDArray[np.bool_] | None = None
+    V: fem.FunctionSpace,
+    x: Array,
+    axes: Iterable[int],
+    cells_at_vertex: NDArray[np.bool_] | None = None,
 ) -> list[fem.DirichletBC]:
-    """Those components are zero at the node at a vertex; `beside` are the cells that may have it,
-    None for all.
+    """Return conditions that components are zero at the node at a vertex x (3,).
+
+    `cells_at_vertex` are the cells that may have the node, None for all.
     """
-    near = fem.locate_dofs_geometrical(V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
-    near = near if beside is None else near[np.isin(near, V.dofmap.list[beside])]
-    return [fem.dirichletbc(0.0, 3 * near + np.int32(i), V.sub(i)) for i in axes]
+    nodes_at_vertex = fem.locate_dofs_geometrical(
+        V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9
+    )
+    nodes_at_vertex = (
+        nodes_at_vertex
+        if cells_at_vertex is None
+        else nodes_at_vertex[np.isin(nodes_at_vertex, V.dofmap.list[cells_at_vertex])]
+    )
+    return [fem.dirichletbc(0.0, 3 * nodes_at_vertex + np.int32(i), V.sub(i)) for i in axes]
 
 
 def refuse_unknown(
@@ -75,23 +89,23 @@ def refuse_unknown(
     conditions: Mapping[str, Condition],
     loads: Loads,
 ) -> None:
-    """See that every edge, point and patch that is held or loaded by its name is there.
+    """Refuse conditions and loads on edges, points and patches that do not exist.
 
     Raises
     ------
     MeshError
         With the name and those that there are.
     """
-    joined = {
+    joint_of_edge = {
         edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges
     }
 
     def refuse_joined(key: str, name: str) -> None:
-        if name in joined and name not in patches:
-            there, number = ", ".join(sorted(edges)) or "none", joined[name]
+        if name in joint_of_edge and name not in patches:
+            edge_names, number = ", ".join(sorted(edges)) or "none", joint_of_edge[name]
             raise MeshError(
                 f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: "
-                f"{there}"
+                f"{edge_names}"
             )
 
     for name, condition in conditions.items():
@@ -118,13 +132,17 @@ def refuse_unknown(
 
 
 def no_mirror(name: str) -> str:
-    """What is said of an edge in no plane of symmetry."""
-    return f"boundary.{name}: symmetry: the edge must lie in a plane that the surface crosses at right angles"
+    """Return the message about an edge that lies in no plane of symmetry."""
+    return (
+        f"boundary.{name}: symmetry: the edge must lie in a plane that the surface crosses at "
+        "right angles"
+    )
 
 
 def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
-    """The plane of an edge, which the surface crosses at right angles, or of a face of a body;
-    collective.
+    """Return the plane of an edge, or of a face of a solid; collective.
+
+    The surface crosses the plane of an edge at right angles.
 
     Raises
     ------
@@ -144,19 +162,21 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
         upright = np.array([-centre[1], centre[0], 0.0])
-        fitted = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
-        candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted]
+        fitted_normal = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
+        candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted_normal]
     for normal in candidates:
         plane = Mirror.with_normal(normal, float(normal @ centre))
         crossing = np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
-        if np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE and crossing > RIGHT:
+        if (
+            np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE
+            and crossing > MIN_CROSSING_COSINE
+        ):
             return plane
     raise MeshError(no_mirror(name))
 
 
 def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
-    """Move the nodes of an edge into the plane of its vertices, if curved elements leave them a
-    little beside it.
+    """Move the nodes of an edge into the plane of its vertices, if they are a little beside it.
 
     The vertices of a chart are exact, the cubic edges between them are not. Collective.
     """
@@ -174,14 +194,15 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
         return
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
     off = (x[dofs] - centre) @ axes[2]
-    if domain.comm.allreduce(np.abs(off).max(initial=0.0), MPI.MAX) < BESIDE:
+    if domain.comm.allreduce(np.abs(off).max(initial=0.0), MPI.MAX) < MAX_OFFSET_FROM_PLANE:
         x[dofs] -= np.outer(off, axes[2])
     r0.x.scatter_forward()
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:
-    """A point (3,) of all planes, from which the volume beside them is measured; None if they have
-    none.
+    """Return a point (3,) of all planes, from which enclosed volumes are measured.
+
+    None if the planes have no common point.
     """
     if not planes:
         return np.zeros(3)
@@ -193,7 +214,7 @@ def closing_point(planes: Sequence[Mirror]) -> Array | None:
 
 
 def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
-    """Outward conormals (n, 3) in the middle of some edges, as long as those; collective."""
+    """Return outward conormals (n, 3) in the middle of edges, as long as these; collective."""
     V = r0.function_space
     topology = V.mesh.topology
     for dims in ((1, 2), (2, 1)):
@@ -205,68 +226,72 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
         ends = np.delete(corners, side, axis=0)
         table = V.element.basix_element.tabulate(1, ends.mean(axis=0)[None])[1:, 0, :, 0]
         a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
-        along, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
-        outward -= (outward @ along) / (along @ along) * along
-        conormals.append(np.linalg.norm(along) * outward / np.linalg.norm(outward))
+        tangent, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
+        outward -= (outward @ tangent) / (tangent @ tangent) * tangent
+        conormals.append(np.linalg.norm(tangent) * outward / np.linalg.norm(outward))
     return np.concatenate(V.mesh.comm.allgather(np.reshape(conormals, (-1, 3))))
 
 
 def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> str:
-    """A rigid motion of a piece of the shell that is left free, as a message; empty if there is
-    none. Collective.
+    """Describe a rigid motion of a piece of the shell that is left free; collective.
+
+    The message is empty if there is none.
     """
     x = r0.x.array[: system.size].reshape(-1, 3)
-    pieces_of_shell = _pieces(system, r0)
-    for own in pieces_of_shell:
-        motions = _loose(system, x, amplitudes, own)
+    pieces_of_shell = _nodes_of_pieces(system, r0)
+    for nodes_of_piece in pieces_of_shell:
+        motions = _unresisted_motions(system, x, amplitudes, nodes_of_piece)
         if not len(motions):
             continue
-        total = system.comm.allreduce(int(own.sum()))
+        total = system.comm.allreduce(int(nodes_of_piece.sum()))
         shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / total
-        moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
-        centre = system.comm.allreduce(x[own].sum(axis=0)) / total
-        along = (
+        is_translation = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
+        centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / total
+        direction = (
             ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3))
-            if moves
+            if is_translation
             else ""
         )
-        where = (
+        location = (
             ""
             if len(pieces_of_shell) == 1
             else f"; this is its piece around {place_text(centre)}, over R"
         )
-        return NOT_HELD + (f"move along ({along})" if moves else "turn") + where
+        return NOT_HELD + (f"move along ({direction})" if is_translation else "turn") + location
     return ""
 
 
 def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> int:
-    """The number of rigid motions that nothing resists, of all pieces of the shell together;
-    collective.
-    """
+    """Return the number of rigid motions that nothing resists, of all pieces; collective."""
     x = r0.x.array[: system.size].reshape(-1, 3)
-    return sum(len(_loose(system, x, amplitudes, own)) for own in _pieces(system, r0))
+    return sum(
+        len(_unresisted_motions(system, x, amplitudes, nodes_of_piece))
+        for nodes_of_piece in _nodes_of_pieces(system, r0)
+    )
 
 
-def _pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
-    """Which nodes of this rank each piece of the shell has; collective."""
-    piece = component_numbers(r0.function_space)[: system.size // 3]
+def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
+    """Return which nodes of this rank belong to each piece of the shell; collective."""
+    piece_of_node = component_numbers(r0.function_space)[: system.size // 3]
     return [
-        piece == n for n in range(1 + system.comm.allreduce(int(piece.max(initial=0)), MPI.MAX))
+        piece_of_node == n
+        for n in range(1 + system.comm.allreduce(int(piece_of_node.max(initial=0)), MPI.MAX))
     ]
 
 
-def _loose(
-    system: FiniteElementSystem, x: Array, amplitudes: Amplitudes, own: NDArray[np.bool_]
+def _unresisted_motions(
+    system: FiniteElementSystem, x: Array, amplitudes: Amplitudes, nodes_of_piece: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """The rigid motions (k, unknowns) of the nodes of a piece that nothing resists, the loosest
-    first; collective.
+    """Return the rigid motions (k, unknowns) of a piece that nothing resists; collective.
+
+    The motion of the lowest energy is the first.
     """
-    total = system.comm.allreduce(int(own.sum()))
-    centre = system.comm.allreduce(x[own].sum(axis=0)) / total
+    total = system.comm.allreduce(int(nodes_of_piece.sum()))
+    centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / total
     motions = np.zeros((6, *x.shape))
     for i, axis in enumerate(np.eye(3)):
-        motions[i, :, i] = own
-        motions[3 + i] = np.cross(axis, x - centre) * own[:, None]
+        motions[i, :, i] = nodes_of_piece
+        motions[3 + i] = np.cross(axis, x - centre) * nodes_of_piece[:, None]
     return unresisted(
         motions.reshape(6, -1),
         system.zero_at_supports,
@@ -276,7 +301,10 @@ def _loose(
 
 
 def unresisted(
-    rigid: Array, held: Callable[[Vector], Vector], tangent: Callable[[], Tangent], comm: MPI.Comm
+    rigid: Array,
+    zero_at_supports: Callable[[Vector], Vector],
+    tangent: Callable[[], Tangent],
+    comm: MPI.Comm,
 ) -> Array:
     """Return the rigid motions that neither a support nor the shell's energy resists; collective.
 
@@ -284,7 +312,7 @@ def unresisted(
     ----------
     rigid
         Rigid motions (k, unknowns of this rank) of the undeformed shell.
-    held
+    zero_at_supports
         Puts zeros into a displacement where the shell is held.
     tangent
         Makes the tangent of the undeformed shell. It is not called where supports stop all motions.
@@ -294,25 +322,27 @@ def unresisted(
     Array
         (n, unknowns) combinations of length one, n at most k, the one of the lowest energy first.
     """
-    stopped = rigid - np.array([held(motion) for motion in rigid])
+    stopped = rigid - np.array([zero_at_supports(motion) for motion in rigid])
     _, squares, combinations = np.linalg.svd(comm.allreduce(stopped @ stopped.T))
-    free = combinations[squares < FREE * max(squares.max(), 1.0)] @ rigid
-    if not len(free):
-        return np.asarray(free)
-    free /= np.sqrt(comm.allreduce((free**2).sum(axis=1)))[:, None]
+    free_motions = combinations[squares < FREE_MOTION_TOLERANCE * max(squares.max(), 1.0)] @ rigid
+    if not len(free_motions):
+        return np.asarray(free_motions)
+    free_motions /= np.sqrt(comm.allreduce((free_motions**2).sum(axis=1)))[:, None]
     K = symmetric_part(tangent())
     product, energies = K.createVecLeft(), []
-    for motion in free:
+    for motion in free_motions:
         displacement = K.createVecRight()
         displacement.array[:] = motion
         K.mult(displacement, product)
-        energies.append(comm.allreduce(free @ product.array))
+        energies.append(comm.allreduce(free_motions @ product.array))
     # what rounding leaves of an energy is a part of this, however stiff other shells are
-    bounds = comm.allreduce((free * _sums_of_rows(K)) @ free.T)
+    bounds = comm.allreduce((free_motions * _sums_of_rows(K)) @ free_motions.T)
     to_unit_bounds = np.linalg.inv(np.linalg.cholesky(bounds))
     values, vectors = np.linalg.eigh(to_unit_bounds @ np.array(energies) @ to_unit_bounds.T)
-    loose = vectors.T[values < LOOSE] @ to_unit_bounds @ free
-    return np.asarray(loose / np.sqrt(comm.allreduce((loose**2).sum(axis=1)))[:, None])
+    unresisted_motions = vectors.T[values < ENERGY_TOLERANCE] @ to_unit_bounds @ free_motions
+    return np.asarray(
+        unresisted_motions / np.sqrt(comm.allreduce((unresisted_motions**2).sum(axis=1)))[:, None]
+    )
 
 
 def _sums_of_rows(K: PETSc.Mat) -> Array:
@@ -325,8 +355,9 @@ def _sums_of_rows(K: PETSc.Mat) -> Array:
 def supports(
     body: BodyMesh, r0: fem.Function, conditions: Mapping[str, Condition]
 ) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
-    """What is held, the planes of symmetry but the mirror plane of a half model, and each support;
-    collective.
+    """Return constraints, planes of symmetry and named supports of a solid; collective.
+
+    The mirror plane of a half model is not among the planes.
 
     Raises
     ------
@@ -334,20 +365,22 @@ def supports(
         On every rank, if an edge lies in no plane of symmetry.
     """
     V = r0.function_space
-    middle = in_middle(body, V)
-    held: list[Constraint] = []
+    is_in_middle = in_middle(body, V)
+    constraints: list[Constraint] = []
     planes: list[Mirror] = []
-    named: dict[str, Support] = {}
-    on_planes: dict[str, Support] = {}
+    named_supports: dict[str, Support] = {}
+    supports_on_planes: dict[str, Support] = {}
     for name, condition in conditions.items():
-        components = condition.components if isinstance(condition, Held) else ALL
+        components = condition.components if isinstance(condition, Held) else ALL_COMPONENTS
         if condition in ("free", "symmetry"):
             continue
-        nodes = None if condition == "clamped" else middle
+        nodes = None if condition == "clamped" else is_in_middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
-            held.append(support_along(V, 2, body.faces[name], plane.normal))
-            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL), kind="plane")
+            constraints.append(support_along(V, 2, body.faces[name], plane.normal))
+            supports_on_planes[name] = Support.of(
+                held_on(V, 2, body.faces[name], ALL_COMPONENTS), kind="plane"
+            )
             continue
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
@@ -357,13 +390,13 @@ def supports(
             )
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
-        held += conditions_of_part
-        named[name] = Support.of(
+        constraints += conditions_of_part
+        named_supports[name] = Support.of(
             conditions_of_part, kind="point" if name in body.points else "part"
         )
-    return held, planes, named | on_planes
+    return constraints, planes, named_supports | supports_on_planes
 
 
 def in_middle(body: BodyMesh, V: fem.FunctionSpace) -> NDArray[np.bool_]:
-    """Which nodes, ghosts included, lie in the middle of the thickness."""
+    """Return which nodes, ghosts included, lie in the middle of the thickness."""
     return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDSURFACE_HEIGHT) < ROUNDING)

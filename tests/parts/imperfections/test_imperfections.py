@@ -180,7 +180,7 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
         ]
         every += [{"kind": "formula", "w0": "0*x"}] * formula
         (left,) = leaves(
-            flaws(shaped("hemisphere", *every).imperfections, ground), drawn, each=False
+            flaws(shaped("hemisphere", *every).imperfections, ground), drawn, one_by_one=False
         )
         return [left.mirrors(Mirror.through_axis(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
@@ -229,7 +229,7 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
         found[key] = replace(
             flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis))
         )
-    (left,) = leaves(found, drawn, each=False)
+    (left,) = leaves(found, drawn, one_by_one=False)
     assert len(left.azimuths) == 400
     assert not any(left.mirrors(Mirror.through_axis(a)) for a in left.azimuths)
 
