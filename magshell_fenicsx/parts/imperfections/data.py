@@ -1,6 +1,4 @@
-"""A measured imperfection: places and heights from a file, their feet on the perfect surface, a
-smooth function.
-"""
+"""A measured imperfection: a smooth function through heights over the perfect surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +64,7 @@ class DataSection(FileKeys, ImperfectionSection):
         return f"data of {self.file}"
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
-        """See `ImperfectionSection`.
+        """Return the geometry of the measured imperfection, see `ImperfectionSection`.
 
         Raises
         ------

@@ -32,8 +32,9 @@ class FormulaSection(ImperfectionSection):
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
-        """See `ImperfectionSection`; the element size is 2.5/k of the shortest wave sin(k x) that
-        it resembles.
+        """Return the geometry of the formula, see `ImperfectionSection`.
+
+        The element size is 2.5/k of the shortest wave sin(k x) that it resembles.
 
         Raises
         ------

@@ -1,6 +1,4 @@
-"""What all imperfections have in common: their sections, sizes with units, and what they bring to a
-problem.
-"""
+"""Base of all imperfections: their sections, sizes with units, and geometry."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -35,17 +33,16 @@ SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
 
 @dataclass(frozen=True)
 class Flaw:
-    """What one imperfection brings to a problem; places, lengths and w0 are over R, in the frame of
-    the case.
+    """Geometry of one imperfection; places, lengths and w0 over R, in the frame of the case.
 
     Attributes
     ----------
     deviation
         Places (n, 3) of the perfect surface -> w0 (n,).
     size
-        Largest element size that shows it, within `reach` of its centre.
+        Largest element size that resolves it, within `reach` of its centre.
     centre
-        Its place (3,) on the perfect surface; None if it is everywhere.
+        Its centre (3,) on the perfect surface; None if it is everywhere.
     distance
         From its centre.
     reach
@@ -69,7 +66,7 @@ class Flaw:
     sizes: Callable[[Array], Array] | None = None
 
     def inside(self, places: Array) -> NDArray[np.bool_]:
-        """Whether places (n, 3) are within its rim."""
+        """Return whether places (n, 3) are within the rim."""
         assert self.distance
         return np.asarray(self.distance(places) < self.reach)
 
@@ -218,12 +215,12 @@ class ImperfectionSection(Section):
         return ("amplitude",)
 
     def account(self) -> str:
-        """Its words in the account of what is built."""
+        """Describe the imperfection in the account of what is built."""
         return self.kind
 
     @property
     def pending_modes(self) -> int:
-        """How many modes of the perfect shell it needs that are not yet computed."""
+        """Number of modes of the perfect shell that it needs and that are not yet computed."""
         return 0
 
     @property
@@ -232,13 +229,14 @@ class ImperfectionSection(Section):
         return False
 
     def listed(self) -> "Mapping[str, ImperfectionSection]":
-        """What is built of it: itself, or others by their keys below its own, which begin with a
-        dot.
+        """Return the imperfections that are built of it, by their keys below its own.
+
+        They are itself, with the key "", or others, whose keys begin with a dot.
         """
         return {"": self}
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
-        """See that a shell can have it; raises ValueError otherwise.
+        """Raise ValueError if a shell cannot have it.
 
         Parameters
         ----------
@@ -247,7 +245,7 @@ class ImperfectionSection(Section):
         """
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
-        """What it brings to a problem; `key` is its own, with dots.
+        """Return its geometry on the perfect shell; `key` is its key, with dots.
 
         Raises
         ------
@@ -306,7 +304,7 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
     key = "imperfections"
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that the shell can have them."""
+        """Refuse imperfections that the shell cannot have."""
         shell = context.shell
         if getattr(shell, "defect", None) and shell.imperfections:
             raise ValueError(

@@ -112,7 +112,7 @@ class ModesSection(FileKeys, ImperfectionSection):
         self._shapes = tuple(part or _zero_mode for part in parts)
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
-        """See `ImperfectionSection`; modes that are not yet computed are zero.
+        """Return the geometry of the modes; those not yet computed are zero.
 
         Raises
         ------

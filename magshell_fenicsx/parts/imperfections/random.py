@@ -84,7 +84,7 @@ class RandomSection(ImperfectionSection):
         return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
     def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
-        """See `ImperfectionSection`; of the field, which the length of correlation shows."""
+        """Return the geometry of the random field; elements resolve its length of correlation."""
         assert self.amplitude is not None
         assert self.length
         length = half_width(self.length, ground.R_over_h, ground.nu)

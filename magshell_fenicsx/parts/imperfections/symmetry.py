@@ -64,7 +64,7 @@ class _Numbers:
         return scipy.spatial.cKDTree(self.rows)
 
     def __call__(self, x: Array) -> Array:
-        """Their sum at a few places (m, 3)."""
+        """Return the sum (m,) of the deviations at a few places (m, 3)."""
         centres, widths = self.rows[:, :3], self.rows[:, 3]
         distance = np.linalg.norm(x[:, None] - centres, axis=-1)
         if self.angles:
@@ -88,7 +88,7 @@ class _Sum:
 
     @cached_property
     def numbers(self) -> _Numbers | None:
-        """What it is made of, if that is local deviations alone: there may be thousands."""
+        """Numbers of the local deviations; None if there are others. There may be thousands."""
         local = [d for d in self.deviations if isinstance(d, Local)]
         classes = list(dict.fromkeys(type(d) for d in local))
         angles = [d.distance.axis for d in local if isinstance(d.distance, AngularDistance)]
@@ -110,7 +110,7 @@ class _Sum:
         )
 
     def mirrored(self, mirror: Mirror) -> bool | None:
-        """Whether it is its own image, by its numbers; None if they do not say."""
+        """Return whether the sum is its own image, by its numbers; None if they do not decide."""
         numbers = self.numbers
         if numbers is None or (numbers.angles and mirror.offset):
             return None
@@ -131,7 +131,7 @@ class _Sum:
 def leaves(
     flaws: Mapping[str, Flaw], drawn: Outline, *, one_by_one: bool
 ) -> list[SymmetryConstraint]:
-    """What imperfections leave.
+    """Return the symmetry that imperfections preserve.
 
     Parameters
     ----------
@@ -178,8 +178,9 @@ def leaves(
 
 
 def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
-    """Azimuths (rad) of the planes through e3 that map the first place to itself or to one at the
-    same distance.
+    """Return azimuths (rad) of planes through e3 that may be planes of symmetry of places.
+
+    They map the first place to itself or to one at the same distance.
     """
     first, *others = centres
     at_same_distance = [
@@ -194,7 +195,7 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
 
 
 def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
-    """Places (n, 3) all over the shell, and around each local imperfection."""
+    """Return places (n, 3) all over the shell, and around each local imperfection."""
     places = [drawn.sample()]
     for key, flaw in flaws.items():
         if flaw.centre is None:
@@ -242,7 +243,7 @@ class LocalImperfection:
     rim: Array | None = None
 
     def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
-        """Small elements on it and a little around it, which grow so fast away from there."""
+        """Return mesh sizes: small elements on it and a little around, which grow away from it."""
         radius, size = self.radius + 0.7 * sqrt(fit.h), self.size / fit.refinement
         return [
             DiscFeature((float(x), float(y)), radius, size, growth)
@@ -286,7 +287,7 @@ def spots(
 
 
 def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
-    """The rims that need edges of elements; of several that are nearly the same, the first."""
+    """Return the rims that need edges of elements; of nearly equal ones, the first."""
     rims: list[Array] = []
     for spot in local:
         rim = spot.rim
@@ -307,7 +308,7 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
     def distance_beyond(t: Array) -> Array:
-        """On each ray the distance at (..., corners) of the chart, less the one that is wanted."""
+        """Return on each ray the distance at t (..., corners), less the wanted one."""
         chart = centre + t[..., None] * rays
         return distance(drawn.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
@@ -339,7 +340,7 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
 
 
 def images(spot: LocalImperfection, drawn: Outline) -> list[Array]:
-    """Its centre (2,), and the same across glued sides of a grid."""
+    """Return its centre (2,), and the images of this across glued sides of a grid."""
     if not (grid := drawn.grid):
         return [spot.centre]
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))

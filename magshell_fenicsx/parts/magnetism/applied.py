@@ -32,25 +32,25 @@ Array = NDArray[np.float64]
 MAX_HALVINGS = 16  # of a segment, whose parts are then shorter than rounding in places of a path
 
 
-def crossed_place(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
+def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array) -> Array | None:
     """Return a place (3,) inside a body on the segments between places (n, 3); None without one.
 
     A distance changes by at most the length of a segment. So no place of a segment is inside if
     the distances at both ends add up to more than its length; the other segments are halved.
     """
-    distance_before, distance_after = distance(before), distance(after)
+    distance_before, distance_after = distance(starts), distance(ends)
     for _ in range(MAX_HALVINGS):
-        may_cross = distance_before + distance_after <= np.linalg.norm(after - before, axis=1)
+        may_cross = distance_before + distance_after <= np.linalg.norm(ends - starts, axis=1)
         if not may_cross.any():
             return None
-        before, after, distance_before, distance_after = (
-            values[may_cross] for values in (before, after, distance_before, distance_after)
+        starts, ends, distance_before, distance_after = (
+            values[may_cross] for values in (starts, ends, distance_before, distance_after)
         )
-        middle = (before + after) / 2
+        middle = (starts + ends) / 2
         between = distance(middle)
         if (between < 0).any():
             return np.asarray(middle[between.argmin()])
-        before, after = np.concatenate([before, middle]), np.concatenate([middle, after])
+        starts, ends = np.concatenate([starts, middle]), np.concatenate([middle, ends])
         distance_before, distance_after = (
             np.concatenate([distance_before, between]),
             np.concatenate([between, distance_after]),

@@ -174,11 +174,15 @@ class ChargedElements:
         raise NotImplementedError
 
     def charges_at(
-        self, boxes: Boxes, x: Array, weights: Array, into: NodalDerivatives | None = None
+        self,
+        boxes: Boxes,
+        x: Array,
+        weights: Array,
+        nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
         """Return the charges at points x (m, 2 or 3) of boxes, times weights (m,).
 
-        With `into`, the charges can add their derivatives to it.
+        With `nodal_derivatives`, the charges can add their derivatives to it.
         """
         raise NotImplementedError
 
@@ -287,9 +291,9 @@ class ShellFaces(ChargedElements):
         candidates = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
         place = np.repeat(np.arange(len(places)), [len(diagonal) for diagonal in candidates])
         box, point = np.divmod(np.concatenate([*candidates, []]).astype(np.intp), len(start))
-        away = np.linalg.norm(places[place] - grid.r[0][box, point], axis=-1)
-        order = np.lexsort((away, box, place))
-        order = order[away[order] <= reach[box[order]]]
+        distance_to_point = np.linalg.norm(places[place] - grid.r[0][box, point], axis=-1)
+        order = np.lexsort((distance_to_point, box, place))
+        order = order[distance_to_point[order] <= reach[box[order]]]
         _, nearest = np.unique(
             place[order] * self.count + box[order], return_index=True
         )  # the nearest in each box
@@ -313,14 +317,18 @@ class ShellFaces(ChargedElements):
             ab = np.clip(ab + step, BOUNDARY_INSET**3, 1 - BOUNDARY_INSET**3)
         foot = self._jets_at(boxes, ab)
         d, n = x - foot.r[0], unit(np.cross(foot.r[1], foot.r[2]))
-        across = np.sum(d * n, axis=-1)
-        off_normal = np.linalg.norm(d - across[..., None] * n, axis=-1)
-        return np.asarray((np.abs(across) <= foot.thickness / 2) & (off_normal < FOOT_TOLERANCE))[
-            :, 0
-        ]
+        normal_distance = np.sum(d * n, axis=-1)
+        off_normal = np.linalg.norm(d - normal_distance[..., None] * n, axis=-1)
+        return np.asarray(
+            (np.abs(normal_distance) <= foot.thickness / 2) & (off_normal < FOOT_TOLERANCE)
+        )[:, 0]
 
     def charges_at(
-        self, boxes: Boxes, x: Array, weights: Array, into: NodalDerivatives | None = None
+        self,
+        boxes: Boxes,
+        x: Array,
+        weights: Array,
+        nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._sectors
 
@@ -339,7 +347,7 @@ class ShellFaces(ChargedElements):
                 )
             return layers_of_jets
 
-        return _point_charges(self._jets(boxes, x), layers, into)
+        return _point_charges(self._jets(boxes, x), layers, nodal_derivatives)
 
 
 class EdgeStrips(ChargedElements):
@@ -362,21 +370,21 @@ class EdgeStrips(ChargedElements):
         edge = self._edges[boxes.elements][:, None]
         if self.shape.swept:
             b = (self._sector[boxes.elements][:, None] + s) / self._sectors
-            along = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
+            tangents = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
             return (
                 np.stack([np.where(edge == 1, 1.0, 0.0) + 0 * s, b], axis=-1),
-                along[:, 0],
+                tangents[:, 0],
                 eta - 0.5,
             )
         # around the triangle with the surface on the left: b = 1 backwards, a = 0 backwards, b = 0
         a = np.where(edge == 0, 1 - s, np.where(edge == 2, s, 0.0))
         b = np.where(edge == 0, 1.0, np.where(edge == 1, 1 - s, 0.0))
-        along = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])[self._edges[boxes.elements]]
-        return np.stack([a, b], axis=-1), along, eta - 0.5
+        tangents = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])[self._edges[boxes.elements]]
+        return np.stack([a, b], axis=-1), tangents, eta - 0.5
 
     def _jets(self, boxes: Boxes, x: Array) -> tuple[SurfaceJets, Array, Array]:
-        ab, along, eta = self._coordinates(boxes, x)
-        return SurfaceJets.at_points(self.shape, self._cells[boxes.elements], ab), along, eta
+        ab, tangents, eta = self._coordinates(boxes, x)
+        return SurfaceJets.at_points(self.shape, self._cells[boxes.elements], ab), tangents, eta
 
     def box_places(self, boxes: Boxes, x: Array) -> Array:
         jets, _, eta = self._jets(boxes, x)
@@ -384,7 +392,11 @@ class EdgeStrips(ChargedElements):
         return np.asarray(jets.r[0] + (eta * jets.thickness)[..., None] * n)[:, :, None]
 
     def charges_at(
-        self, boxes: Boxes, x: Array, weights: Array, into: NodalDerivatives | None = None
+        self,
+        boxes: Boxes,
+        x: Array,
+        weights: Array,
+        nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
         jets, tangents, eta = self._jets(boxes, x)
         area = (
@@ -399,7 +411,7 @@ class EdgeStrips(ChargedElements):
             outward = area[..., None] * np.cross(tangent, G3)
             return [(eta[..., None], (outward, 0 * outward, 0 * outward))]
 
-        return _point_charges(jets, layers, into)
+        return _point_charges(jets, layers, nodal_derivatives)
 
 
 def heights(faces: ShellFaces) -> Array:
@@ -416,7 +428,7 @@ def _interior_layers() -> tuple[Array, Array]:
 def _point_charges(
     jets: SurfaceJets,
     layers_of: Callable[[SurfaceJets], list[Layer]],
-    into: NodalDerivatives | None,
+    nodal_derivatives: NodalDerivatives | None,
 ) -> PointCharges:
     """Return the charges of some layers of a surface with jets."""
     n, layers = unit(np.cross(jets.r[1], jets.r[2])), layers_of(jets)
@@ -433,7 +445,7 @@ def _point_charges(
         )
 
     q = charges(layers)
-    if into is None:
+    if nodal_derivatives is None:
         return PointCharges(x, q)
 
     def add_derivatives(on_x: Array, on_q: Array) -> None:
@@ -441,8 +453,12 @@ def _point_charges(
         by_B = [
             sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)
         ]
-        jets.add_derivatives(into, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B))
-        jets.add_reference_derivatives(into, lambda other: charges(layers_of(other)), on_q)
+        jets.add_derivatives(
+            nodal_derivatives, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B)
+        )
+        jets.add_reference_derivatives(
+            nodal_derivatives, lambda other: charges(layers_of(other)), on_q
+        )
 
     return PointCharges(x, q, add_derivatives)
 
@@ -498,9 +514,9 @@ def _add_field(
 
 
 def gradient(
-    families: Sequence[ChargedElements], place: Array, e: Array, into: NodalDerivatives
+    families: Sequence[ChargedElements], place: Array, e: Array, nodal_derivatives: NodalDerivatives
 ) -> float:
-    """Return e . B at one place (3,), and add its derivatives by nodal values to `into`.
+    """Return e . B at one place (3,), and add its derivatives by nodal values to `nodal_derivatives`.
 
     Raises
     ------
@@ -516,7 +532,7 @@ def gradient(
     )
     for family, part in parts:
         rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
-        charges = family.charges_at(part, rule, weights, into)
+        charges = family.charges_at(part, rule, weights, nodal_derivatives)
         d = place - charges.x
         r = np.linalg.norm(d, axis=-1)
         kernel = d @ e / (4 * np.pi * r**3)

@@ -151,7 +151,11 @@ class SolidCharges(ChargedElements):
         return self.shape.X + self.shape.u
 
     def charges_at(
-        self, boxes: Boxes, x: Array, weights: Array, into: NodalDerivatives | None = None
+        self,
+        boxes: Boxes,
+        x: Array,
+        weights: Array,
+        nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
         reference, cells, solid = self.reference(boxes, x), self.cells[boxes.elements], self.shape
         T, TB = tables(solid.element, reference, 1), tables(solid.remanence_element, reference, 1)
@@ -160,12 +164,14 @@ class SolidCharges(ChargedElements):
         C = self.remanence_factors(boxes, X, np.prod(boxes.size, axis=1)[:, None] * weights)
         place = np.einsum("nmk,nki->nmi", T[0], self._nodes[cells])
         q = np.sum(C * B, axis=(0, -1))
-        if into is None:
+        if nodal_derivatives is None:
             return PointCharges(place[:, :, None], q[..., None])
 
         def add_derivatives(on_x: Array, on_q: Array) -> None:
-            np.add.at(into.by_u, cells, np.einsum("nmk,nmi->nki", T[0], on_x[:, :, 0]))
-            np.add.at(into.by_remanence, cells, np.einsum("dnmk,dnmi->nki", TB, C * on_q))
+            np.add.at(nodal_derivatives.by_u, cells, np.einsum("nmk,nmi->nki", T[0], on_x[:, :, 0]))
+            np.add.at(
+                nodal_derivatives.by_remanence, cells, np.einsum("dnmk,dnmi->nki", TB, C * on_q)
+            )
 
         return PointCharges(place[:, :, None], q[..., None], add_derivatives)
 
@@ -214,7 +220,11 @@ class ChargeLayers(ChargedElements):
         self._inside, self.count, self.shape = inside, inside.count, inside.shape
 
     def charges_at(
-        self, boxes: Boxes, x: Array, weights: Array, into: NodalDerivatives | None = None
+        self,
+        boxes: Boxes,
+        x: Array,
+        weights: Array,
+        nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
         heights, weights_through = gauss(GAUSS_LAYERS)
         zero, one = np.zeros((len(boxes.elements), 1)), np.ones((len(boxes.elements), 1))

@@ -135,8 +135,10 @@ class ElementKind:
         points = np.stack(np.meshgrid(s, eta, indexing="ij"), axis=-1).reshape(-1, 2)
         return s, eta, points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
 
-    def add_derivatives(self, which: int, by_charges: Array, into: NodalDerivatives) -> None:
-        """Add derivatives by nodal values to `into`, from those by the charges of a rule."""
+    def add_derivatives(
+        self, which: int, by_charges: Array, nodal_derivatives: NodalDerivatives
+    ) -> None:
+        """Add derivatives by nodal values to `nodal_derivatives`, from those by the charges of a rule."""
         count, boxes = len(self._copies.images), Boxes.undivided(self.family.count)
         by_modelled_charges = np.einsum(
             "c,c...->...",
@@ -146,14 +148,16 @@ class ElementKind:
         points_and_weights = (
             self._face_points(which)[1:] if self._edge is None else self._strip_points(which)[2:]
         )
-        charges = self.family.charges_at(boxes, *points_and_weights, into)
+        charges = self.family.charges_at(boxes, *points_and_weights, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(
             np.zeros_like(charges.x), by_modelled_charges.reshape(charges.q.shape)
         )
 
-    def add_height_derivatives(self, which: int, by_heights: Array, into: NodalDerivatives) -> None:
-        """Add derivatives by the thickness to `into`, from those by the heights of a rule."""
+    def add_height_derivatives(
+        self, which: int, by_heights: Array, nodal_derivatives: NodalDerivatives
+    ) -> None:
+        """Add derivatives by the thickness to `nodal_derivatives`, from those by the heights of a rule."""
         X = (
             self._face_points(which)[0]
             if self._edge is None
@@ -163,7 +167,10 @@ class ElementKind:
             len(self._copies.normal_signs), -1, len(X)
         )
         self._shape.add_thickness_derivatives(
-            self._modelled, X, np.einsum("c,cnm->nm", self._copies.normal_signs, by_thickness), into
+            self._modelled,
+            X,
+            np.einsum("c,cnm->nm", self._copies.normal_signs, by_thickness),
+            nodal_derivatives,
         )
 
     def _charged_points(self, X: Array, eta: Array, q: Array) -> Points:
@@ -336,16 +343,16 @@ class InteractingCharges:
         )  # such a pair stands in both orders
         shares = (is_own_pair & (first < second), 1.0), (~is_own_pair, 0.5)
         for number, (counted, share) in product(np.unique(which), shares):
-            chosen = counted & (which == number)
-            cells = np.column_stack([first[chosen], second[chosen]])
-            for one, other in product(self._kinds, self._kinds):
-                one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
+            is_counted = counted & (which == number)
+            cells = np.column_stack([first[is_counted], second[is_counted]])
+            for first_kind, second_kind in product(self._kinds, self._kinds):
+                one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
                 is_charged = (one_row >= 0) & (other_row >= 0)
-                if one.faces and other.faces:
+                if first_kind.faces and second_kind.faces:
                     is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
                 left, right = (
-                    (one.rule(int(number)), one_row[is_charged]),
-                    (other.rule(int(number)), other_row[is_charged]),
+                    (first_kind.rule(int(number)), one_row[is_charged]),
+                    (second_kind.rule(int(number)), other_row[is_charged]),
                 )
                 count = int(is_charged.sum())
                 energy += share * self._pairs.add(
@@ -387,7 +394,7 @@ class InteractingCharges:
             self.rules(nodes, own_cells),
             nodes + COMPLEX_STEP * 1j * rates,
         )
-        into = self._shape.zero_derivatives(of_shape=of_shape)
+        nodal_derivatives = self._shape.zero_derivatives(of_shape=of_shape)
         multipoles, cells_and_points = (
             self.boxes(nodes, own_cells)[0],
             [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds],
@@ -396,42 +403,42 @@ class InteractingCharges:
             nodes, moved_nodes, cells_and_points, weights, heights=of_shape
         )
         for kind, (by_charges, *by_all_heights) in zip(self._kinds, by_far_charges, strict=True):
-            kind.add_derivatives(MULTIPOLE_RULE, by_charges, into)
+            kind.add_derivatives(MULTIPOLE_RULE, by_charges, nodal_derivatives)
             for by_heights in by_all_heights:
-                kind.add_height_derivatives(MULTIPOLE_RULE, by_heights, into)
+                kind.add_height_derivatives(MULTIPOLE_RULE, by_heights, nodal_derivatives)
         first, second = np.nonzero(rules >= 0)
         which, first = rules[first, second], first + own_cells.start
         for number in map(int, np.unique(which)):
             cells = np.column_stack([first, second])[which == number]
-            for one, other in product(self._kinds, self._kinds):
-                one_row, other_row = one.number[cells[:, 0]], other.number[cells[:, 1]]
+            for first_kind, second_kind in product(self._kinds, self._kinds):
+                one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
                 is_charged = (one_row >= 0) & (other_row >= 0)
-                if one.faces and other.faces:
+                if first_kind.faces and second_kind.faces:
                     is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
                 left, right = (
-                    (one.rule(number), one_row[is_charged]),
-                    (other.rule(number), other_row[is_charged]),
+                    (first_kind.rule(number), one_row[is_charged]),
+                    (second_kind.rule(number), other_row[is_charged]),
                 )
-                one.add_derivatives(
+                first_kind.add_derivatives(
                     number,
                     pair_derivatives(moved_nodes, cells[is_charged], left, right, weights)[0],
-                    into,
+                    nodal_derivatives,
                 )  # the other order is there
                 if of_shape:
-                    one.add_height_derivatives(
+                    first_kind.add_height_derivatives(
                         number,
                         pair_derivatives(
                             moved_nodes, cells[is_charged], left, right, weights, heights=True
                         )[0],
-                        into,
+                        nodal_derivatives,
                     )
         if self._singular_pairs:
-            self._singular_pairs.field_derivatives(moved_nodes, weights, into)
+            self._singular_pairs.field_derivatives(moved_nodes, weights, nodal_derivatives)
         if is_stacked.any() and self._kinds[0].faces:
             self._stacked_faces.field_derivatives(
-                nodes, own_cells, is_stacked, moved_nodes, weights, into
+                nodes, own_cells, is_stacked, moved_nodes, weights, nodal_derivatives
             )
-        return into
+        return nodal_derivatives
 
 
 def _areas(r0: Array) -> Array:

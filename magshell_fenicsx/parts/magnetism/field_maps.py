@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
-MOST = 1_000_000  # places of one map
-LONGEST = 60  # of a name
-SQUARE = 1e-9  # cosine of the angle between sides
+MAX_PLACES = 1_000_000  # places of one map
+MAX_NAME_LENGTH = 60  # of a name
+RIGHT_ANGLE_TOLERANCE = 1e-9  # cosine of the angle between sides
 
 
 class FieldMapSection(Section):
@@ -59,13 +59,15 @@ class FieldMapSection(Section):
                 f"points: {len(self.points)} numbers for {len(self.sides)} sides: give one for "
                 "each side, as [41, 41] for two"
             )
-        if np.prod(self.points) > MOST:
-            raise ValueError(f"points: more than {MOST} places in all: give fewer")
+        if np.prod(self.points) > MAX_PLACES:
+            raise ValueError(f"points: more than {MAX_PLACES} places in all: give fewer")
         sides = np.array(self.sides)
         lengths = np.linalg.norm(sides, axis=1)
         if not lengths.all():
             raise ValueError("sides: a side has no length: give vectors that point somewhere")
-        if any(abs(a @ b) > SQUARE for a, b in combinations(sides / lengths[:, None], 2)):
+        if any(
+            abs(a @ b) > RIGHT_ANGLE_TOLERANCE for a, b in combinations(sides / lengths[:, None], 2)
+        ):
             raise ValueError("sides: are not perpendicular to each other")
         return self
 
@@ -97,32 +99,32 @@ class FieldMap:
 
 
 def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
-    """The maps of a case, in a frame turned about e3 (rad)."""
-    given: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
-    own, R = units(context), context.shell.reference
+    """Return the maps of a case, in a frame turned by `turn` about e3 (rad)."""
+    sections: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
+    field_units, R = units(context), context.shell.reference
     unit = unit_of_readings(context)
     grids = [
         (
-            each,
+            section,
             MapGrid(
                 name,
-                np.array(each.corner) / R,
-                np.array(each.sides) / R,
-                tuple(each.points),
+                np.array(section.corner) / R,
+                np.array(section.sides) / R,
+                tuple(section.points),
                 unit,
-                each.field,
+                section.field,
             ),
         )
-        for name, each in given.items()
+        for name, section in sections.items()
     ]
     return tuple(
-        FieldMap(grid, grid.places @ rotation(turn).T, each.field == "total", *own)
-        for each, grid in grids
+        FieldMap(grid, grid.places @ rotation(turn).T, section.field == "total", *field_units)
+        for section, grid in grids
     )
 
 
 def unit_of_readings(context: Context) -> str:
-    """What a reading is in: T, or what it is over."""
+    """Return the unit of readings: T, or what they are over."""
     magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
     if magnetic and magnetic.remanent is None:
         return "T" if E and magnetic.lambda_m is None else "sqrt(mu0 E)"
@@ -135,33 +137,34 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
     key = "field_maps"
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that something is magnetised, whose field there can be."""
+        """Refuse maps where nothing is magnetised, and names that no file can have."""
         refuse_unfit_reading(self.key, context)
         for name in self.given:
-            if not (name.isascii() and name.isidentifier() and len(name) <= LONGEST):
+            if not (name.isascii() and name.isidentifier() and len(name) <= MAX_NAME_LENGTH):
                 raise ValueError(
-                    f"field_maps: {name}: a name is made of at most {LONGEST} letters, digits and "
-                    "_, as it is in names of files"
+                    f"field_maps: {name}: a name is made of at most {MAX_NAME_LENGTH} letters, "
+                    "digits and _, as it is in names of files"
                 )
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """See that the applied field has a strength, where it is asked for."""
-        for name, each in self.given.items():
-            refuse_unknown_field(f"field_maps.{name}", each.field, context)
+        """Refuse the total field where the strength of the applied one is unknown."""
+        for name, section in self.given.items():
+            refuse_unknown_field(f"field_maps.{name}", section.field, context)
 
     def numbers(self, context: Context) -> list[str]:
         """How many places there are."""
         return [
-            f"field map {name}: {' x '.join(map(str, each.points))} places, {each.field} field"
-            for name, each in self.given.items()
+            f"field map {name}: {' x '.join(map(str, section.points))} places, {section.field} "
+            "field"
+            for name, section in self.given.items()
         ]
 
 
 class FieldMapsSeen(Seen):
-    """What maps show."""
+    """Grids of the magnetic field, as observables."""
 
     def grids(self, loads: "Loads") -> Sequence[str]:
-        return [each.grid.name for each in loads.field_maps]
+        return [field_map.grid.name for field_map in loads.field_maps]
 
     def on_grids(self, sight: Sight, state: "State") -> list[MapGrid]:
         from magshell_fenicsx.parts.magnetism.readings import (
@@ -170,10 +173,14 @@ class FieldMapsSeen(Seen):
 
         return [
             replace(
-                each.grid,
+                field_map.grid,
                 values=field_at(
-                    sight, state, each.places, each.own, each.applied if each.total else 0.0
+                    sight,
+                    state,
+                    field_map.places,
+                    field_map.own,
+                    field_map.applied if field_map.total else 0.0,
                 ),
             )
-            for each in sight.loads.field_maps
+            for field_map in sight.loads.field_maps
         ]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-SAME = 1e-9  # cosine of directions: rounding
+EQUALITY_TOLERANCE = 1e-9  # cosine of directions: rounding
 
 
 class FieldSection(FactorStep):
@@ -57,10 +57,10 @@ class FieldSection(FactorStep):
             straight,
         )  # the solver takes long to import
 
-        direction, value = self._along(here)
+        direction, value = self._direction_and_value(here)
         return (straight(direction), value) if direction[1:].any() else None
 
-    def _along(self, here: Here) -> tuple[Array, float]:
+    def _direction_and_value(self, here: Here) -> tuple[Array, float]:
         """The direction by the amplitudes of the field's components, and the field along it."""
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
@@ -72,7 +72,14 @@ class FieldSection(FactorStep):
 
     def now(self, here: Here) -> Now:
         """The field has no conjugate."""
-        return Now(self._along(here)[1], 0.0, 0.0, here.driven, self.size(here.context), here.h)
+        return Now(
+            self._direction_and_value(here)[1],
+            0.0,
+            0.0,
+            here.driven,
+            self.size(here.context),
+            here.h,
+        )
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
@@ -109,19 +116,23 @@ class RotationSection(Step):
     """Equal angles to it"""
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        before = direction_before(step.number, context)
-        if before is None or not strength(context):
+        start = direction_before(step.number, context)
+        if start is None or not strength(context):
             raise ValueError(
                 f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero"
             )
-        driven = context.driven_before(step.number)
-        if context.whole and FieldSection.amplitude not in driven:
+        driven_amplitudes = context.driven_before(step.number)
+        if context.whole and FieldSection.amplitude not in driven_amplitudes:
             raise ValueError(
                 f"{step.key}.kind: rotation needs a field: a step of kind: field before it"
             )
-        if abs(before @ self.to.vector()) > 1 - SAME:
-            where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
-            raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
+        if abs(start @ self.to.vector()) > 1 - EQUALITY_TOLERANCE:
+            subject = (
+                "the field at its beginning"
+                if self.amplitude in driven_amplitudes
+                else "magnetic.applied"
+            )
+            raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {subject}")
 
     def leaves(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
@@ -132,26 +143,26 @@ class RotationSection(Step):
         return {name} | {other for other in mu if other.startswith("lambda_")}
 
     def course(self, here: Here) -> Course:
-        from magshell_fenicsx.parts.magnetism import (
-            direction as of,
-        )  # the solver takes long to import
+        from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
         field, number = here.loads.magnetic, here.step.number
-        ends = of.directions(here.context.steps, field, here.turn)[number - 1 : number + 1]
-        before, after = (of.components(end, field) for end in ends)
-        size, total = float(before @ of.field_at(here.mu)), acos(float(ends[0] @ ends[1]))
+        ends = direction.directions(here.context.steps, field, here.turn)[number - 1 : number + 1]
+        start, end = (direction.components(end, field) for end in ends)
+        size, total = float(start @ direction.field_at(here.mu)), acos(float(ends[0] @ ends[1]))
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
         if size == 0:
             return Course(drive, "limit", impossible="the field is zero and cannot turn")
 
         def forbidden(mu: Mapping[str, float], what: str) -> str:
-            angle = of.field_angle(mu, field) % 360
+            angle = direction.field_angle(mu, field) % 360
             return f"the turning field makes the shell unstable at {angle:.4g} degrees: {what}"
 
-        whole = field and field.turns
+        rotates_as_whole = field and field.turns
         curves = (
-            of.as_a_whole(turn_name(here.step), total) if whole else of.circle(size, before, after)
+            direction.as_a_whole(turn_name(here.step), total)
+            if rotates_as_whole
+            else direction.circle(size, start, end)
         )
         return Course(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
 
@@ -161,9 +172,11 @@ class RotationSection(Step):
         )  # the solver takes long to import
 
         all_directions = directions(context.steps, loads.magnetic, turn)
-        first, before, after = (all_directions[i] for i in (0, step.number - 1, step.number))
-        angle = degrees(acos(float(np.clip(after @ first, -1, 1))))
-        return Ahead("its last direction", angle if before @ first > 1 - SAME else None)
+        first, start, end = (all_directions[i] for i in (0, step.number - 1, step.number))
+        angle = degrees(acos(float(np.clip(end @ first, -1, 1))))
+        return Ahead(
+            "its last direction", angle if start @ first > 1 - EQUALITY_TOLERANCE else None
+        )
 
 
 def turn_name(step: ProgrammeStep) -> str:
@@ -175,10 +188,10 @@ def turn_name(step: ProgrammeStep) -> str:
 
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
     """The unit vector (3,) of the field where a step begins; None without a field."""
-    turned = [
+    rotated_to = [
         step.load.to for step in context.before(number) if isinstance(step.load, RotationSection)
     ]
-    if turned:
-        return turned[-1].vector()
+    if rotated_to:
+        return rotated_to[-1].vector()
     magnetic = context.of(MagneticSection)
     return magnetic.applied.vector() if magnetic else None

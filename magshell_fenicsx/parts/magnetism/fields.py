@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 MU_0 = 4e-7 * pi  # T m/A
-SOURCES = 1e-9  # of the field's derivatives: rounding
-LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
-MOST_SOFT = 1e6  # of a susceptibility
-SMALLEST_FIELD, LARGEST_FIELD = (
+SOURCE_TOLERANCE = 1e-9  # of the field's derivatives: rounding
+MAX_FIELD_RATIO = 1e6  # of a field over its unit, as of a remanence
+MAX_SUSCEPTIBILITY = 1e6  # of a susceptibility
+MIN_LAMBDA, MAX_LAMBDA = (
     1e-12,
     10.0,
 )  # of lambda_m: rounding, and a thousand times what destabilises a shell
@@ -65,24 +65,30 @@ class AppliedSection(Direction):
 
     @model_validator(mode="after")
     def _beside_sources(self) -> Self:
-        others = {"polar", "azimuth", "uniform", "gradient", "components"} & self.model_fields_set
-        if self.sources and self.flux_density is None and others:
+        other_keys = {
+            "polar",
+            "azimuth",
+            "uniform",
+            "gradient",
+            "components",
+        } & self.model_fields_set
+        if self.sources and self.flux_density is None and other_keys:
             raise ValueError(
-                f"{', '.join(sorted(others))}: of a field beside the sources: give its "
+                f"{', '.join(sorted(other_keys))}: of a field beside the sources: give its "
                 "flux_density too"
             )
         names = [source.name for source in self.sources or [] if source.name is not None]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"sources: {twice}: two of them have this name")
+        if repeated := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"sources: {repeated}: two of them have this name")
         return self
 
     @model_validator(mode="after")
     def _square(self) -> Self:
         if self.components and (
-            others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set
+            other_keys := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set
         ):
             raise ValueError(
-                f"components are the whole field: leave out {', '.join(sorted(others))}"
+                f"components are the whole field: leave out {', '.join(sorted(other_keys))}"
             )
         if self.gradient and any(len(row) != 3 for row in self.gradient):
             raise ValueError("gradient is three rows of three numbers")
@@ -113,15 +119,15 @@ def _of_places(value: Any) -> Any:
     elif isinstance(value, dict) and not value:
         raise ValueError("a mapping names at least one patch")
     else:
-        for each in value.values() if isinstance(value, dict) else [value]:
+        for number in value.values() if isinstance(value, dict) else [value]:
             if (
-                isinstance(each, bool)
-                or not isinstance(each, int | float)
-                or not 0 <= each <= MOST_SOFT
+                isinstance(number, bool)
+                or not isinstance(number, int | float)
+                or not 0 <= number <= MAX_SUSCEPTIBILITY
             ):
                 raise ValueError(
-                    f"{each!r}: allowed are numbers from 0 to {MOST_SOFT:g}, and formulas of x, "
-                    "y, z"
+                    f"{number!r}: allowed are numbers from 0 to {MAX_SUSCEPTIBILITY:g}, and "
+                    "formulas of x, y, z"
                 )
     return value
 
@@ -208,15 +214,15 @@ class MagneticSection(Section, Ability):
         """Parts with a remanence that moves with the material, see `coulomb`."""
         if self.interaction == "none":
             return self
-        beside = {
+        excluded = {
             "remanent: none": self.remanent is None,
             "susceptibility": self.susceptibility is not None,
             "remanence: rotation": self.remanence == "rotation",
             f"energy: {self.energy}": self.energy != "full",
         }
-        if bad := next((key for key, given in beside.items() if given), None):
+        if reason := next((key for key, given in excluded.items() if given), None):
             raise ValueError(
-                f"interaction: {self.interaction}: not with {bad}: it is that of parts with a "
+                f"interaction: {self.interaction}: not with {reason}: it is that of parts with a "
                 "remanence alone, with remanence: deformation and energy: full"
             )
         return self
@@ -256,16 +262,16 @@ class MagneticSection(Section, Ability):
     @property
     def without_field(self) -> bool:
         """Whether the remanence is alone: nothing says how strong a field is."""
-        given = self.model_fields_set
+        keys_given = self.model_fields_set
         return (
             self.remanent is not None
             and self.lambda_m is None
-            and "remanent" in given
-            and "applied" not in given
+            and "remanent" in keys_given
+            and "applied" not in keys_given
         )
 
     def _one_field(self) -> None:
-        """Of a shell that is soft alone."""
+        """Refuse keys of a remanence for a shell that is soft alone."""
         if self.lambda_m is not None and self.applied.reference is not None:
             raise ValueError(
                 "give lambda_m, or the flux density (or the sources) of applied, not both"
@@ -294,7 +300,7 @@ class MagneticSection(Section, Ability):
         return MU_0 * youngs_modulus / self.remanent.flux_density
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that its field has a strength, and that the shell has what its energies need."""
+        """Refuse a field of unknown strength, and shells that its energies do not allow."""
         from magshell_fenicsx.parts.magnetism.sensors import is_read  # it needs this section
 
         shell = context.shell
@@ -322,9 +328,9 @@ class MagneticSection(Section, Ability):
                 "a thickness that does not change",
             )
         if self.energy != "full":
-            expanded = f"magnetic.energy: {self.energy}"
+            energy_key = f"magnetic.energy: {self.energy}"
             context.needs(
-                expanded,
+                energy_key,
                 "a mid-surface",
                 "a thickness that does not change",
                 hint="or give energy: full",
@@ -360,9 +366,11 @@ class MagneticSection(Section, Ability):
         )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
-        acts = [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
-        seen = strength(context) or is_read(context) or acts
-        return acts + (leaves(context, outline) if seen else [])
+        interacting = (
+            [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
+        )
+        is_visible = strength(context) or is_read(context) or interacting
+        return interacting + (leaves(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import (
@@ -374,7 +382,9 @@ class MagneticSection(Section, Ability):
                 "magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0
             )
         if isinstance(self.susceptibility, str):
-            yield Formulas("magnetic.susceptibility", [self.susceptibility], 0.0, MOST_SOFT, 1.0)
+            yield Formulas(
+                "magnetic.susceptibility", [self.susceptibility], 0.0, MAX_SUSCEPTIBILITY, 1.0
+            )
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.magnetisation import (
@@ -392,29 +402,29 @@ class MagneticSection(Section, Ability):
 
         refuse_unfit_interaction(context)
         lambda_m = strength(context)
-        largest = LARGEST_FIELD * (
+        largest = MAX_LAMBDA * (
             100.0 if self.applied.sources else 1.0
         )  # of 1 T, which no source makes on a shell
-        if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:
+        if lambda_m and not MIN_LAMBDA <= abs(lambda_m) <= largest:
             raise CaseError(
                 f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
-                f"{SMALLEST_FIELD:g} to {largest:g}"
+                f"{MIN_LAMBDA:g} to {largest:g}"
             )
         for source in placed(context):
             B = source(places)[0]
             if len(
-                strong := places[
-                    np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)
+                strong_places := places[
+                    np.isfinite(B).all(axis=1) & (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
                 ]
             ):
-                x, y, z = strong[0]
+                x, y, z = strong_places[0]
                 raise CaseError(
-                    f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the "
+                    f"{source.key}: its field is above {MAX_FIELD_RATIO:g} times the unit of the "
                     f"field at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
-            bad = places[~np.isfinite(B).all(axis=1)]
-            if len(bad):
-                x, y, z = bad[0]
+            bad_places = places[~np.isfinite(B).all(axis=1)]
+            if len(bad_places):
+                x, y, z = bad_places[0]
                 raise CaseError(
                     f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) "
                     f"{source.nowhere}; see its position"
@@ -425,13 +435,13 @@ class MagneticSection(Section, Ability):
         }
         for key, text in (
             (key, text)
-            for key, each in components.items()
-            if isinstance(each, list)
-            for text in each
+            for key, texts in components.items()
+            if isinstance(texts, list)
+            for text in texts
         ):
-            bad = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
-            if len(bad):
-                x, y, z = bad[0]
+            bad_places = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
+            if len(bad_places):
+                x, y, z = bad_places[0]
                 raise CaseError(
                     f"magnetic.{key}.components: {shown_value(text)}: has no finite value (or one "
                     f"above 1e6) at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
@@ -449,7 +459,7 @@ class MagneticSection(Section, Ability):
         )
         sizes = np.nan_to_num(divergence), np.nan_to_num(curl)
         largest = [float(values.max()) for values in sizes]
-        if max(largest) <= SOURCES * np.nan_to_num(np.abs(G)).max():
+        if max(largest) <= SOURCE_TOLERANCE * np.nan_to_num(np.abs(G)).max():
             return None
         x, y, z = places[np.argmax(np.maximum(*sizes))]
         return (

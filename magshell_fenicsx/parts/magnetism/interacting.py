@@ -150,7 +150,7 @@ class InteractionTerm:
         b += factor * self._evaluated()[1]
 
     def add_extrapolated_residual(self, b: Array, factor: float) -> None:
-        """See `assembly.dense_tangent.DenseTerm`."""
+        """Add the residual of extrapolated forces, see `assembly.dense_tangent.DenseTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
         extrapolated = (
             self._extrapolation.at(
@@ -164,7 +164,7 @@ class InteractionTerm:
         b += factor * (self._evaluated()[1] if extrapolated is None else extrapolated)
 
     def extrapolation_holds_along(self, step: Array) -> bool:
-        """See `assembly.dense_tangent.DenseTerm`."""
+        """Return whether forces are known along a step, see `assembly.dense_tangent.DenseTerm`."""
         self._nodes()
         displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
         step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
@@ -179,7 +179,7 @@ class InteractionTerm:
         """Nodes far apart act on each other; see `acting`."""
 
     def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
-        """See `assembly.dense_tangent.DenseTerm`; collective."""
+        """Return the second derivative, see `assembly.dense_tangent.DenseTerm`; collective."""
         return (
             self._even_term.even_and_odd_hessians(inexact=inexact)[1]
             if self._even_term
@@ -204,8 +204,10 @@ class InteractionTerm:
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Of remanence, thickness and placement; see `assembly.nonlocal_terms.FieldDifferentiable`;
-        collective."""
+        """Return derivatives by remanence, thickness or placement; collective.
+
+        See `assembly.nonlocal_terms.FieldDifferentiable`.
+        """
         field_of_model, of_shape = self_field(self._view), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         rates_of_copies = np.concatenate([rates @ image.Q.T for image in self._copies.images])

@@ -24,7 +24,7 @@ AMPLITUDE = "interaction"
 
 @dataclass(frozen=True)
 class Interaction:
-    """What acts on each other.
+    """Interaction of magnetised parts.
 
     Attributes
     ----------
@@ -79,13 +79,13 @@ class InteractionStep(FactorStep):
 
 
 def acts(context: Context) -> bool:
-    """Whether magnetised parts act on each other."""
+    """Return whether magnetised parts act on each other."""
     magnetic = context.of(MagneticSection)
     return magnetic is not None and magnetic.interaction != "none"
 
 
 def interaction(context: Context) -> Interaction | None:
-    """That of a case; None without."""
+    """Return the interaction of a case; None without one."""
     magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None or not acts(context):
         return None
@@ -98,7 +98,7 @@ def interaction(context: Context) -> Interaction | None:
 
 
 def refuse_unfit_interaction(context: Context) -> None:
-    """See that the shell has what the interaction needs.
+    """Refuse a case without what the interaction needs.
 
     Raises
     ------

@@ -55,11 +55,11 @@ from magshell_fenicsx.shape.symmetry_constraint import (
 )
 
 Array = NDArray[np.float64]
-SAME = 1e-9  # part of a direction outside a plane: rounding
+EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
 
 
 def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
-    """A remanence by vectors at points, in a frame turned about e3 (rad).
+    """Return a remanence by vectors at points, in a frame turned by `turn` about e3 (rad).
 
     Raises
     ------
@@ -75,14 +75,14 @@ def magnetisation(
     magnetic: MagneticSection,
     context: Context,
     turn: float,
-    within: Mapping[str, Inside],
+    patch_rims: Mapping[str, Inside],
     to: Sequence[Direction] = (),
 ) -> Magnetisation:
-    """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
+    """Return the magnetisation of a case, in a frame turned by `turn` about e3 (rad).
 
     Parameters
     ----------
-    within
+    patch_rims
         Of `Problem`.
     to
         Directions that the field turns to.
@@ -91,22 +91,22 @@ def magnetisation(
         magnetic.remanent or RemanentSection.model_construct(),
         magnetic.applied.gradient,
     )
-    field, driven = in_space(context, turn)
-    own = units(context)[0]
+    field, moving_fields = in_space(context, turn)
+    tesla_of_remanence = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
     for direction in () if field else to:
-        away = direction.vector(turn) - np.sum(
+        normal_part = direction.vector(turn) - np.sum(
             [(direction.vector(turn) @ e) * e for e in basis], axis=0
         )
-        if np.linalg.norm(away) > SAME:
-            basis.append(away / np.linalg.norm(away))
-    applied, *across = (magnetic.applied.uniform * e for e in basis)
+        if np.linalg.norm(normal_part) > EQUALITY_TOLERANCE:
+            basis.append(normal_part / np.linalg.norm(normal_part))
+    applied, *other_components = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(context.shell, MeshSurface):
         patches = {
             name: _on_patch(direction, context, turn) for name, direction in section.patches.items()
         }
-    remanent = _remanence(section, context, turn, within) if magnetic.remanent else np.zeros(3)
+    remanent = _remanence(section, context, turn, patch_rims) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
     G = Q @ np.array(gradient) @ Q.T if gradient and not field else None
@@ -115,17 +115,17 @@ def magnetisation(
         applied,
         magnetic.energy,
         G,
-        tuple(across),
+        tuple(other_components),
         patches,
         layers,
         magnetic.remanence,
         field,
         tuple(basis),
-        driven,
+        moving_fields,
         turns(context, turn),
         section.components if isinstance(section.components, UserField) else None,
-        soft(context, turn, within),
-        own if np.isfinite(own) else 1.0,
+        soft_magnet(context, turn, patch_rims),
+        tesla_of_remanence if np.isfinite(tesla_of_remanence) else 1.0,
         context.shell.reference
         if context.shell.with_units and np.isfinite(units(context)[1])
         else 0.0,
@@ -133,9 +133,12 @@ def magnetisation(
     )
 
 
-def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> SoftMagnet | None:
-    """What is soft, in a frame turned about e3 (rad); None without a susceptibility; `within` is of
-    `Problem`.
+def soft_magnet(
+    context: Context, turn: float, patch_rims: Mapping[str, Inside]
+) -> SoftMagnet | None:
+    """Return the soft-magnetic material, in a frame turned by `turn` about e3 (rad).
+
+    None without a susceptibility. `patch_rims` has the rims of patches by name, see `Problem`.
     """
     magnetic = context.of(MagneticSection)
     if magnetic is None or magnetic.susceptibility is None:
@@ -146,12 +149,12 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> SoftMag
     if isinstance(chi, str):
         pattern = FormulaVectors([formula_function(chi)], rotation(turn), 1.0)
     elif isinstance(chi, dict) and isinstance(context.shell, MeshSurface):
-        patches = {name: np.array([each]) for name, each in chi.items()}
+        patches = {name: np.array([value]) for name, value in chi.items()}
     elif isinstance(chi, dict):
         rest = np.array([chi.get("rest", 0.0)])
         rims = tuple(
             (inside, np.array([chi[name]]) if name in chi else rest)
-            for name, inside in within.items()
+            for name, inside in patch_rims.items()
         )
         pattern = WithinRims(rims, rest) if rims else float(rest[0])
     scale = (
@@ -163,23 +166,27 @@ def soft(context: Context, turn: float, within: Mapping[str, Inside]) -> SoftMag
 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
-    """Whether a plane mirrors a susceptibility; patches are mapped onto themselves."""
+    """Return whether a plane mirrors a susceptibility; patches are mapped onto themselves."""
     return not isinstance(chi, str) or mirrors_formula(chi, mirror, outline.sample())
 
 
 def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:
-    """The remanence on a patch, which may be one shell of several."""
+    """Return the remanence on a patch, which may be one shell of several."""
     if not isinstance(section, RemanentSection) or section.of_shell is None:
         return section.vector(turn)
     place, factor = section.of_shell
-    own = _remanence(section, context, 0.0, {})
-    return factor * own @ place.Q.T if isinstance(own, np.ndarray) else Placed(own, place, factor)
+    remanence = _remanence(section, context, 0.0, {})
+    return (
+        factor * remanence @ place.Q.T
+        if isinstance(remanence, np.ndarray)
+        else Placed(remanence, place, factor)
+    )
 
 
 def _remanence(
-    section: RemanentSection, context: Context, turn: float, within: Mapping[str, Inside]
+    section: RemanentSection, context: Context, turn: float, patch_rims: Mapping[str, Inside]
 ) -> NDArray[np.float64] | Pattern:
-    """The remanence over its magnitude, without patches of a mesh."""
+    """Return the remanence over its magnitude, without patches of a mesh."""
     if section.kind == "radial":
         return radial
     if section.kind == "tangential":
@@ -195,7 +202,7 @@ def _remanence(
     if section.patches and not isinstance(context.shell, MeshSurface):
         vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
         rest = vectors.pop("rest")
-        rims = tuple((inside, vectors.get(name, rest)) for name, inside in within.items())
+        rims = tuple((inside, vectors.get(name, rest)) for name, inside in patch_rims.items())
         return WithinRims(rims, rest) if vectors else rest
     return section.vector(turn)
 
@@ -205,60 +212,62 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     magnetic = context.of(MagneticSection)
     assert magnetic
     formulas = magnetic.applied.components if magnetic.applied.beside else None
-    alone = formulas or not magnetic.applied.beside or not strength(context)
-    magnetised = magnetic.remanent.directions() if magnetic.remanent else []
-    given = [_on_patch(d, context, 0.0) for d in magnetised]
-    vectors = [v for v in given if not callable(v)] + ([] if alone else [magnetic.applied.vector()])
-    whole = turns(context)  # then the rotation is a part of the field at each place
-    turning = [] if whole else [step.to.vector() for step in _rotations(context)]
+    without_uniform_field = formulas or not magnetic.applied.beside or not strength(context)
+    directions = magnetic.remanent.directions() if magnetic.remanent else []
+    remanences = [_on_patch(d, context, 0.0) for d in directions]
+    vectors = [v for v in remanences if not callable(v)] + (
+        [] if without_uniform_field else [magnetic.applied.vector()]
+    )
+    rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
+    turning = [] if rotates_as_whole else [step.to.vector() for step in _rotations(context)]
     remanent = magnetic.remanent or RemanentSection.model_construct()
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if isinstance(remanent.components, UserField):
         return [SymmetryConstraint("the remanence is a function on a mesh", mirrors=no_plane)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
-    askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
+    reasons = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
     if remanent.file:
         by_place = by_points(remanent)
         fields.append(lambda x: by_place(x, x))
-        askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
+        reasons += [] if by_place.controls.around else ["the remanence is given at points in space"]
     patterns = {
-        name: of
-        for name, of in zip(remanent.patches or {}, given, strict=False)
-        if isinstance(of, Placed)
+        name: remanence
+        for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
+        if isinstance(remanence, Placed)
     }
     for name, pattern in patterns.items():
         if pattern.pattern in (radial, tangential):
             continue
         fields.append(partial(_at_places, pattern))
-        pieces = tuple(
-            piece
-            for piece in (outline.meridian.shell_meridians if outline.meridian else ())
-            if name.startswith(piece.name)
+        meridians = tuple(
+            meridian
+            for meridian in (outline.meridian.shell_meridians if outline.meridian else ())
+            if name.startswith(meridian.name)
         )
-        span = outline.meridian and replace(outline.meridian, shell_meridians=pieces)
+        span = outline.meridian and replace(outline.meridian, shell_meridians=meridians)
         if not (span and field_is_axisymmetric(fields[-1], span, smooth=False)):
-            askew.append(f"the remanence of {name} differs around e3")
+            reasons.append(f"the remanence of {name} differs around e3")
     if remanent.components and not (
         outline.meridian and vector_is_axisymmetric(remanent.components, outline.meridian)
     ):
-        askew.append("the formula of the remanence differs around e3")
+        reasons.append("the formula of the remanence differs around e3")
     if formulas and not (
         outline.meridian and vector_is_axisymmetric(formulas, outline.meridian, in_space=True)
     ):
-        askew.append("the formula of the applied field differs around e3")
+        reasons.append("the formula of the applied field differs around e3")
     if isinstance(magnetic.susceptibility, str) and not (
         outline.meridian and scalar_is_axisymmetric(magnetic.susceptibility, outline.meridian)
     ):
-        askew.append("the susceptibility differs around e3")
-    sources = values(context) if magnetic.applied.sources or whole else []
+        reasons.append("the susceptibility differs around e3")
+    sources = values(context) if magnetic.applied.sources or rotates_as_whole else []
     if sources and not (
         outline.meridian
         and all(field_is_axisymmetric(field, outline.meridian) for field in sources)
     ):
-        askew.append("the field of a source differs around e3")
+        reasons.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
-        askew.append("the gradient of the applied field is not diag(a, a, b)")
+        reasons.append("the gradient of the applied field is not diag(a, a, b)")
 
     def mirrors(mirror: Mirror) -> bool:
         S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
@@ -266,24 +275,27 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
-            few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
+            some_places = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
                 equal_to_rounding(
                     sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
                 )
                 for field, places in (
                     *((field, x) for field in fields),
-                    *((field, few) for field in sources),
+                    *((field, some_places) for field in sources),
                 )
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
-            of_shells = [(each.pattern, each.place.Q[:, 2]) for each in patterns.values()]
-            even = all(p is not radial or sign == 1.0 for p, _ in of_shells)
-            even &= all(
-                p is not tangential or np.abs(S @ e3 - sign * e3).max() <= SAME
+            of_shells = [
+                (pattern_of_shell.pattern, pattern_of_shell.place.Q[:, 2])
+                for pattern_of_shell in patterns.values()
+            ]
+            is_symmetric = all(p is not radial or sign == 1.0 for p, _ in of_shells)
+            is_symmetric &= all(
+                p is not tangential or np.abs(S @ e3 - sign * e3).max() <= EQUALITY_TOLERANCE
                 for p, e3 in of_shells
             )
-            return uniform and varying and even and kinds.get(remanent.kind, sign) == sign
+            return uniform and varying and is_symmetric and kinds.get(remanent.kind, sign) == sign
 
         return soft_mirrored(magnetic.susceptibility, outline, mirror) and (
             images(1.0) or images(-1.0)
@@ -291,21 +303,23 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
 
     return [
         SymmetryConstraint(
-            next(iter(askew), None),
-            [*vectors, *_of_sources(magnetic.applied.sources or [], context.shell.reference)],
+            next(iter(reasons), None),
+            [
+                *vectors,
+                *_vectors_of_sources(magnetic.applied.sources or [], context.shell.reference),
+            ],
             mirrors,
         )
     ]
 
 
 def _at_places(pattern: Pattern, x: Array) -> Array:
-    """A pattern that does not depend on the normal, at places (n, 3)."""
+    """Return the values (n, 3) at places of a pattern that does not depend on the normal."""
     return np.asarray(pattern(x[None], 0 * x[None])[0])
 
 
-def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
-    """What a mirror plane through e3 may hold: the places of sources, or the axes of those on
-    e3."""
+def _vectors_of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
+    """Return what a mirror plane through e3 may contain: places of sources, or axes on e3."""
     places = [np.array(source.position) / R for source in sources]
     axes = [source.axes[:, 2] for source in sources]
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
@@ -315,24 +329,24 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it
     is.
     """
-    magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
+    magnetic, turn, patch_rims = context.of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
-    driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
-    read: dict[str, Any] = {
+    driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    observed: dict[str, Any] = {
         "sensors": sensors(context, turn),
         "field_maps": field_maps(context, turn),
     }
-    read["interaction"] = interaction(context)
-    if FieldSection.amplitude in driven:
+    observed["interaction"] = interaction(context)
+    if FieldSection.amplitude in driven_amplitudes:
         to = [step.to for step in _rotations(context)]
-        return {"magnetic": magnetisation(magnetic, context, turn, within, to), **read}
+        return {"magnetic": magnetisation(magnetic, context, turn, patch_rims, to), **observed}
     if magnetic.remanent is None:
-        return read
-    (part,) = leaves(context, modelled.outline)
-    shown = part.not_axisymmetric is None or not modelled.axisymmetric
-    if not shown or (modelled.plane and not part.mirrors(modelled.plane)):
-        return read
-    return {"remanence": magnetisation(magnetic, context, turn, within), **read}
+        return observed
+    (constraint,) = leaves(context, modelled.outline)
+    is_visible = constraint.not_axisymmetric is None or not modelled.axisymmetric
+    if not is_visible or (modelled.plane and not constraint.mirrors(modelled.plane)):
+        return observed
+    return {"remanence": magnetisation(magnetic, context, turn, patch_rims), **observed}
 
 
 def _rotations(context: Context) -> list[RotationSection]:
@@ -340,7 +354,7 @@ def _rotations(context: Context) -> list[RotationSection]:
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """The energy of the field, and its sources."""
+    """Describe the energy of the field, and its sources."""
     magnetic, field, words = context.of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
         words = [
@@ -348,16 +362,20 @@ def account(context: Context, loads: Loads) -> Account:
             f"{loads.interaction.strength:g}"
         ]
     if magnetic is None or field is None:
-        none = "lambda_m is zero" if magnetic else "no magnetic section"
-        return Account(words, [f"magnetic energy: {none}"])
+        reason = "lambda_m is zero" if magnetic else "no magnetic section"
+        return Account(words, [f"magnetic energy: {reason}"])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
-    if field.soft:
-        chi, beside = (
+    if field.soft_magnet:
+        susceptibility, remanence_text = (
             magnetic.susceptibility,
-            "without remanence" if field.soft.alone else "beside the remanence",
+            "without remanence" if field.soft_magnet.alone else "beside the remanence",
         )
-        chi = f"{chi:g}" if isinstance(chi, int | float) else chi
-        law += f", soft magnetism of a sheet with the susceptibility {chi} {beside}"
+        susceptibility = (
+            f"{susceptibility:g}" if isinstance(susceptibility, int | float) else susceptibility
+        )
+        law += (
+            f", soft magnetism of a sheet with the susceptibility {susceptibility} {remanence_text}"
+        )
         law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
     sources = enumerate(magnetic.applied.sources or [])
     words += [f"source {source.name or i}: {source.words()}" for i, source in sources]

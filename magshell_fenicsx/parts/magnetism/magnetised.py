@@ -93,21 +93,21 @@ class Magnetisation:
 
         A uniform one has the magnitude lambda_m.
         """
-        along = mu.get("lambda_m", 0.0)
-        if self.in_space and not along:
+        lambda_m = mu.get("lambda_m", 0.0)
+        if self.in_space and not lambda_m:
             return np.zeros_like(r)
         if self.in_space:
             x = r.reshape(-1, 3)
             B = self.in_space(x)[0] + sum(
-                (each.at(x, mu).value[0] for each in self.driven), np.zeros(3)
+                (field.at(x, mu).value[0] for field in self.driven), np.zeros(3)
             )
-            return np.asarray(along * B.reshape(r.shape))
-        uniform = along * self.applied
-        for name, across in zip(ACROSS, self.across, strict=False):
-            uniform = uniform + mu.get(name, 0.0) * across
+            return np.asarray(lambda_m * B.reshape(r.shape))
+        uniform = lambda_m * self.applied
+        for name, component in zip(ACROSS, self.across, strict=False):
+            uniform = uniform + mu.get(name, 0.0) * component
         if self.gradient is None:
             return np.broadcast_to(uniform, r.shape)
-        return np.asarray(uniform + along * r @ self.gradient.T)
+        return np.asarray(uniform + lambda_m * r @ self.gradient.T)
 
     def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
         """Return 1 if mirror images continue the applied field, -1 if opposites do; collective."""

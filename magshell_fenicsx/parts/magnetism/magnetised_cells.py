@@ -113,15 +113,15 @@ class MagnetisedShell:
         return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=by_thickness)
 
     def add_thickness_derivatives(
-        self, cells: Ints, X: Array, by_thickness: Array, into: NodalDerivatives
+        self, cells: Ints, X: Array, by_thickness: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal factors of the thickness to `into`.
+        """Add derivatives by nodal factors of the thickness to `nodal_derivatives`.
 
         They follow from those by thicknesses (n, m) at places X (m, d) of reference cells (n,).
         """
-        if self.thickness_factor and into.by_thickness is not None:
+        if self.thickness_factor and nodal_derivatives.by_thickness is not None:
             T = self.thickness_factor[0].tabulate(0, X)[0, :, :, 0]
-            np.add.at(into.by_thickness, cells, self.h * by_thickness @ T)
+            np.add.at(nodal_derivatives.by_thickness, cells, self.h * by_thickness @ T)
 
 
 def tables(element: Any, X: Array, order: int) -> Array:
@@ -229,9 +229,9 @@ class SurfaceJets:
         )
 
     def add_derivatives(
-        self, into: NodalDerivatives, by_place: Array, by_normal: Array, by_B: Array
+        self, nodal_derivatives: NodalDerivatives, by_place: Array, by_normal: Array, by_B: Array
     ) -> None:
-        """Add dJ/du and dJ/dB at nodes to `into`, for a number J.
+        """Add dJ/du and dJ/dB at nodes to `nodal_derivatives`, for a number J.
 
         They follow from dJ/dr and dJ/dn (n, m, 3), and from dJ/d(B, B_a, B_b) (3, n, m, 3).
         """
@@ -260,21 +260,21 @@ class SurfaceJets:
         else:
             by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:3], by_jets)
             by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables, by_B)
-        np.add.at(into.by_u, self.cells, by_u)
-        np.add.at(into.by_remanence, self.cells, by_remanence)
+        np.add.at(nodal_derivatives.by_u, self.cells, by_u)
+        np.add.at(nodal_derivatives.by_remanence, self.cells, by_remanence)
 
     def add_reference_derivatives(
         self,
-        into: NodalDerivatives,
+        nodal_derivatives: NodalDerivatives,
         charges_of: "Callable[[SurfaceJets], Array]",
         by_charges: Array,
     ) -> None:
-        """Add derivatives by the undeformed place and the thickness to `into`; of triangles.
+        """Add derivatives by the undeformed place and the thickness to `nodal_derivatives`; of triangles.
 
         They follow from the derivatives `by_charges` (n, m, l) by numbers that depend on the jets.
         Those numbers' own derivatives are found along an imaginary change, exact to rounding.
         """
-        if into.by_place is None or into.by_thickness is None:
+        if nodal_derivatives.by_place is None or nodal_derivatives.by_thickness is None:
             return
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
 
@@ -291,12 +291,18 @@ class SurfaceJets:
             t = self.t.astype(np.complex128)
             t[d] += COMPLEX_STEP * 1j
             by_t[d] = rate(t=t)
-        np.add.at(into.by_place, self.cells, np.einsum("dnmk,dnmi->nki", self.shape_tables, by_r0))
+        np.add.at(
+            nodal_derivatives.by_place,
+            self.cells,
+            np.einsum("dnmk,dnmi->nki", self.shape_tables, by_r0),
+        )
         if self.shape.thickness_factor:
             X, slopes, _ = self.shape.reference(self.ab)
             T = _chain(tables(self.shape.thickness_factor[0], X, 1), slopes, self.ab)
             np.add.at(
-                into.by_thickness, self.cells, self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t)
+                nodal_derivatives.by_thickness,
+                self.cells,
+                self.shape.h * np.einsum("dnmk,dnm->nk", T, by_t),
             )
 
 

@@ -366,7 +366,7 @@ class InteractionHessian:
 
     @cached_property
     def near_blocks(self) -> bsr_array:
-        """See `assembly.dense_tangent.DenseHessian`."""
+        """Blocks of near nodes, see `assembly.dense_tangent.DenseHessian`."""
         return self.near.matrix(self.sign)
 
     def turned(self, q: Array) -> SinglePrecisionBlocks | None:
@@ -381,7 +381,7 @@ class InteractionHessian:
         return self.turning.kept(self.near, self.is_adjacent)
 
     def times_far(self, v: Array) -> Array:
-        """See `assembly.dense_tangent.DenseHessian`."""
+        """Return products with the multipoles' part, see `assembly.dense_tangent.DenseHessian`."""
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
         of_cell, local_expansions = self.far.local_expansions_of_cells(
             _cellwise_products(self.B, self.cells.changes_of_copies(v, self.sign))

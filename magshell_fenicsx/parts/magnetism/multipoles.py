@@ -1,5 +1,4 @@
-"""Solid harmonics: what charges in a box are to others far away, and how that is shifted, derived
-and translated.
+"""Solid harmonics: multipole moments of charges in a box, their shifts, derivatives, translations.
 
 With R = r^l P_l^m(cos theta) e^(i m phi)/(l + m)! and I = (l - m)! P_l^m(cos theta) e^(i m
 phi)/r^(l + 1) about centres at a distance D from each other, 1/|a - b| is the sum of (-1)^l
@@ -22,7 +21,7 @@ COUNT = (ORDER + 1) ** 2
 
 
 def place_of(degree: int, m: int) -> int:
-    """Of the real part of R_l^m in Y; the imaginary one, for m > 0, is the next."""
+    """Return the row of Re R_l^m in Y; the imaginary part, for m > 0, is in the next row."""
     return degree**2 + max(0, 2 * m - 1)
 
 
@@ -33,39 +32,39 @@ def harmonics(x: Array) -> Array:
     Y[0] = 1.0
     for m in range(ORDER + 1):
         if m:
-            before, at = place_of(m - 1, m - 1), place_of(m, m)
+            previous, row = place_of(m - 1, m - 1), place_of(m, m)
             if m == 1:
-                Y[at], Y[at + 1] = -a / 2, -b / 2
+                Y[row], Y[row + 1] = -a / 2, -b / 2
             else:
-                Y[at] = (b * Y[before + 1] - a * Y[before]) / (2 * m)
-                Y[at + 1] = -(a * Y[before + 1] + b * Y[before]) / (2 * m)
+                Y[row] = (b * Y[previous + 1] - a * Y[previous]) / (2 * m)
+                Y[row + 1] = -(a * Y[previous + 1] + b * Y[previous]) / (2 * m)
         for degree in range(m + 1, ORDER + 1):
             share = 1 / ((degree + m) * (degree - m))
             for part in range(1 + (m > 0)):
-                at, one, two = (place_of(degree - k, m) + part for k in range(3))
-                np.multiply(z, Y[one], out=Y[at])
-                Y[at] *= (2 * degree - 1) * share
+                row, lower, second_lower = (place_of(degree - k, m) + part for k in range(3))
+                np.multiply(z, Y[lower], out=Y[row])
+                Y[row] *= (2 * degree - 1) * share
                 if degree > m + 1:
-                    Y[at] -= share * square * Y[two]
+                    Y[row] -= share * square * Y[second_lower]
     return Y
 
 
 @cache
 def derivatives() -> tuple[Array, Array, Array]:
-    """The matrices N with dY/dx_i = N_i Y."""
+    """Return the matrices N (COUNT, COUNT) with dY/dx_i = N_i Y."""
     matrices = [np.zeros((COUNT, COUNT)) for _ in range(3)]
-    along, rest = _complex()
+    coefficients, rest = _complex()
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
             continue
         # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz
         # R_(l-1)^m
-        up, down, same = (along.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
-        for i, row in enumerate(((up - down) / 2, (up + down) / 2j, same)):
-            at = place_of(degree, m)
-            matrices[i][at] = row.real
+        up, down, unchanged = (coefficients.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
+        for i, row in enumerate(((up - down) / 2, (up + down) / 2j, unchanged)):
+            position = place_of(degree, m)
+            matrices[i][position] = row.real
             if m:
-                matrices[i][at + 1] = row.imag
+                matrices[i][position + 1] = row.imag
     return matrices[0], matrices[1], matrices[2]
 
 
@@ -94,20 +93,22 @@ def shift(octant: tuple[int, int, int]) -> Array:
 
 
 def translations(D: Array) -> Array:
-    """The matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) .
+    """Return the matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) . G Y(a).
 
-    G Y(a), for vectors D (n, 3) from b's centre to a's.
+    D (n, 3) are the vectors from b's centre to a's.
     """
     x, y, z = D.T
     square, w = x * x + y * y + z * z, x + 1j * y
-    of: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
+    irregular: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
     for m in range(ORDER + 1):
         if m:
-            of[m, m] = -(2 * m - 1) * w / square * of[m - 1, m - 1]
+            irregular[m, m] = -(2 * m - 1) * w / square * irregular[m - 1, m - 1]
         for degree in range(m + 1, ORDER + 1):
-            of[degree, m] = (2 * degree - 1) * z / square * of[degree - 1, m]
+            irregular[degree, m] = (2 * degree - 1) * z / square * irregular[degree - 1, m]
             if degree > m + 1:
-                of[degree, m] -= ((degree - 1) ** 2 - m * m) / square * of[degree - 2, m]
+                irregular[degree, m] -= (
+                    ((degree - 1) ** 2 - m * m) / square * irregular[degree - 2, m]
+                )
     rows, _ = _complex()
     C, keys = np.array(list(rows.values())).conj(), list(rows)
     G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
@@ -116,7 +117,7 @@ def translations(D: Array) -> Array:
             degree, m = l1 + l2, m1 + m2
             if degree <= ORDER:
                 G[:, j, i] = (-1) ** l1 * (
-                    of[degree, m] if m >= 0 else (-1) ** m * of[degree, -m].conj()
+                    irregular[degree, m] if m >= 0 else (-1) ** m * irregular[degree, -m].conj()
                 )
     return np.ascontiguousarray((C.T @ G @ C).real)
 

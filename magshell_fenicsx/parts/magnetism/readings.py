@@ -124,7 +124,7 @@ class SensorsSeen(Seen):
                 )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        return tuple(column for each in loads.sensors for column in each.columns)
+        return tuple(column for sensor in loads.sensors for column in sensor.columns)
 
     def differentiable(self, loads: "Loads") -> Sequence[str]:
         return self.columns(loads, ())

@@ -1,4 +1,4 @@
-"""What is magnetised for good: the section `remanent` of a case, or of one of its shells."""
+"""The remanence: the section `remanent` of a case, or of one of its shells."""
 
 from typing import Annotated, Literal, Self
 
@@ -76,7 +76,7 @@ class RemanentSection(FileKeys, Direction):
         return self
 
     def placed(self, place: ShellPose, factor: float) -> "RemanentSection":
-        """That of one shell of several, in the frame of which it is, times a factor."""
+        """Return the remanence of one shell of several, in that shell's frame, times a factor."""
         copied = self.model_copy()
         copied._of_shell = place, factor
         return copied

@@ -29,13 +29,13 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """That of a field known by values, without its value at u = 0; P as of `applied.around`."""
+    """Return the energy of a field known by values, less its value at u = 0; P see `around`."""
     B, change = around(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def rotated(F: Expr, v: Expr) -> Expr:
-    """R v."""
+    """Return R v, with the rotation R of F = R U."""
     f1, f2, f3 = (F[:, i] for i in range(3))
     cofactor = ufl.as_tensor([ufl.cross(f2, f3), ufl.cross(f3, f1), ufl.cross(f1, f2)]).T
     first, second, i3 = (

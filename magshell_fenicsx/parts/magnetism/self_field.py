@@ -141,14 +141,16 @@ class SelfField:
         # charges that are zero have derivatives by the remanence
         for include_uncharged in (False, True) if self._is_convected else (True,):
             shape, families = self.families(mu, include_uncharged=include_uncharged)
-            into = NodalDerivatives(np.zeros_like(shape.u), np.zeros_like(shape.remanence))
+            nodal_derivatives = NodalDerivatives(
+                np.zeros_like(shape.u), np.zeros_like(shape.remanence)
+            )
             for image in self._images:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
-                gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, into)
-            derivatives_of_families.append(into)
+                gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, nodal_derivatives)
+            derivatives_of_families.append(nodal_derivatives)
         first, last = derivatives_of_families[0], derivatives_of_families[-1]
-        into = NodalDerivatives(first.by_u, last.by_remanence)
-        return into if self._is_convected else self._to_material(into, mu)
+        nodal_derivatives = NodalDerivatives(first.by_u, last.by_remanence)
+        return nodal_derivatives if self._is_convected else self._to_material(nodal_derivatives, mu)
 
     def moment(self, mu: Mapping[str, float]) -> Array:
         """Return the magnetic moment, remanent and induced, (3,) over R³; collective."""
@@ -258,7 +260,9 @@ class SelfField:
             )
         return np.asarray(along_r1 * r0[1] + along_r2 * r0[2] + along_normal * frame.n0)
 
-    def _to_material(self, into: NodalDerivatives, mu: Mapping[str, float]) -> NodalDerivatives:
+    def _to_material(
+        self, nodal_derivatives: NodalDerivatives, mu: Mapping[str, float]
+    ) -> NodalDerivatives:
         """Return derivatives by displacement and remanence, from those by F^-1 J (`_material`)."""
         V, model = self._model.r0.function_space, self._model
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
@@ -274,22 +278,27 @@ class SelfField:
                     by_jets[d, ..., i] += (
                         weight
                         / DIFFERENCE_STEP
-                        * np.sum(into.by_remanence * self._material(r0, u_moved, mu), axis=-1)
+                        * np.sum(
+                            nodal_derivatives.by_remanence * self._material(r0, u_moved, mu),
+                            axis=-1,
+                        )
                     )
         T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
         if self._dim == 1:
             by_meridian = by_jets[:2][..., [0, 2]]
             by_meridian[0][..., 0] += by_jets[2][..., 1]
             by_jets = by_meridian
-        by_u = into.by_u + np.einsum("dmk,dnmi->nki", T, by_jets)
+        by_u = nodal_derivatives.by_u + np.einsum("dmk,dnmi->nki", T, by_jets)
         space_of_Br = self.Br.function_space
         TB = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)[0, :, :, 0]
         Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
             self.Br.x.array[:] = Br
-            before = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1)
+            before = np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1)
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
-            change = np.sum(into.by_remanence * self._material(r0, u, mu), axis=-1) - before
+            change = (
+                np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1) - before
+            )
             by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
         self.Br.x.array[:] = Br
         return NodalDerivatives(by_u, by_B)

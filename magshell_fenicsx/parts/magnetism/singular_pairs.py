@@ -200,13 +200,13 @@ class SingularPairs:
     def _kinds_of_pair(self, c: int, d: int) -> Iterator[PairKind]:
         """Yield the kinds of all pairs of elements of two adjacent cells c and d."""
         own_corners, other_corners = (
-            [int(each) for each in self._corners[cell]] for cell in (c, d)
+            [int(corner) for corner in self._corners[cell]] for cell in (c, d)
         )
         boundary_sides = tuple(map(bool, self._boundary_sides[c]))
         sides = [
-            (edge, shared)
+            (edge, side_in_other)
             for edge in range(3)
-            if c != d and (shared := self._common_side(c, edge, d))
+            if c != d and (side_in_other := self._common_side(c, edge, d))
         ]
         if c == d:
             yield "faces", boundary_sides, "self"
@@ -218,12 +218,12 @@ class SingularPairs:
                 "faces",
                 boundary_sides,
                 "corner",
-                next(i for i, each in enumerate(other_corners) if each in own_corners),
+                next(i for i, corner in enumerate(other_corners) if corner in own_corners),
             )
         for edge in np.flatnonzero(self._strips[c]):
             edge = int(edge)
             common_side, ends = self._common_side(c, edge, d), [own_corners[i] for i in ENDS[edge]]
-            common_corners = [i for i, each in enumerate(other_corners) if each in ends]
+            common_corners = [i for i, corner in enumerate(other_corners) if corner in ends]
             if common_side:
                 yield "strip", edge, "side", *common_side
             else:
@@ -374,9 +374,11 @@ class SingularPairs:
     @cached_property
     def _on_faces(self) -> Array:
         """(modelled cells, nodes, layers) charges per area of the reference triangle."""
-        return np.concatenate([found.q for _, found in self._face_charges(None)])
+        return np.concatenate([point_charges.q for _, point_charges in self._face_charges(None)])
 
-    def _face_charges(self, into: NodalDerivatives | None) -> Iterator[tuple[Ints, PointCharges]]:
+    def _face_charges(
+        self, nodal_derivatives: NodalDerivatives | None
+    ) -> Iterator[tuple[Ints, PointCharges]]:
         X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         cells_at_once = max(1, MAX_POINTS_AT_ONCE // len(X))
@@ -386,7 +388,7 @@ class SingularPairs:
             yield (
                 part,
                 ShellFaces(self._shape, part, include_uncharged=self._include_uncharged).at(
-                    Boxes.undivided(len(part)), ab, weights, into
+                    Boxes.undivided(len(part)), ab, weights, nodal_derivatives
                 ),
             )
 
@@ -396,12 +398,12 @@ class SingularPairs:
         charges: list[Array] = [
             np.zeros((len(self._shape.r0), int(np.prod(STRIP_NODES)))) for _ in range(3)
         ]
-        for edge, cells, found in self._strip_charges(None):
-            charges[edge][cells] = found.q[..., 0]
+        for edge, cells, point_charges in self._strip_charges(None):
+            charges[edge][cells] = point_charges.q[..., 0]
         return charges
 
     def _strip_charges(
-        self, into: NodalDerivatives | None
+        self, nodal_derivatives: NodalDerivatives | None
     ) -> Iterator[tuple[int, Ints, PointCharges]]:
         (a, _), (b, _) = (gauss(n) for n in STRIP_NODES)
         points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -413,17 +415,17 @@ class SingularPairs:
                     edge,
                     cells,
                     sides.charges_at(
-                        Boxes.undivided(len(cells)), points, np.ones(len(points)), into
+                        Boxes.undivided(len(cells)), points, np.ones(len(points)), nodal_derivatives
                     ),
                 )
 
     def field_derivatives(
-        self, moved_nodes: Complex, weights: Weights, into: NodalDerivatives
+        self, moved_nodes: Complex, weights: Weights, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values to `into`: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives by nodal values to `nodal_derivatives`: see `InteractingCharges.field_derivatives`."""
         on_faces, on_strips = (
             np.zeros_like(self._on_faces),
-            [np.zeros_like(each) for each in self._on_strips],
+            [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips],
         )
         for batch in self._batches:
             pairs = batch.pairs[: batch.own]
@@ -432,8 +434,8 @@ class SingularPairs:
             by_charges_of_both = pair_derivatives(
                 moved_nodes, pairs, (batch.left, rows), (batch.right, rows), weights
             )
-            if into.by_thickness is not None:
-                self._by_heights(batch, pairs, moved_nodes, weights, into)
+            if nodal_derivatives.by_thickness is not None:
+                self._by_heights(batch, pairs, moved_nodes, weights, nodal_derivatives)
             for side, (points, edge, share) in sides:
                 copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
                 by_charges = by_charges_of_both[side][: len(pairs)].reshape(
@@ -453,12 +455,12 @@ class SingularPairs:
                     )
                 else:
                     np.add.at(on_strips[edge], cells, by_charges[..., 0] @ _basis(points))
-        for part, found in self._face_charges(into):
-            assert found.add_derivatives
-            found.add_derivatives(np.zeros_like(found.x), on_faces[part])
-        for edge, cells, found in self._strip_charges(into):
-            assert found.add_derivatives
-            found.add_derivatives(np.zeros_like(found.x), on_strips[edge][cells][..., None])
+        for part, charges in self._face_charges(nodal_derivatives):
+            assert charges.add_derivatives
+            charges.add_derivatives(np.zeros_like(charges.x), on_faces[part])
+        for edge, cells, charges in self._strip_charges(nodal_derivatives):
+            assert charges.add_derivatives
+            charges.add_derivatives(np.zeros_like(charges.x), on_strips[edge][cells][..., None])
 
     def _by_heights(
         self,
@@ -466,7 +468,7 @@ class SingularPairs:
         pairs: Ints,
         moved_nodes: Complex,
         weights: Weights,
-        into: NodalDerivatives,
+        nodal_derivatives: NodalDerivatives,
     ) -> None:
         rows, points_of_both = np.arange(len(pairs)), (batch.left, batch.right)
         by_heights = pair_derivatives(
@@ -479,7 +481,7 @@ class SingularPairs:
             on_t = self._copies.normal_signs[copy][:, None] * np.sum(
                 heights * by_heights[side][: len(pairs)].reshape(shape), axis=-1
             )
-            self._shape.add_thickness_derivatives(cells, places.X, on_t, into)
+            self._shape.add_thickness_derivatives(cells, places.X, on_t, nodal_derivatives)
 
 
 def _basis(points: Places) -> Array:

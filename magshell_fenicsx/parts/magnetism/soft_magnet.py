@@ -161,7 +161,7 @@ class Sheet:
         self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array
     ) -> list[Array]:
         """Return the values (cells, points, 3) of both `fields` at points."""
-        numbers = [float(each.value) for each in amplitudes]
+        numbers = [float(amplitude.value) for amplitude in amplitudes]
         if polynomials is not None:
             return [numbers[0] * polynomials[..., 6:9], numbers[0] * polynomials[..., 3:6]]
         parts = [self.field.applied, *self.field.across]
@@ -188,8 +188,10 @@ class Sheet:
     def energy_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
     ) -> Expr:
-        """The same of a body, in units of E h R²: its layers are sheets, with the normal n0
-        before."""
+        """Return the energy per volume in a solid, in E h R², less its value at u = 0 in this field.
+
+        Layers of the solid are sheets, with the undeformed normal n0.
+        """
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
         return (
             s**2

@@ -59,13 +59,13 @@ class SourceStep(LoadStep):
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:
-        given = [
+        changes = [
             key for key in ("move", "to", "turn", "strength") if getattr(self, key) is not None
         ]
-        if len(given) != 1:
+        if len(changes) != 1:
             raise ValueError("give one of move, to, turn and strength")
         if self.strength == 1 or (self.move and not any(self.move)):
-            raise ValueError(f"{given[0]}: changes nothing")
+            raise ValueError(f"{changes[0]}: changes nothing")
         if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"source"}):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the source"
@@ -91,13 +91,13 @@ class SourceStep(LoadStep):
         """The number of its source; None if there is no such source."""
         if isinstance(self.source, int):
             return self.source if 0 <= self.source < len(sources) else None
-        return next((i for i, one in enumerate(sources) if one.name == self.source), None)
+        return next((i for i, source in enumerate(sources) if source.name == self.source), None)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         magnetic, key = context.of(MagneticSection), step.key
         sources = (magnetic.applied.sources if magnetic else None) or []
         if self.number(sources) is None:
-            names = [one.name or str(i) for i, one in enumerate(sources)]
+            names = [source.name or str(i) for i, source in enumerate(sources)]
             raise ValueError(
                 f"{key}.source: {self.source}: magnetic.applied.sources has no such source; "
                 f"allowed: {', '.join(names) or 'none'}"
@@ -106,10 +106,18 @@ class SourceStep(LoadStep):
             raise ValueError(
                 f"{key}.kind: source needs the field of its source: a step of kind: field before it"
             )
-        loads = (each for each in context.steps if each.name != step.name)
-        others = [each.load for each in loads if isinstance(each.load, SourceStep)]
-        same = (other for other in others if other.number(sources) == self.number(sources))
-        if self.to and any(other.move or other.to for other in same):
+        loads = (
+            step_of_other for step_of_other in context.steps if step_of_other.name != step.name
+        )
+        other_loads = [
+            step_of_other.load
+            for step_of_other in loads
+            if isinstance(step_of_other.load, SourceStep)
+        ]
+        of_same_source = (
+            other for other in other_loads if other.number(sources) == self.number(sources)
+        )
+        if self.to and any(other.move or other.to for other in of_same_source):
             raise ValueError(f"{key}.to: another step moves the same source: give move")
 
 
@@ -117,12 +125,13 @@ def source_columns(loads: "Loads") -> dict[str, str]:
     """Amplitude of a source -> the column of the force, the torque or the work on it."""
     kinds_of: dict[str, str] = {}
     turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
-    for each in loads.magnetic.driven if loads.magnetic else ():
-        own = [motion for motion in each.motions if motion.name not in turns]
+    for field in loads.magnetic.driven if loads.magnetic else ():
+        own_motions = [motion for motion in field.motions if motion.name not in turns]
         kinds_of |= {
-            motion.name: "source_torque" if motion.turns else "source_force" for motion in own
+            motion.name: "source_torque" if motion.turns else "source_force"
+            for motion in own_motions
         }
-        kinds_of |= dict.fromkeys(each.factors, "source_work")
+        kinds_of |= dict.fromkeys(field.factors, "source_work")
     kinds = list(kinds_of.values())
     return {
         name: kind if kinds.count(kind) == 1 else f"{kind}_{name}"
@@ -133,10 +142,10 @@ def source_columns(loads: "Loads") -> dict[str, str]:
 def source_size(loads: "Loads", name: str) -> float:
     """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
     assert loads.magnetic
-    for each in loads.magnetic.driven:
-        if name in each.factors:
-            return each.factors[name]
-        for motion in each.motions:
+    for field in loads.magnetic.driven:
+        if name in field.factors:
+            return field.factors[name]
+        for motion in field.motions:
             if motion.name == name:
                 return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
     raise KeyError(name)
@@ -198,8 +207,8 @@ class SourcesSeen(Seen):
     def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
         motions = [
             motion
-            for driven in (loads.magnetic.driven if loads.magnetic else ())
-            for motion in driven.motions
+            for field in (loads.magnetic.driven if loads.magnetic else ())
+            for motion in field.motions
         ]
         return {
             motion.name: (bool(motion.turns), source_size(loads, motion.name)) for motion in motions

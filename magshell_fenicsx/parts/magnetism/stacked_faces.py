@@ -86,14 +86,14 @@ def corner_distances(x: Array, corners: Array) -> tuple[Array, Array]:
     sides = corners[:, [1, 2, 0]] - corners
     normal = unit(np.asarray(np.cross(sides[:, 0], sides[:, 1]), dtype=np.float64))
     separations = x[:, :, None] - corners[:, None]
-    across = np.einsum("nmi,ni->nm", separations[:, :, 0], normal)
+    normal_distance = np.einsum("nmi,ni->nm", separations[:, :, 0], normal)
     side_heights = np.einsum("nmki,nki->nmk", separations, np.cross(normal[:, None], sides))
     square = np.sum(sides * sides, axis=-1)
     t = np.clip(np.einsum("nmki,nki->nmk", separations, sides) / square[:, None], 0.0, 1.0)
     to_sides = np.linalg.norm(separations - t[..., None] * sides[:, None], axis=-1).min(axis=-1)
-    distance = np.where((side_heights >= 0).all(axis=-1), np.abs(across), to_sides)
+    distance = np.where((side_heights >= 0).all(axis=-1), np.abs(normal_distance), to_sides)
     rows, nearest = np.arange(len(x)), distance.argmin(axis=1)
-    return distance[rows, nearest], np.abs(across[rows, nearest])
+    return distance[rows, nearest], np.abs(normal_distance[rows, nearest])
 
 
 FreeSides = tuple[bool, bool, bool]  # whether each side of a cell is at a free edge
@@ -233,18 +233,22 @@ class StackedFaces:
         is_stacked: NDArray[np.bool_],
         moved_nodes: Complex,
         weights: Weights,
-        into: NodalDerivatives,
+        nodal_derivatives: NodalDerivatives,
     ) -> None:
-        """Add derivatives of own cells to `into`: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives of own cells to `nodal_derivatives`: see `InteractingCharges.field_derivatives`."""
         on_charges, first_row, basis = (
             np.zeros_like(self._nodal_charges),
             np.zeros(1, dtype=np.int64),
             coefficients_of_nodes(CHARGE_ELEMENT),
         )
-        for one, other in self._ordered(own_cells, is_stacked)[0]:
-            first_points, first_weights = self._rules_of_kinds[self._kind[one]]
+        for first_cell, second_cell in self._ordered(own_cells, is_stacked)[0]:
+            first_points, first_weights = self._rules_of_kinds[self._kind[first_cell]]
             rule = self._pairs.visible_points(
-                self._structs[self._kind[one]], nodes, one, other, MAX_VISIBLE_POINTS
+                self._structs[self._kind[first_cell]],
+                nodes,
+                first_cell,
+                second_cell,
+                MAX_VISIBLE_POINTS,
             )
             if rule is None:
                 continue
@@ -252,7 +256,7 @@ class StackedFaces:
             places, sizes = (first_points, X.reshape(-1, 2)), (len(first_points), w.shape[1])
             (t, q), (t_of_second, q_of_second) = (
                 self._thickness_and_charges(cell, points)
-                for cell, points in zip((one, other), places, strict=True)
+                for cell, points in zip((first_cell, second_cell), places, strict=True)
             )
             layers, layer_factors, heights_of_layers = self._extrapolated_layers(t, *layer_shifts)
             q = first_weights[:, None] * np.einsum("pls,ps->pl", layer_factors, q)
@@ -265,15 +269,18 @@ class StackedFaces:
                 t_of_second.reshape(1, *sizes),
                 q_of_second,
             )
-            pairs, sides = np.array([[one, other]]), ((left, first_row), (right, first_row))
+            pairs, sides = (
+                np.array([[first_cell, second_cell]]),
+                ((left, first_row), (right, first_row)),
+            )
             by_charges = pair_derivatives(moved_nodes, pairs, *sides, weights)
             on_heights = (
                 None
-                if into.by_thickness is None
+                if nodal_derivatives.by_thickness is None
                 else pair_derivatives(moved_nodes, pairs, *sides, weights, heights=True)
             )
             for side, (cell, points, weight) in enumerate(
-                zip((one, other), places, (first_weights, w.ravel()), strict=True)
+                zip((first_cell, second_cell), places, (first_weights, w.ravel()), strict=True)
             ):
                 if cell not in own_cells:
                     continue
@@ -298,9 +305,9 @@ class StackedFaces:
                         on_heights[side].reshape(len(points), -1) * heights_of_side, axis=-1
                     )
                     self._shape.add_thickness_derivatives(
-                        np.array([number]), points, by_thickness[None], into
+                        np.array([number]), points, by_thickness[None], nodal_derivatives
                     )
-        charges = self._faces.charges_at(*self._nodes_of_charges, into)
+        charges = self._faces.charges_at(*self._nodes_of_charges, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(np.zeros_like(charges.x), on_charges)
 
@@ -373,7 +380,7 @@ class StackedFaces:
     def _structs(self) -> list[object]:
         """Structs in C for each kind of first cells."""
         rules = [np.column_stack(gauss(n)).ravel() for n in range(1, MAX_GAUSS_POINTS + 1)]
-        shared = {
+        shared_arrays = {
             "shape": coefficients_of_nodes(self._shape.element),
             "charges": self._charge_polynomials,
             "thickness": self._thickness,
@@ -381,7 +388,7 @@ class StackedFaces:
             "gauss": np.concatenate(rules),
         }
         numbers = {
-            "k": shared["shape"].shape[1],
+            "k": shared_arrays["shape"].shape[1],
             "degree": self._shape.element.degree,
             "of_charges": CHARGE_DEGREE,
         }
@@ -394,7 +401,11 @@ class StackedFaces:
         }
         structs = list[object]()
         for X, w in self._rules_of_kinds:
-            arrays = shared | {"T": np.ascontiguousarray(self._tabulated(X)), "X": X, "weights": w}
+            arrays = shared_arrays | {
+                "T": np.ascontiguousarray(self._tabulated(X)),
+                "X": X,
+                "weights": w,
+            }
             structs.append(self._pairs.cells(arrays, **numbers, P=len(w), precision=PRECISION))
         return structs
 

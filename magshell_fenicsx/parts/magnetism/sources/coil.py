@@ -65,8 +65,8 @@ class CoilSection(SourceSection):
 
 def to_polygon(x: Array, corners: Array) -> Array:
     """The distance (n,) of places (n, 3) from the nearest of the lines between corners (m, 3)."""
-    least = np.full(len(x), np.inf)
-    for a, way in zip(corners, np.diff(corners, axis=0), strict=False):
-        along = np.clip((x - a) @ way / np.sum(way**2), 0.0, 1.0)
-        least = np.minimum(least, np.linalg.norm(x - a - along[:, None] * way, axis=1))
-    return least
+    distance = np.full(len(x), np.inf)
+    for a, segment in zip(corners, np.diff(corners, axis=0), strict=False):
+        position = np.clip((x - a) @ segment / np.sum(segment**2), 0.0, 1.0)
+        distance = np.minimum(distance, np.linalg.norm(x - a - position[:, None] * segment, axis=1))
+    return distance

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")
 VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3
-SAME = 1e-6  # of the distance between places: rounding of a table
+PLACE_TOLERANCE = 1e-6  # of the distance between places: rounding of a table
 _grids: dict[tuple[Path, str], tuple[list[Array], Array]] = {}  # a run plans its case several times
 
 
@@ -42,7 +42,7 @@ class GridSection(FileKeys, SourceSection):
         return f"grid of {self.file}"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """See `SourceSection`.
+        """Return the field of the spline, see `SourceSection`.
 
         Raises
         ------
@@ -56,13 +56,17 @@ class GridSection(FileKeys, SourceSection):
         spline = _spline(axes, B_on_grid)
 
         def values(x: Array) -> tuple[Array, Array, Array]:
-            def derived(*by: int) -> Array:
-                return np.asarray(spline(x, nu=np.bincount(by, minlength=3)) if by else spline(x))
+            def derivative(*axes_of_derivative: int) -> Array:
+                return np.asarray(
+                    spline(x, nu=np.bincount(axes_of_derivative, minlength=3))
+                    if axes_of_derivative
+                    else spline(x)
+                )
 
-            B, G = derived(), np.stack([derived(j) for j in range(3)], axis=-1)
+            B, G = derivative(), np.stack([derivative(j) for j in range(3)], axis=-1)
             H = np.empty((len(x), 3, 3, 3))
             for j, k in combinations_with_replacement(range(3), 2):
-                H[:, :, j, k] = H[:, :, k, j] = derived(j, k)
+                H[:, :, j, k] = H[:, :, k, j] = derivative(j, k)
             return B, G, H
 
         low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
@@ -75,9 +79,9 @@ def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
 
     knots = []
     for i, axis in enumerate(axes):
-        along = scipy.interpolate.make_interp_spline(axis, values, DEGREE, axis=i)
-        knots.append(along.t)
-        values = np.moveaxis(along.c, 0, i)
+        spline = scipy.interpolate.make_interp_spline(axis, values, DEGREE, axis=i)
+        knots.append(spline.t)
+        values = np.moveaxis(spline.c, 0, i)
     return scipy.interpolate.NdBSpline(tuple(knots), values, DEGREE, extrapolate=False)
 
 
@@ -135,8 +139,8 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
 
 
 def _size(unit: str | None, name: str) -> float:
-    of = "metre" if name in PLACES else "tesla"
-    return column_size(name, unit or of, of)
+    base_unit = "metre" if name in PLACES else "tesla"
+    return column_size(name, unit or base_unit, base_unit)
 
 
 def _vtk_rows(file: Path, files: Files) -> tuple[Array, Array]:
@@ -149,14 +153,14 @@ def _vtk_rows(file: Path, files: Files) -> tuple[Array, Array]:
     return np.array(data.points, dtype=float), np.array(data.point_data["B"], dtype=float)
 
 
-def _places(along: Array) -> Array:
+def _places(coordinates: Array) -> Array:
     """Different places, sorted; those that differ by rounding are one."""
-    different = np.unique(along)
-    apart = np.ptp(different) / len(different) if len(different) > 1 else 1.0
-    first = np.concatenate([[True], np.diff(different) > SAME * apart])
-    return np.asarray(different[first])
+    distinct = np.unique(coordinates)
+    mean_distance = np.ptp(distinct) / len(distinct) if len(distinct) > 1 else 1.0
+    first = np.concatenate([[True], np.diff(distinct) > PLACE_TOLERANCE * mean_distance])
+    return np.asarray(distinct[first])
 
 
-def _nearest(axis: Array, along: Array) -> NDArray[np.int64]:
+def _nearest(axis: Array, coordinates: Array) -> NDArray[np.int64]:
     middle = (axis[1:] + axis[:-1]) / 2
-    return np.asarray(np.searchsorted(middle, along))
+    return np.asarray(np.searchsorted(middle, coordinates))

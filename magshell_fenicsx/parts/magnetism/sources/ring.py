@@ -34,7 +34,7 @@ class RingSection(MagnetSection):
 
     @property
     def radii(self) -> tuple[float, float]:
-        """Of the hole, and of the ring, in m."""
+        """Radii of the hole and of the ring, in m."""
         return self.inner_diameter / 2, self.diameter / 2
 
     def values(self, magnets: ModuleType) -> Values:

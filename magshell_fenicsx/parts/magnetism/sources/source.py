@@ -1,6 +1,4 @@
-"""What all sources of the applied field have in common: their sections, and their fields at their
-places.
-"""
+"""Base of all sources of the applied field: their sections, and their fields at their places."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -75,7 +73,7 @@ class SourceSection(Section):
 
     @property
     def axes(self) -> Array:
-        """Its own axes as columns (3, 3)."""
+        """Axes of the source as columns (3, 3)."""
         (sp, cp), (sa, ca), (ss, cs) = (
             (np.sin(t), np.cos(t))
             for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
@@ -87,11 +85,13 @@ class SourceSection(Section):
         )
 
     def words(self) -> str:
-        """Its words in the account of what is built."""
+        """Describe the source in the account of what is built."""
         return f"{self.kind} at ({', '.join(f'{1e3 * x:g}' for x in self.position)}) mm"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Its field; `key` is its own, and R (m) what formulas of the place are over.
+        """Return the field in the source's axes.
+
+        `key` is the source's key, and R (m) is the unit of places in formulas.
 
         Raises
         ------
@@ -118,19 +118,19 @@ class MagnetSection(SourceSection):
 
     @abstractmethod
     def values(self, magnets: ModuleType) -> Values:
-        """B at places in m, by the magnet of magpylib."""
+        """Return B at places in m, by the magnet of magpylib."""
 
     @abstractmethod
     def distance(self, x: Array) -> Array:
-        """How far places (n, 3) in m are from it; negative inside."""
+        """Return the distance (n,) of places (n, 3) in m from the magnet; negative inside."""
 
     @abstractmethod
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, in m."""
+        """Return the outline: places (n, 3) along lines, in m."""
 
     @abstractmethod
     def solid(self) -> Solid:
-        """Its faces, in m."""
+        """Return the faces, in m."""
 
     def field(self, key: str, R: float) -> FieldOfSource:
         values = Harmonic(self.values(magpylib(key).magnet), self.distance)
@@ -140,12 +140,14 @@ class MagnetSection(SourceSection):
         return FieldOfSource(values, self.lines(), "inside", solid)
 
 
-def to_box(beyond: Array) -> Array:
-    """The distance (n,) from how far places are beyond the faces in each direction (n, m); negative
-    inside.
+def to_box(outside_by: Array) -> Array:
+    """Return the distance (n,) of places from a box; negative inside.
+
+    `outside_by` (n, m) is how far places are beyond the faces in each direction.
     """
     return np.asarray(
-        np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+        np.linalg.norm(np.maximum(outside_by, 0.0), axis=1)
+        + np.minimum(outside_by.max(axis=1), 0.0)
     )
 
 
@@ -184,29 +186,34 @@ class PlacedSource:
         )
 
     def distance(self, x: Array) -> Array:
-        """From places (n, 3) to its body, over R, negative inside; infinite if it has none."""
-        of = getattr(self.own.values, "distance", None)
+        """Return the distance (n,) of places (n, 3) from the source's body, over R.
+
+        It is negative inside, and infinite if there is no body.
+        """
+        distance_to_source = getattr(self.own.values, "distance", None)
         return (
             np.full(len(x), np.inf)
-            if of is None
-            else of(self.length * (x - self.position) @ self.axes) / self.length
+            if distance_to_source is None
+            else distance_to_source(self.length * (x - self.position) @ self.axes) / self.length
         )
 
     @property
     def nowhere(self) -> str:
-        """What a place without a field is, in words."""
+        """Description of a place without a field."""
         return f"is {self.own.nowhere} {self.key}"
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
+        """Outline: places (n, 3) along lines, over R."""
         return [self.position + line / self.length @ self.axes.T for line in self.own.lines]
 
     @property
     def solid(self) -> Solid | None:
-        """Its faces, over R."""
-        own = self.own.solid
-        return own.transformed(self.axes, self.position, 1 / self.length) if own else None
+        """Faces, over R; None without any."""
+        own_solid = self.own.solid
+        return (
+            own_solid.transformed(self.axes, self.position, 1 / self.length) if own_solid else None
+        )
 
 
 def magpylib(key: str) -> ModuleType:
