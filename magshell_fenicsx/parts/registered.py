@@ -67,7 +67,7 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "imperfections.growth.GrowingSeen",
     "pressure.pressure.PressureSeen",
     "forces.dead.ForcesSeen",
-    "supports.reacting.Moved",
+    "supports.reacting.ReactionsSeen",
     "magnetism.readings.FieldSeen",
     "magnetism.source_step.SourcesSeen",
     "magnetism.readings.SoftSeen",

@@ -37,7 +37,8 @@ from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells, side_of
-from magshell_fenicsx.parts.supports.moved import (
+from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
+from magshell_fenicsx.parts.supports.support_motion import (
     PRESSURE,
     Support,
     enclosed,
@@ -45,7 +46,6 @@ from magshell_fenicsx.parts.supports.moved import (
     moving,
     rotation_of,
 )
-from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.observed import Thin

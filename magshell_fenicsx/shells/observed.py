@@ -26,7 +26,7 @@ from magshell_fenicsx.parts.bodies.contact import Pressing, Region
 from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
-from magshell_fenicsx.parts.supports.moved import Support
+from magshell_fenicsx.parts.supports.support_motion import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
 from magshell_fenicsx.shells.terms import EnergyFactory
 

@@ -56,7 +56,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import beside, on_cells, on_each, openings
-from magshell_fenicsx.parts.supports.moved import (
+from magshell_fenicsx.parts.supports.support_motion import (
     Support,
     SupportKind,
     enclosed,

@@ -44,7 +44,12 @@ from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import Shape, body_shape, growth_in_body
 from magshell_fenicsx.parts.pressure.openings import openings
-from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges
+from magshell_fenicsx.parts.supports.support_motion import (
+    enclosed,
+    motions_of,
+    moving,
+    pressed_edges,
+)
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
 from magshell_fenicsx.shells.observed import Observed
 from magshell_fenicsx.shells.solid_sites import make_sites

@@ -516,7 +516,7 @@ def _add_field(
 def gradient(
     families: Sequence[ChargedElements], place: Array, e: Array, nodal_derivatives: NodalDerivatives
 ) -> float:
-    """Return e . B at one place (3,), and add its derivatives by nodal values to `nodal_derivatives`.
+    """Return e . B at one place (3,), and add to its derivatives by nodal values.
 
     Raises
     ------

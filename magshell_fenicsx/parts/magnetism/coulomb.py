@@ -138,7 +138,7 @@ class ElementKind:
     def add_derivatives(
         self, which: int, by_charges: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values to `nodal_derivatives`, from those by the charges of a rule."""
+        """Add derivatives by nodal values, from those by the charges of a rule."""
         count, boxes = len(self._copies.images), Boxes.undivided(self.family.count)
         by_modelled_charges = np.einsum(
             "c,c...->...",
@@ -157,7 +157,7 @@ class ElementKind:
     def add_height_derivatives(
         self, which: int, by_heights: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by the thickness to `nodal_derivatives`, from those by the heights of a rule."""
+        """Add derivatives by the thickness, from those by the heights of a rule."""
         X = (
             self._face_points(which)[0]
             if self._edge is None

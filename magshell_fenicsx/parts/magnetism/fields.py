@@ -397,7 +397,7 @@ class MagneticSection(Section, Ability):
         """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
         from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
         from magshell_fenicsx.parts.magnetism.sources.field import (
-            placed,
+            placed_sources,
         )  # the solver takes long to import
 
         refuse_unfit_interaction(context)
@@ -410,7 +410,7 @@ class MagneticSection(Section, Ability):
                 f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
                 f"{MIN_LAMBDA:g} to {largest:g}"
             )
-        for source in placed(context):
+        for source in placed_sources(context):
             B = source(places)[0]
             if len(
                 strong_places := places[
@@ -473,11 +473,11 @@ class MagneticSection(Section, Ability):
         unit.
         """
         from magshell_fenicsx.parts.magnetism.sources.field import (
-            placed,
+            placed_sources,
         )  # the solver takes long to import
         from magshell_fenicsx.shape.outline import outline
 
-        if not (sources := placed(context)):
+        if not (sources := placed_sources(context)):
             return []
         places, unit = outline(context.shell).sample(), 1e3 * abs(self.applied.reference or 1.0)
         sizes = unit * np.linalg.norm(

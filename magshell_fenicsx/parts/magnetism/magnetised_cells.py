@@ -269,7 +269,7 @@ class SurfaceJets:
         charges_of: "Callable[[SurfaceJets], Array]",
         by_charges: Array,
     ) -> None:
-        """Add derivatives by the undeformed place and the thickness to `nodal_derivatives`; of triangles.
+        """Add derivatives by the undeformed place and the thickness; of triangles.
 
         They follow from the derivatives `by_charges` (n, m, l) by numbers that depend on the jets.
         Those numbers' own derivatives are found along an imaginary change, exact to rounding.

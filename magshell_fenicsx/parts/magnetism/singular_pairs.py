@@ -422,7 +422,7 @@ class SingularPairs:
     def field_derivatives(
         self, moved_nodes: Complex, weights: Weights, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values to `nodal_derivatives`: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives by nodal values: see `InteractingCharges.field_derivatives`."""
         on_faces, on_strips = (
             np.zeros_like(self._on_faces),
             [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips],

@@ -188,7 +188,7 @@ class Sheet:
     def energy_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
     ) -> Expr:
-        """Return the energy per volume in a solid, in E h R², less its value at u = 0 in this field.
+        """Return the energy per volume in a solid, in E h R², less its value at u = 0.
 
         Layers of the solid are sheets, with the undeformed normal n0.
         """

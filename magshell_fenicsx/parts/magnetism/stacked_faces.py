@@ -235,7 +235,7 @@ class StackedFaces:
         weights: Weights,
         nodal_derivatives: NodalDerivatives,
     ) -> None:
-        """Add derivatives of own cells to `nodal_derivatives`: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives of own cells: see `InteractingCharges.field_derivatives`."""
         on_charges, first_row, basis = (
             np.zeros_like(self._nodal_charges),
             np.zeros(1, dtype=np.int64),

@@ -45,7 +45,7 @@ def only_turns(loads: "Loads", name: str) -> bool:
     return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
 
-class Moved(Seen):
+class ReactionsSeen(Seen):
     """Motions of supports with their reactions, and the reactions of all supports."""
 
     quantities = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.prescribed_motion import vectors_in_space
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.parts.supports.moved import PRECEDENCE
+from magshell_fenicsx.parts.supports.support_motion import PRECEDENCE
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.observed import Observed

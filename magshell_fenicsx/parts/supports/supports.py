@@ -22,7 +22,7 @@ from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.supports.moved import Support
+from magshell_fenicsx.parts.supports.support_motion import Support
 
 Array = NDArray[np.float64]
 ALL_COMPONENTS = (0, 1, 2)

@@ -21,7 +21,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.magnetism.applied import crossed_place
-from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
+from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed_sources
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 
@@ -333,7 +333,7 @@ def test_thin_magnet_in_the_way() -> None:
     """It is passed through in one step: the distance of the ends of a way says nothing about its
     middle.
     """
-    (plate,) = placed(
+    (plate,) = placed_sources(
         case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]).context
     )
     x = np.array([[0.01, 0.02, 0.3], [5.0, 0, 0.3]])

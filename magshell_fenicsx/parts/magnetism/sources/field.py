@@ -44,13 +44,13 @@ class Sum:
         n = len(x)
         B, G, H = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3, 3))
         for part in self.parts:
-            for whole, own in zip((B, G, H), part(x), strict=True):
-                whole += own
+            for total, addend in zip((B, G, H), part(x), strict=True):
+                total += addend
         return B, G, H
 
 
-def placed(context: Context, turn: float = 0.0) -> list[PlacedSource]:
-    """The sources of a case, in a frame turned about e3 (rad).
+def placed_sources(context: Context, turn: float = 0.0) -> list[PlacedSource]:
+    """Return the sources of a case, in a frame turned by `turn` about e3 (rad).
 
     Raises
     ------
@@ -66,9 +66,11 @@ def placed(context: Context, turn: float = 0.0) -> list[PlacedSource]:
     for i, section in enumerate(applied.sources):
         key = f"magnetic.applied.sources.{i}"
         position = [x / R for x in section.position]
-        own = section.field(key, R)
+        field_of_source = section.field(key, R)
         sources.append(
-            PlacedSource(own, Q @ position, Q @ section.axes, R, section.strength / unit, key)
+            PlacedSource(
+                field_of_source, Q @ position, Q @ section.axes, R, section.strength / unit, key
+            )
         )
     return sources
 
@@ -79,30 +81,32 @@ def _applied(context: Context) -> AppliedSection | None:
 
 
 def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
-    """The rotations of all of the field about the origin, of a field that is known by values, or
-    has a gradient.
+    """Return the rotations of the whole field about the origin, one for each step that rotates it.
+
+    There are none for a uniform field, which has components instead.
     """
     applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
         return ()
-    rotations, before, zero = list[RigidMotion](), applied.vector(turn), np.zeros(3)
+    rotations, start, zero = list[RigidMotion](), applied.vector(turn), np.zeros(3)
     for step in context.steps:
         if isinstance(step.load, RotationSection):
-            after = step.load.to.vector(turn)
-            axis = np.cross(before, after)
-            angle = acos(float(before @ after))
+            end = step.load.to.vector(turn)
+            axis = np.cross(start, end)
+            angle = acos(float(start @ end))
             rotations.append(
                 RigidMotion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero)
             )
-            before = after
+            start = end
     return tuple(rotations)
 
 
 def in_space(
     context: Context, turn: float = 0.0
 ) -> tuple[FieldInSpace | None, tuple[MovingField, ...]]:
-    """The field that stays, None if it is built in, and the fields that steps drive, in a frame
-    turned about e3 (rad).
+    """Return the field at rest, None if it is uniform or linear, and the moving fields.
+
+    Both are in a frame turned by `turn` about e3 (rad).
 
     Raises
     ------
@@ -121,20 +125,20 @@ def in_space(
     if applied.beside:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
         parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
-    driven = list[MovingField]()
-    for number, source in enumerate(placed(context, turn)):
-        one = _driven(applied, context.steps, number, source, rotations, Q)
-        if one.names:
-            driven.append(one)
+    moving_fields = list[MovingField]()
+    for number, source in enumerate(placed_sources(context, turn)):
+        moving_field = _moving_source(applied, context.steps, number, source, rotations, Q)
+        if moving_field.names:
+            moving_fields.append(moving_field)
         else:
             parts.append(source)
     if rotations:
-        driven += [MovingField(part, rotations) for part in parts]
+        moving_fields += [MovingField(part, rotations) for part in parts]
         parts = []
-    return Sum(parts), tuple(driven)
+    return Sum(parts), tuple(moving_fields)
 
 
-def _driven(
+def _moving_source(
     applied: AppliedSection,
     steps: Sequence[ProgrammeStep],
     number: int,
@@ -142,8 +146,9 @@ def _driven(
     rotations: Sequence[RigidMotion],
     Q: Array,
 ) -> MovingField:
-    """A source with the amplitudes of its steps; turns about its own position come before all other
-    motions.
+    """Return a source with the amplitudes of its steps.
+
+    Rotations about its own position come before all other motions.
     """
     spins, moves, factors, zero = (
         list[RigidMotion](),
@@ -151,15 +156,17 @@ def _driven(
         dict[str, float](),
         np.zeros(3),
     )
-    of_all = {motion.name: motion for motion in rotations}
+    rotation_of = {motion.name: motion for motion in rotations}
     loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
-    own = {name for name, load in loads.items() if load.number(applied.sources or []) == number}
+    steps_of_source = {
+        name for name, load in loads.items() if load.number(applied.sources or []) == number
+    }
     for step in steps:
         if isinstance(step.load, RotationSection):
-            moves.append(of_all[turn_name(step)])
-        if step.name not in own:
+            moves.append(rotation_of[turn_name(step)])
+        if step.name not in steps_of_source:
             continue
-        own.remove(step.name)
+        steps_of_source.remove(step.name)
         load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
@@ -178,19 +185,21 @@ def _driven(
 
 
 def values(context: Context) -> list[Callable[[Array], Array]]:
-    """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them
-    has changed.
+    """Return functions of places (n, 3) -> B over |B^a|, for sources at several amplitudes.
+
+    The first is for the sources as they begin; the others have one amplitude changed each.
     """
-    still, driven = in_space(context)
-    if still is None:
+    field_at_rest, moving_fields = in_space(context)
+    if field_at_rest is None:
         return []
-    names = [name for each in driven for name in each.names]
+    names = [name for field in moving_fields for name in field.names]
     mus = [dict.fromkeys(names, 0.0)]
     mus += [{**mus[0], name: mu} for name in names for mu in (HALFWAY, 1.0)]
 
-    def at(mu: dict[str, float]) -> Callable[[Array], Array]:
+    def field_at(mu: dict[str, float]) -> Callable[[Array], Array]:
         return lambda x: np.asarray(
-            still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3))
+            field_at_rest(x)[0]
+            + sum((field.at(x, mu).value[0] for field in moving_fields), np.zeros(3))
         )
 
-    return [at(mu) for mu in mus]
+    return [field_at(mu) for mu in mus]
