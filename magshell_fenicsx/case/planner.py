@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS, LocalImperfection, different, leaves, spots
 from magshell_fenicsx.parts.laminate import Laminated, laminate_of
@@ -366,7 +366,7 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
 
 
 def imperfect(
-    perfect: Outline, imperfections: Mapping[str, Flaw], turn: float, still: Collection[str]
+    perfect: Outline, imperfections: Mapping[str, ImperfectionGeometry], turn: float, still: Collection[str]
 ) -> Outline:
     """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have
     their cells.

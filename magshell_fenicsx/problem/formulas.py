@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.fitted import Cells, fitted, sampling
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
 from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
 from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.part import Context, Formulas
 from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
 
@@ -356,7 +356,7 @@ def formula_refinements(
 
 
 def imperfection_refinements(
-    imperfections: Iterable[Flaw], perfect: Outline, turn: float, h: float
+    imperfections: Iterable[ImperfectionGeometry], perfect: Outline, turn: float, h: float
 ) -> tuple[list[SquaresFeature], float]:
     """Return where imperfections without a centre need small elements.
 

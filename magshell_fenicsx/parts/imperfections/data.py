@@ -15,7 +15,11 @@ from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.mesh.patch import place_text
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    ImperfectionSection,
+    over,
+)
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
@@ -63,7 +67,7 @@ class DataSection(FileKeys, ImperfectionSection):
     def account(self) -> str:
         return f"data of {self.file}"
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the measured imperfection, see `ImperfectionSection`.
 
         Raises
@@ -83,7 +87,7 @@ class DataSection(FileKeys, ImperfectionSection):
             except TableError as e:
                 raise CaseError(f"{key}.file: {self.file}: {e}") from None
         fitted = _fits[fit_key]
-        return Flaw(
+        return ImperfectionGeometry(
             Factored(fitted.function, self.amplitude),
             fitted.size,
             account=f"{self.file}: {fitted.account}",

@@ -10,7 +10,10 @@ from pydantic import Field
 from magshell_fenicsx.input.expressions import Formula, formula, formula_with_derivatives
 from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    ImperfectionSection,
+)
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
@@ -31,7 +34,7 @@ class FormulaSection(ImperfectionSection):
     def account(self) -> str:
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the formula, see `ImperfectionSection`.
 
         The element size is 2.5/k of the shortest wave sin(k x) that it resembles.
@@ -67,7 +70,7 @@ class FormulaSection(ImperfectionSection):
             float(at_sample.min()) if largest > 0 and at_sample.min() < MAX_ELEMENT_SIZE else np.inf
         )
         is_local = not (at_sample < 2 * size).mean() > MAX_LOCAL_SHARE
-        return Flaw(deviation, size, sizes=sizes if is_local else None)
+        return ImperfectionGeometry(deviation, size, sizes=sizes if is_local else None)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
 
 
 @dataclass(frozen=True)
-class Flaw:
+class ImperfectionGeometry:
     """Geometry of one imperfection; places, lengths and w0 over R, in the frame of the case.
 
     Attributes
@@ -244,7 +244,7 @@ class ImperfectionSection(Section):
             Polar angle of the edge of a sphere (rad); None of other shells.
         """
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return its geometry on the perfect shell; `key` is its key, with dots.
 
         Raises
@@ -279,12 +279,12 @@ class LocalSection(ImperfectionSection):
         depth = abs(self.amplitude) / R_over_h
         _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         of, width = self.deviation, self.half_width(ground.R_over_h, ground.nu)
         place, distance = locate(self.at, ground, key)
         size = min(SHOWN / sqrt(ground.R_over_h), of.shown * width)
         deviation = of(self.amplitude / ground.R_over_h, width, distance)
-        return Flaw(deviation, size, place, distance, of.reach * width, of.rim)
+        return ImperfectionGeometry(deviation, size, place, distance, of.reach * width, of.rim)
 
 
 def _refuse_steep(depth: float, slope: float) -> None:
@@ -321,6 +321,6 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
 
 def flaws(
     imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell
-) -> dict[str, Flaw]:
+) -> dict[str, ImperfectionGeometry]:
     """Key of each imperfection below `shell` -> what it brings."""
-    return {key: section.flaw(ground, f"shell.{key}") for key, section in imperfections.items()}
+    return {key: section.geometry(ground, f"shell.{key}") for key, section in imperfections.items()}

@@ -13,7 +13,11 @@ from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.multi_shell import ShellPose
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    ImperfectionSection,
+    over,
+)
 from magshell_fenicsx.platform.input_files import read_vtk
 from magshell_fenicsx.shape.reference_shell import ON_AXIS, ReferenceShell
 
@@ -111,7 +115,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             )
         self._shapes = tuple(part or _zero_mode for part in parts)
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the modes; those not yet computed are zero.
 
         Raises
@@ -131,7 +135,9 @@ class ModesSection(FileKeys, ImperfectionSection):
             for a, name in zip(self.amplitudes, names, strict=False)
         ]
         account = ", ".join(words) or "modes that the run computes"
-        return Flaw(Modes(shapes, amplitudes), SIZE_OVER_WIDTH * sqrt(h), account=account)
+        return ImperfectionGeometry(
+            Modes(shapes, amplitudes), SIZE_OVER_WIDTH * sqrt(h), account=account
+        )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.chance import DefectsSection, generator
 from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
 from magshell_fenicsx.parts.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.parts.imperfections.imperfection import (
-    Flaw,
+    ImperfectionGeometry,
     ImperfectionSection,
     half_width,
     over,
@@ -83,12 +83,14 @@ class RandomSection(ImperfectionSection):
             ) from None
         return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
-    def flaw(self, ground: ReferenceShell, key: str) -> Flaw:
+    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the random field; elements resolve its length of correlation."""
         assert self.amplitude is not None
         assert self.length
         length = half_width(self.length, ground.R_over_h, ground.nu)
-        return Flaw(Waves(self.amplitude / ground.R_over_h, length, self.seed), length)
+        return ImperfectionGeometry(
+            Waves(self.amplitude / ground.R_over_h, length, self.seed), length
+        )
 
 
 @dataclass(frozen=True)

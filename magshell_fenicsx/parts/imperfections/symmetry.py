@@ -17,7 +17,7 @@ from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.course import Fit
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, Local
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, Local
 from magshell_fenicsx.shape.meridian_chart import ANGLES
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.reference_shell import AngularDistance, StraightDistance
@@ -129,7 +129,7 @@ class _Sum:
 
 
 def leaves(
-    flaws: Mapping[str, Flaw], drawn: Outline, *, one_by_one: bool
+    imperfections: Mapping[str, ImperfectionGeometry], drawn: Outline, *, one_by_one: bool
 ) -> list[SymmetryConstraint]:
     """Return the symmetry that imperfections preserve.
 
@@ -140,12 +140,16 @@ def leaves(
     one_by_one
         Whether each must be its own image, as patches with names are.
     """
-    if not flaws:
+    if not imperfections:
         return []
-    grouped = [[flaw] for flaw in flaws.values()] if one_by_one else [list(flaws.values())]
-    groups = [_Sum([flaw.deviation for flaw in group]) for group in grouped]
+    grouped = (
+        [[imperfection] for imperfection in imperfections.values()]
+        if one_by_one
+        else [list(imperfections.values())]
+    )
+    groups = [_Sum([imperfection.deviation for imperfection in group]) for group in grouped]
 
-    sample = cache(lambda: _sample(flaws, drawn))
+    sample = cache(lambda: _sample(imperfections, drawn))
 
     def mirrors(mirror: Mirror) -> bool:
         undecided = []
@@ -158,7 +162,11 @@ def leaves(
             _are_equal(group(sample()), group(mirror.image(sample()))) for group in undecided
         )
 
-    centres = [flaw.centre for flaw in flaws.values() if flaw.centre is not None]
+    centres = [
+        imperfection.centre
+        for imperfection in imperfections.values()
+        if imperfection.centre is not None
+    ]
     off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
     reason = None
     if off and drawn.round:
@@ -194,17 +202,17 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
     )
 
 
-def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
+def _sample(imperfections: Mapping[str, ImperfectionGeometry], drawn: Outline) -> Array:
     """Return places (n, 3) all over the shell, and around each local imperfection."""
     places = [drawn.sample()]
-    for key, flaw in flaws.items():
-        if flaw.centre is None:
+    for key, imperfection in imperfections.items():
+        if imperfection.centre is None:
             continue
-        places.append(flaw.centre[None])
-        chart = drawn.inverse(flaw.centre)
+        places.append(imperfection.centre[None])
+        chart = drawn.inverse(imperfection.centre)
         if len(chart) == 2:
             places += [
-                drawn.perfect(contour(key, flaw, drawn, 0.0, chart, part)[::7])
+                drawn.perfect(contour(key, imperfection, drawn, 0.0, chart, part)[::7])
                 for part in COMPARED_PARTS_OF_REACH
             ]
     return np.concatenate(places)
@@ -227,7 +235,7 @@ class LocalImperfection:
     centre, radius
         The disc that it needs small elements in.
     size
-        See `Flaw`.
+        See `ImperfectionGeometry`.
     circle
         Whether its outline is a circle around the chart's origin.
     rim
@@ -252,7 +260,7 @@ class LocalImperfection:
 
 
 def spots(
-    flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float
+    imperfections: Iterable[tuple[str, ImperfectionGeometry]], drawn: Outline, turn: float
 ) -> list[LocalImperfection]:
     """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
 
@@ -267,20 +275,31 @@ def spots(
         If one reaches around the shell.
     """
     local_imperfections = []
-    for key, flaw in flaws:
-        if flaw.centre is None:
+    for key, imperfection in imperfections:
+        if imperfection.centre is None:
             continue
-        if drawn.disc and np.hypot(*flaw.centre[:2]) < AXIS_TOLERANCE:
+        if drawn.disc and np.hypot(*imperfection.centre[:2]) < AXIS_TOLERANCE:
             local_imperfections.append(
-                LocalImperfection(np.zeros(2), flaw.reach, flaw.size, circle=True, jumps=flaw.rim)
+                LocalImperfection(
+                    np.zeros(2),
+                    imperfection.reach,
+                    imperfection.size,
+                    circle=True,
+                    jumps=imperfection.rim,
+                )
             )
             continue
-        centre = drawn.inverse(rotation(turn) @ flaw.centre)
-        curve = contour(key, flaw, drawn, turn, centre, 1.0)
+        centre = drawn.inverse(rotation(turn) @ imperfection.centre)
+        curve = contour(key, imperfection, drawn, turn, centre, 1.0)
         radius = float(np.linalg.norm(curve - centre, axis=1).max())
         local_imperfections.append(
             LocalImperfection(
-                centre, radius, flaw.size, False, flaw.rim, curve if flaw.rim else None
+                centre,
+                radius,
+                imperfection.size,
+                False,
+                imperfection.rim,
+                curve if imperfection.rim else None,
             )
         )
     return local_imperfections
@@ -298,12 +317,19 @@ def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
     return tuple(rims)
 
 
-def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, part: float) -> Array:
+def contour(
+    key: str,
+    imperfection: ImperfectionGeometry,
+    drawn: Outline,
+    turn: float,
+    centre: Array,
+    part: float,
+) -> Array:
     """Points (n, 2) of the chart at a part of the reach of an imperfection: the first on each ray
     from its centre.
     """
-    assert flaw.distance
-    distance, Q, reach = flaw.distance, rotation(turn), part * flaw.reach
+    assert imperfection.distance
+    distance, Q, reach = imperfection.distance, rotation(turn), part * imperfection.reach
     angles = np.arange(CONTOUR_CORNERS) * 2 * np.pi / CONTOUR_CORNERS
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -316,7 +342,7 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     is_outside = distance_beyond(np.tile(ray_lengths[:, None], CONTOUR_CORNERS)) >= 0
     if not is_outside.any(axis=0).all():
         raise CaseError(
-            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: "
+            f"shell.{key}.width: its width over R, {imperfection.reach:.3g}, is too much for this place: "
             "it would reach around the shell or its axis"
         )
     high = ray_lengths[is_outside.argmax(axis=0)]

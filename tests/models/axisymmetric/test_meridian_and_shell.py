@@ -10,7 +10,7 @@ from meridian_scenes import E3, hemisphere
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.revolution import Revolution
@@ -18,7 +18,7 @@ from magshell_fenicsx.shells.shell import ShellModel
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)
-REACH = Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.width)
+REACH = ImperfectionGeometry(DIMPLE, distance=AT_POLE, reach=DIMPLE.width)
 
 
 def displacement(phi: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from magshell_fenicsx.models.shell.patterns import (
     tangential,
 )
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.remanent import Layer, layer_average
@@ -65,7 +65,7 @@ def test_patches_jump_at_the_rim() -> None:
     c = np.cos(phi_o)
     uniform = -2 * np.pi * 2 / 3
     cap = -2 * np.pi * (2 / 3 - c + c**3 / 3)
-    cap_only = Flaw(Dimple(0.0, phi_o), distance=AT_POLE, reach=phi_o)
+    cap_only = ImperfectionGeometry(Dimple(0.0, phi_o), distance=AT_POLE, reach=phi_o)
     jumps = WithinRims(((cap_only.inside, -UP),), UP)
     assert swelling(model(jumps, circle=phi_o)) == pytest.approx(uniform - 2 * cap, rel=1e-4)
 

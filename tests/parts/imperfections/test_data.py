@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.data import _on_quadrics, feet
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.shape.outline import Outline, outline, reference_shell_of
 
 Array = NDArray[np.float64]
@@ -38,8 +38,8 @@ def made(shell: dict[str, Any], folder: Path = Path(), **item: Any) -> Case:
     return Case.from_source(Source("case.yaml", content, folder=folder))
 
 
-def read(case: Case) -> Flaw:
-    return case.shell.imperfections[0].flaw(reference_shell_of(case.shell), "shell.imperfections.0")
+def read(case: Case) -> ImperfectionGeometry:
+    return case.shell.imperfections[0].geometry(reference_shell_of(case.shell), "shell.imperfections.0")
 
 
 def places(drawn: Outline, count: int) -> tuple[Array, Array]:

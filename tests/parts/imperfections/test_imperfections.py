@@ -15,7 +15,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline, reference_shell_of
@@ -221,7 +221,7 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
         "hemisphere",
         *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats),
     )
-    drawn, found = outline(case.shell), dict[str, Flaw]()
+    drawn, found = outline(case.shell), dict[str, ImperfectionGeometry]()
     for key, flaw in flaws(case.imperfections, reference_shell_of(case.shell)).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
