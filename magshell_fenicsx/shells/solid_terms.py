@@ -29,7 +29,7 @@ from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
 from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
-from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
@@ -246,7 +246,7 @@ class TermFactory:
         directions = [("lambda_m", "", of.applied)]
         directions += [
             (name, name.replace("lambda_", " "), Ba)
-            for name, Ba in zip(ACROSS, of.across, strict=False)
+            for name, Ba in zip(TRANSVERSE_AMPLITUDES, of.across, strict=False)
         ]
         terms = []
         for amplitude, suffix, Ba in directions:

@@ -46,7 +46,7 @@ from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
-from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 from magshell_fenicsx.parts.natural.shape import Shape, grown
@@ -293,7 +293,7 @@ class EnergyFactory:
         directions = [("lambda_m", "", field.applied)]
         directions += [
             (name, name.replace("lambda_", " "), Ba)
-            for name, Ba in zip(ACROSS, field.across, strict=False)
+            for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False)
         ]
         terms = [
             carrier.energy(

@@ -129,13 +129,13 @@ class _Sum:
 
 
 def leaves(
-    imperfections: Mapping[str, ImperfectionGeometry], drawn: Outline, *, one_by_one: bool
+    imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline, *, one_by_one: bool
 ) -> list[SymmetryConstraint]:
     """Return the symmetry that imperfections preserve.
 
     Parameters
     ----------
-    drawn
+    perfect
         The perfect shell.
     one_by_one
         Whether each must be its own image, as patches with names are.
@@ -149,7 +149,7 @@ def leaves(
     )
     groups = [_Sum([imperfection.deviation for imperfection in group]) for group in grouped]
 
-    sample = cache(lambda: _sample(imperfections, drawn))
+    sample = cache(lambda: _sample(imperfections, perfect))
 
     def mirrors(mirror: Mirror) -> bool:
         undecided = []
@@ -169,16 +169,16 @@ def leaves(
     ]
     off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
     reason = None
-    if off and drawn.round:
+    if off and perfect.round:
         reason = "an imperfection is off the axis"
-    elif drawn.meridian:
-        places = drawn.meridian.interior_sample()
+    elif perfect.meridian:
+        places = perfect.meridian.interior_sample()
         rotated = [
             np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
         ]
         if not all(_are_equal(rotated[0], w0) for w0 in rotated):
             reason = "an imperfection differs around e3"
-    if not drawn.round:
+    if not perfect.round:
         return [SymmetryConstraint(reason, (), mirrors)]
     if common_azimuth(off) is None:
         return [SymmetryConstraint(reason, (), mirrors, azimuths=_azimuths_of_planes(off))]
@@ -202,17 +202,17 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
     )
 
 
-def _sample(imperfections: Mapping[str, ImperfectionGeometry], drawn: Outline) -> Array:
+def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline) -> Array:
     """Return places (n, 3) all over the shell, and around each local imperfection."""
-    places = [drawn.sample()]
+    places = [perfect.sample()]
     for key, imperfection in imperfections.items():
         if imperfection.centre is None:
             continue
         places.append(imperfection.centre[None])
-        chart = drawn.inverse(imperfection.centre)
+        chart = perfect.inverse(imperfection.centre)
         if len(chart) == 2:
             places += [
-                drawn.perfect(contour(key, imperfection, drawn, 0.0, chart, part)[::7])
+                perfect.perfect(contour(key, imperfection, perfect, 0.0, chart, part)[::7])
                 for part in COMPARED_PARTS_OF_REACH
             ]
     return np.concatenate(places)
@@ -260,13 +260,13 @@ class LocalImperfection:
 
 
 def spots(
-    imperfections: Iterable[tuple[str, ImperfectionGeometry]], drawn: Outline, turn: float
+    imperfections: Iterable[tuple[str, ImperfectionGeometry]], perfect: Outline, turn: float
 ) -> list[LocalImperfection]:
     """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
 
     Parameters
     ----------
-    drawn
+    perfect
         The perfect shell.
 
     Raises
@@ -278,7 +278,7 @@ def spots(
     for key, imperfection in imperfections:
         if imperfection.centre is None:
             continue
-        if drawn.disc and np.hypot(*imperfection.centre[:2]) < AXIS_TOLERANCE:
+        if perfect.disc and np.hypot(*imperfection.centre[:2]) < AXIS_TOLERANCE:
             local_imperfections.append(
                 LocalImperfection(
                     np.zeros(2),
@@ -289,8 +289,8 @@ def spots(
                 )
             )
             continue
-        centre = drawn.inverse(rotation(turn) @ imperfection.centre)
-        curve = contour(key, imperfection, drawn, turn, centre, 1.0)
+        centre = perfect.inverse(rotation(turn) @ imperfection.centre)
+        curve = contour(key, imperfection, perfect, turn, centre, 1.0)
         radius = float(np.linalg.norm(curve - centre, axis=1).max())
         local_imperfections.append(
             LocalImperfection(
@@ -320,7 +320,7 @@ def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
 def contour(
     key: str,
     imperfection: ImperfectionGeometry,
-    drawn: Outline,
+    perfect: Outline,
     turn: float,
     centre: Array,
     part: float,
@@ -336,14 +336,14 @@ def contour(
     def distance_beyond(t: Array) -> Array:
         """Return on each ray the distance at t (..., corners), less the wanted one."""
         chart = centre + t[..., None] * rays
-        return distance(drawn.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
+        return distance(perfect.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
     ray_lengths = np.linspace(0, MAX_CHART_STRETCH * reach, CONTOUR_STEPS + 1)[1:]
     is_outside = distance_beyond(np.tile(ray_lengths[:, None], CONTOUR_CORNERS)) >= 0
     if not is_outside.any(axis=0).all():
         raise CaseError(
-            f"shell.{key}.width: its width over R, {imperfection.reach:.3g}, is too much for this place: "
-            "it would reach around the shell or its axis"
+            f"shell.{key}.width: its width over R, {imperfection.reach:.3g}, is too much for this "
+            "place: it would reach around the shell or its axis"
         )
     high = ray_lengths[is_outside.argmax(axis=0)]
     low, distance_low, distance_high = (
@@ -365,9 +365,9 @@ def contour(
     return np.asarray(centre + high[:, None] * rays)
 
 
-def images(spot: LocalImperfection, drawn: Outline) -> list[Array]:
+def images(spot: LocalImperfection, perfect: Outline) -> list[Array]:
     """Return its centre (2,), and the images of this across glued sides of a grid."""
-    if not (grid := drawn.grid):
+    if not (grid := perfect.grid):
         return [spot.centre]
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))
     return [spot.centre + np.multiply(step, np.subtract(grid.high, grid.low)) for step in steps]

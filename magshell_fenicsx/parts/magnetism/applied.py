@@ -171,7 +171,7 @@ class AppliedField:
         return (self._r0.renew() + self._displacement.renew()).reshape(-1, 3)
 
     def passed_through(
-        self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]
+        self, start: tuple[Array, Mapping[str, float]], end: tuple[Array, Mapping[str, float]]
     ) -> str:
         """Describe the body through which a point has moved between two states; "" without one.
 
@@ -188,7 +188,7 @@ class AppliedField:
                 relative_places = [
                     (x - t) @ Q
                     for x, (Q, t) in (
-                        (x, combined_motion(moving_field.motions, mu)) for x, mu in (before, after)
+                        (x, combined_motion(moving_field.motions, mu)) for x, mu in (start, end)
                     )
                 ]
                 if crossed_place(distance, *relative_places) is not None:

@@ -105,10 +105,10 @@ class MagnetisedSolid:
             step = np.linalg.pinv(np.stack(gradients, axis=-1)) @ (x - value)[..., None]
             reference = np.clip(reference + step[..., 0], -NEWTON_OVERSHOOT, 1 + NEWTON_OVERSHOOT)
         value = np.einsum("nk,nki->ni", tables(self.element, reference[:, None], 0)[0, :, 0], nodes)
-        inside = (reference > -CUBE_TOLERANCE).all(axis=1) & (reference < 1 + CUBE_TOLERANCE).all(
-            axis=1
-        )
-        return np.asarray(inside & (np.linalg.norm(x - value, axis=1) < FOOT_TOLERANCE))
+        is_in_cube = (reference > -CUBE_TOLERANCE).all(axis=1) & (
+            reference < 1 + CUBE_TOLERANCE
+        ).all(axis=1)
+        return np.asarray(is_in_cube & (np.linalg.norm(x - value, axis=1) < FOOT_TOLERANCE))
 
 
 class SolidCharges(ChargedElements):

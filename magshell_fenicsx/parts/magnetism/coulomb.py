@@ -280,7 +280,7 @@ class InteractingCharges:
             least_distances,
             h=self._h,
             space=MIN_DISTANCE,
-            above=ABOVE_TOLERANCE,
+            above_tolerance=ABOVE_TOLERANCE,
             flat=BESIDE_SINE,
             worst=too_near,
         )

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Curve
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
-from magshell_fenicsx.parts.magnetism.magnetised import ACROSS, Magnetisation
+from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
 from magshell_fenicsx.parts.magnetism.moving_source import combined_motion
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 Array = NDArray[np.float64]
-FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
+FIELD = ("lambda_m", *TRANSVERSE_AMPLITUDES)  # amplitudes of the field's components
 
 
 def directions(

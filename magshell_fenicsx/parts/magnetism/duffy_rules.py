@@ -68,7 +68,7 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
         cuts = _ray_lengths(lines, V, rays)
         low = np.zeros(len(x)) if is_inside else cuts.min(axis=1)
         high = np.where(np.isfinite(cuts), cuts, 0.0).max(axis=1)
-        bottom, top = (np.arcsinh(each / s)[:, None] for each in (low, high))
+        bottom, top = (np.arcsinh(length / s)[:, None] for length in (low, high))
         r = s * np.sinh(bottom + (top - bottom) * v)
         turn = (abs(ends[1] - ends[0]) * w / np.cosh(mu))[:, None]
         points.append((apex + r[..., None] * rays[:, None]).reshape(-1, 2))
@@ -160,7 +160,7 @@ def strip() -> tuple[Array, Array, Array]:
     """Return a rule of an edge strip: coordinates along and across it, in [0, 1], and weights."""
     (x, wt), (eta, we) = (gauss(n) for n in STRIP_POINTS)
     t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends
-    a, b = (each.ravel() for each in np.meshgrid(t, eta, indexing="ij"))
+    a, b = (coordinate.ravel() for coordinate in np.meshgrid(t, eta, indexing="ij"))
     return a, b, np.asarray(np.outer(wt, we).ravel(), dtype=np.float64)
 
 
@@ -179,7 +179,7 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
         if not is_beyond
         else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
     )
-    pieces = list[tuple[Array, Array, Array]]()
+    rules_of_segments = list[tuple[Array, Array, Array]]()
     for high in (-eta, 1 - eta):
         for height, weight in zip(
             eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True
@@ -189,11 +189,11 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
                 bottom, top = np.arcsinh(start / scale), np.arcsinh(end / scale)
                 r = bottom + (top - bottom) * v
                 places = t + sign * scale * np.sinh(r)
-                pieces.append(
+                rules_of_segments.append(
                     (
                         places,
                         np.full_like(r, height),
                         weight * wv * (top - bottom) * scale * np.cosh(r),
                     )
                 )
-    return tuple(np.concatenate(part) for part in zip(*pieces, strict=True))
+    return tuple(np.concatenate(part) for part in zip(*rules_of_segments, strict=True))

@@ -267,8 +267,8 @@ class InteractionTerm:
             D.near_blocks @ v + D.times_far(v[:, None]).ravel()
         )
         nodes = V.dofmap.list[:count]
-        shared = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
-        return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(shared, 1)[:, None])[nodes])
+        cells_of_node = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
+        return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None])[nodes])
 
     def _hessians_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
         own_cells, images, V = self._cells.own_range, self._copies.images, self._u.function_space
@@ -279,14 +279,14 @@ class InteractionTerm:
         row_of[own_cells.start : own_cells.stop] = V.dofmap.list[: len(own_cells)]
         turn = np.stack([image.Q for image in images])
         local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
-        far, near_cells = self._charges.boxes(nodes, own_cells)
-        stored, adjacent = (
+        multipoles, near_cells = self._charges.boxes(nodes, own_cells)
+        has_block, adjacent = (
             np.zeros((local, count), dtype=bool),
             np.zeros((count, count), dtype=bool),
         )
         for pattern, row_numbers, pairs in (
-            (stored, row_of, near_cells),
-            (adjacent, self._cells.nodes, far.adjacent_cells(own_cells)),
+            (has_block, row_of, near_cells),
+            (adjacent, self._cells.nodes, multipoles.adjacent_cells(own_cells)),
         ):
             for cell, row in zip(own_cells, pairs, strict=True):
                 columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
@@ -294,7 +294,7 @@ class InteractionTerm:
         self._comm.Allreduce(
             MPI.IN_PLACE, adjacent, MPI.LOR
         )  # the same blocks on any number of ranks
-        stiffness = Stiffness(stored, self._scale, row_of, column_of, turn)
+        stiffness = Stiffness(has_block, self._scale, row_of, column_of, turn)
         try:
             self._charges.evaluate(nodes, own_cells, stiffness)
         except PartsTooNear:
@@ -303,21 +303,21 @@ class InteractionTerm:
         cells = CellNodes(
             self._cells.nodes, own_cells, row_of[own_cells.start : own_cells.stop], numbers, turn
         )
-        B = far.jacobian(far.place_charges(nodes))
-        even, odd = (
+        B = multipoles.jacobian(multipoles.place_charges(nodes))
+        even_hessian, odd_hessian = (
             InteractionHessian(
                 stiffness,
-                far,
+                multipoles,
                 B,
                 self._scale,
                 cells,
                 sign,
-                adjacent[numbers][stored],
+                adjacent[numbers][has_block],
                 self._turning,
             )
             for sign in ([1.0, -1.0] if has_images else [1.0, 1.0])
         )
-        return even, odd
+        return even_hessian, odd_hessian
 
     def _evaluated(self) -> tuple[float, Array]:
         """Return the energy of this rank's cells and its gradient by local nodes; collective."""
@@ -369,7 +369,7 @@ class InteractionTerm:
                 self.__dict__.pop(name, None)
         return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
 
-    def _rotations(self, u: Array, before: Array) -> Array:
+    def _rotations(self, u: Array, u_before: Array) -> Array:
         """Return the rotations of all nodes from one displacement to another.
 
         They are quaternions (nodes, 4), scalar last.
@@ -383,7 +383,7 @@ class InteractionTerm:
             return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
 
         F = np.zeros((len(r0), 3, 3))
-        np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(before)))
+        np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(u_before)))
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property

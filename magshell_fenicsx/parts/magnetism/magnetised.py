@@ -15,7 +15,7 @@ from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 
-ACROSS = ("lambda_across", "lambda_third")
+TRANSVERSE_AMPLITUDES = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 RemanenceLaw = Literal["deformation", "rotation"]
 PLACES = 50  # on each rank, where a field and its images are compared
@@ -38,7 +38,7 @@ class Magnetisation:
         Fields that amplitudes drive, added to `in_space`.
     across
         Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the
-        amplitudes of `ACROSS`.
+        amplitudes of `TRANSVERSE_AMPLITUDES`.
     axes
         Unit vectors along `applied` and `across`.
     turns
@@ -103,7 +103,7 @@ class Magnetisation:
             )
             return np.asarray(lambda_m * B.reshape(r.shape))
         uniform = lambda_m * self.applied
-        for name, component in zip(ACROSS, self.across, strict=False):
+        for name, component in zip(TRANSVERSE_AMPLITUDES, self.across, strict=False):
             uniform = uniform + mu.get(name, 0.0) * component
         if self.gradient is None:
             return np.broadcast_to(uniform, r.shape)

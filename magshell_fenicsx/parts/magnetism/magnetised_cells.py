@@ -83,8 +83,8 @@ class MagnetisedShell:
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
             return a[..., None], np.stack([np.ones_like(a), np.zeros_like(a)], -1)[..., None], b
-        one = np.ones_like(a)
-        slopes = np.stack([np.stack([one, -b], -1), np.stack([0 * one, 1 - a], -1)], -2)
+        ones = np.ones_like(a)
+        slopes = np.stack([np.stack([ones, -b], -1), np.stack([0 * ones, 1 - a], -1)], -2)
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:

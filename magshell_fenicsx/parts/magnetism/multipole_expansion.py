@@ -110,12 +110,12 @@ class MultipoleExpansion:
             heights,
         )
 
-    def add(self, placed: PlacedCharges, *, with_second_derivatives: bool) -> float:
+    def add(self, charges: PlacedCharges, *, with_second_derivatives: bool) -> float:
         """Return the energy of own cells, half of each pair's, and add derivatives to points' sums.
 
         First derivatives are added, and second ones if `with_second_derivatives`.
         """
-        N, L = derivatives(), self.local_expansions(self._moments(self._q * placed.Y))[..., 0]
+        N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
         matrices = (
             [*N, *(N[i] @ N[j] for i, j in SECOND_DERIVATIVES)] if with_second_derivatives else N
         )
@@ -124,11 +124,11 @@ class MultipoleExpansion:
         for box, first, last in zip(
             self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
         ):
-            values[self._order[first:last]] = placed.Y[:, first:last].T @ expansion_of_boxes[box]
+            values[self._order[first:last]] = charges.Y[:, first:last].T @ expansion_of_boxes[box]
         values *= self._leaf.width ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
         energy, start = 0.0, 0
         for (_, points), heights, own_rows in zip(
-            self._kinds, placed.heights, self._own_rows, strict=True
+            self._kinds, charges.heights, self._own_rows, strict=True
         ):
             stop = start + points.q.size
             weighted = (
@@ -271,15 +271,15 @@ class MultipoleExpansion:
             self.local_expansions(M) / self._leaf.width, dtype=np.float64
         )
 
-    def jacobian(self, placed: PlacedCharges) -> Array:
+    def jacobian(self, charges: PlacedCharges) -> Array:
         """Return derivatives (cells, COUNT, 3 k) of the moments of each cell's box by its nodes."""
         N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
         slopes = np.empty((3, len(self._q), COUNT))
         for i in range(3):
-            slopes[i, self._order] = (self._q * (N[i] @ placed.Y)).T / self._leaf.width
+            slopes[i, self._order] = (self._q * (N[i] @ charges.Y)).T / self._leaf.width
         for (cells, points), heights, surface in zip(
-            self._kinds, placed.heights, placed.surfaces, strict=True
+            self._kinds, charges.heights, charges.surfaces, strict=True
         ):
             stop, T = start + points.q.size, points.tables
             slopes_of_kind, start = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT), stop

@@ -172,8 +172,8 @@ class Stiffness:
         a, b = np.triu_indices(k)
         block = np.zeros((k, k, 3, 3))
         for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
-            onto = self.factor * self.onto[cell]
-            block[b, a], block[a, b] = onto.transpose(0, 2, 1), onto
+            sums = self.factor * self.onto[cell]
+            block[b, a], block[a, b] = sums.transpose(0, 2, 1), sums
             self.blocks[self.where[self.row_of[cell][:, None], self.column_of[cell]]] += block
 
     def matrix(self, sign: float) -> bsr_array:
@@ -189,8 +189,8 @@ class Pairs:
 
     def __init__(self, comm: MPI.Comm) -> None:
         names = "pairs.c", "multipole_expansion.c", "stacked_faces.c"
-        source, *behind = (Path(__file__).with_name(name) for name in names)
-        self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *behind)
+        source, *further_sources = (Path(__file__).with_name(name) for name in names)
+        self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *further_sources)
 
     def add(
         self,
@@ -244,11 +244,20 @@ class Pairs:
     def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
         if not stiffness:
             return [0.0, *3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
-        p, where = self._pointer, stiffness.where
-        onto, blocks = p(stiffness.onto), p(stiffness.blocks)
+        p, block_numbers = self._pointer, stiffness.where
+        cell_blocks, blocks = p(stiffness.onto), p(stiffness.blocks)
         nodes_of = p(stiffness.row_of), p(stiffness.column_of)
         turn, modelled = p(stiffness.turn), len(nodes) // len(stiffness.turn)
-        return [stiffness.factor, onto, blocks, p(where), where.shape[1], *nodes_of, turn, modelled]
+        return [
+            stiffness.factor,
+            cell_blocks,
+            blocks,
+            p(block_numbers),
+            block_numbers.shape[1],
+            *nodes_of,
+            turn,
+            modelled,
+        ]
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
         """Return the struct `Cells` of stacked_faces.c, for `add_stacked` and `visible_points`."""
@@ -305,21 +314,21 @@ class Pairs:
         """Add the sums at points on cells (rows,) to gradient and stiffness, and reset them."""
         padding, p = -len(cells) % LANES, self._pointer
         filled, (P, *_) = _filled(cells, padding), points.tables.shape
-        onto = p(stiffness.onto) if stiffness else self._ffi.NULL
+        cell_blocks = p(stiffness.onto) if stiffness else self._ffi.NULL
         sizes = [len(filled), padding, p(filled), nodes.shape[1], p(nodes), P]
-        self._lib.points(*sizes, p(points.tables), p(points.sums), p(gradient), onto)
+        self._lib.points(*sizes, p(points.tables), p(points.sums), p(gradient), cell_blocks)
         points.sums[:] = 0.0
 
     def rules(
         self,
         nodes: Array,
         own_cells: range,
-        apart: NDArray[np.uint8],
-        least: Array,
+        has_rule: NDArray[np.uint8],
+        least_distances: Array,
         *,
         h: float,
         space: float,
-        above: float,
+        above_tolerance: float,
         flat: float,
         worst: float,
     ) -> NDArray[np.int8] | None:
@@ -329,15 +338,15 @@ class Pairs:
 
         Parameters
         ----------
-        apart
+        has_rule
             (own cells, cells) 1 for the pairs that have a rule.
-        least
+        least_distances
             (rules,) the distance over the size of cells from which each rule is precise.
         h
             Thickness over R: nearer cells are too near.
         space
             Least distance over size that is counted.
-        above
+        above_tolerance
             Distance over a cell's radius: what is so near to its middle is above or below the cell.
         flat
             Sine of the angle up to which a cell is pattern another, not above it.
@@ -348,18 +357,36 @@ class Pairs:
         normal = np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         radius = np.linalg.norm(nodes - centre[:, None], axis=-1).max(axis=1)
-        p, chosen = self._pointer, np.empty((len(own_cells), len(nodes)), dtype=np.int8)
+        p, rule_numbers = self._pointer, np.empty((len(own_cells), len(nodes)), dtype=np.int8)
         sizes = [len(nodes), own_cells.start, own_cells.stop, nodes.shape[1]]
-        arrays = [p(array) for array in (nodes, centre, normal, radius, apart)]
+        arrays = [p(array) for array in (nodes, centre, normal, radius, has_rule)]
         too_near = self._lib.rules(
-            *sizes, *arrays, h, space, above, flat, len(least), p(least), worst, p(chosen)
+            *sizes,
+            *arrays,
+            h,
+            space,
+            above_tolerance,
+            flat,
+            len(least_distances),
+            p(least_distances),
+            worst,
+            p(rule_numbers),
         )
-        return None if too_near else chosen
+        return None if too_near else rule_numbers
 
     def translate(
-        self, one: Ints, other: Ints, which: Ints, ends: Ints, G: Array, M: Array, L: Array
+        self,
+        receiving_boxes: Ints,
+        acting_boxes: Ints,
+        which: Ints,
+        ends: Ints,
+        G: Array,
+        M: Array,
+        L: Array,
     ) -> None:
-        """Add the translations of moments M (boxes, .., n) of boxes `other` to L of boxes `one`.
+        """Add the translated moments M of acting boxes to the expansions L of receiving boxes.
+
+        Both are (boxes, .., n); `acting_boxes` and `receiving_boxes` are (pairs,).
 
         Parameters
         ----------
@@ -370,12 +397,12 @@ class Pairs:
         G
             (matrices, sum of ends) these entries.
         """
-        if not len(one):
+        if not len(receiving_boxes):
             return
         p, G, M = self._pointer, np.ascontiguousarray(G), np.ascontiguousarray(M)
-        numbers = p(one), p(other), p(which)
+        numbers = p(receiving_boxes), p(acting_boxes), p(which)
         sizes = M.shape[1], p(ends), G.shape[1], M.shape[2]
-        self._lib.translate(len(one), *numbers, *sizes, p(G), p(M), p(L))
+        self._lib.translate(len(receiving_boxes), *numbers, *sizes, p(G), p(M), p(L))
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         assert array.flags.c_contiguous

@@ -80,9 +80,11 @@ class SoftSeen(Seen):
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         from magshell_fenicsx.models.shell.patterns import by_patch
 
-        soft = loads.magnetic.soft if loads.magnetic else None
-        if soft and soft.patches:
-            by_patch(soft.patches, surface.patches, len(surface.cells), "magnetic.susceptibility")
+        soft_magnet = loads.magnetic.soft if loads.magnetic else None
+        if soft_magnet and soft_magnet.patches:
+            by_patch(
+                soft_magnet.patches, surface.patches, len(surface.cells), "magnetic.susceptibility"
+            )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return INDUCED if loads.magnetic and loads.magnetic.soft else ()
@@ -138,7 +140,7 @@ class SensorsSeen(Seen):
 
     def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
-        from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
+        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
         from magshell_fenicsx.parts.magnetism.self_field import (
             DIFFERENCE_STEP,
             DIFFERENCE_WEIGHTS,
@@ -173,7 +175,7 @@ class SensorsSeen(Seen):
         if applied and (sensor.total or applied.soft):
             names = {
                 "lambda_m",
-                *ACROSS,
+                *TRANSVERSE_AMPLITUDES,
                 *(name for sensor_of_columns in applied.driven for name in sensor_of_columns.names),
             }
             for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):

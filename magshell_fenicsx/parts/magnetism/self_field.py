@@ -294,10 +294,13 @@ class SelfField:
         Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
             self.Br.x.array[:] = Br
-            before = np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1)
+            value_before = np.sum(
+                nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1
+            )
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
             change = (
-                np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1) - before
+                np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1)
+                - value_before
             )
             by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
         self.Br.x.array[:] = Br

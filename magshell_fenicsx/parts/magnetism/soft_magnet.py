@@ -99,9 +99,14 @@ class Sheet:
     @cached_property
     def amplitudes(self) -> tuple[str, ...]:
         """Names of the amplitudes of the field's uniform parts."""
-        from magshell_fenicsx.parts.magnetism.magnetised import ACROSS  # it needs this module
+        from magshell_fenicsx.parts.magnetism.magnetised import (
+            TRANSVERSE_AMPLITUDES,
+        )  # it needs this module
 
-        return ("lambda_m", *(() if self.field.in_space else ACROSS[: len(self.field.across)]))
+        return (
+            "lambda_m",
+            *(() if self.field.in_space else TRANSVERSE_AMPLITUDES[: len(self.field.across)]),
+        )
 
     @property
     def vectors(self) -> list[Array]:

@@ -12,7 +12,7 @@ import numpy as np
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.loads import forces
-from magshell_fenicsx.parts.magnetism.magnetised import ACROSS
+from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -186,7 +186,7 @@ class Expected(Scene):
         """The amplitudes, of no displacement."""
         loads = self.problem.loads
         field = loads.magnetic
-        across = ACROSS[: len(field.across)] if field else ()
+        across = TRANSVERSE_AMPLITUDES[: len(field.across)] if field else ()
         driven = ("lambda_m", *across, *(motion.name for motion in field.turns)) if field else ()
         names = [
             *(["pressure"] if loads.pressure else []),

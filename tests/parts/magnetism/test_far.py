@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.parts.magnetism import coulomb, tree
 from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
-from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian, CellNodes
+from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
 from magshell_fenicsx.parts.magnetism.turned import Turning
