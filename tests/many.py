@@ -12,14 +12,14 @@ from magshell_fenicsx.studies import ensemble as ensembles
 from magshell_fenicsx.studies import study as studies
 from magshell_fenicsx.studies import sweep as sweeps
 
-sweep = partial(sweeps.sweep, made=Case.from_source)
-ensemble = partial(ensembles.ensemble, made=Case.from_source)
-study = partial(studies.study, made=Case.from_source)
-compare = partial(comparisons.compare, made=Case.from_source)
-design = partial(designs.design, made=Case.from_source)
-variables = partial(design_variables.variables, made=Case.from_source)
-make_samples = partial(samples.make_samples, made=Case.from_source)
-with_earlier = partial(sweeps.with_earlier, made=Case.from_source)
+sweep = partial(sweeps.sweep, make_case=Case.from_source)
+ensemble = partial(ensembles.ensemble, make_case=Case.from_source)
+study = partial(studies.study, make_case=Case.from_source)
+compare = partial(comparisons.compare, make_case=Case.from_source)
+design = partial(designs.design, make_case=Case.from_source)
+variables = partial(design_variables.variables, make_case=Case.from_source)
+make_samples = partial(samples.make_samples, make_case=Case.from_source)
+with_earlier = partial(sweeps.with_earlier, make_case=Case.from_source)
 
 
 def make_points(

@@ -25,7 +25,7 @@ from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, LostResult, instabilities
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import ELSEWHERE, number_of, on_mesh_of, size_of
 from magshell_fenicsx.simulate.record import Record
@@ -91,7 +91,7 @@ class Ran:
         """A result: as a row of path.csv has it, else as it was located."""
         state = self.records[-1].point.state
         row = {**state.mu, **self.scene.observe(state)}
-        return float(row[of]) if of in row else self.adjoint(of).shown
+        return float(row[of]) if of in row else self.adjoint(of).value_in_unit
 
 
 def numbers(part: Any, key: str) -> Iterator[str]:
@@ -191,7 +191,7 @@ def main(names: Sequence[str]) -> None:
                     continue
                 numbers = f"{line.gradient:.8g} | {line.difference:.8g} | {line.error:.0e}"
                 print(f"| `{line.key}` | {line.of} | {numbers} |", flush=True)
-        except Lost as e:
+        except LostResult as e:
             print(f"lost: {e}")
         print("\nRefused:\n")
         for line in refused:

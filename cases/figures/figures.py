@@ -100,7 +100,7 @@ FIGURES = {
 def make(name: str, out: Path = OUT) -> Sweep:
     """Compute a figure's sweep, then write its numbers and its picture; collective."""
     figure = FIGURES[name]
-    done = sweep(CASES / figure.case, figure.over, out=out / name, made=Case.from_source)
+    done = sweep(CASES / figure.case, figure.over, out=out / name, make_case=Case.from_source)
 
     def write() -> None:
         rows, y = (knockdowns(done), "delta_k_d") if figure.along else (curves(done), "force")

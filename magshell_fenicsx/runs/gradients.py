@@ -26,7 +26,7 @@ from magshell_fenicsx.simulate.gradients.fields import density
 from magshell_fenicsx.simulate.gradients.gradient import Gradient, derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
     FOLDS,
-    Lost,
+    LostResult,
     instabilities,
     refuse_moving,
 )
@@ -70,7 +70,7 @@ def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
     for name in section.of:
         try:
             kind, adjoint = _adjoint(result, name)
-        except (CaseError, FoldLost, Lost) as e:
+        except (CaseError, FoldLost, LostResult) as e:
             say(f"warning: no gradient of {name}: {e}")
             continue
         gradients = _gradients(adjoint, name, section.by, say)
@@ -110,7 +110,7 @@ def _report(
             write = partial(_write, gradient_file(folder, name), surface, scene)
             access_disk(scene.comm, write)
     result.gradients[name] = {
-        "value": adjoint.shown,
+        "value": adjoint.value_in_unit,
         "kind": kind,
         "numbers": numbers,
         "fields": entries,
@@ -134,7 +134,7 @@ def _gradients(
     for parameter in parameters:
         try:
             gradients[parameter] = derivative(adjoint, parameter)
-        except (CaseError, FoldLost, Lost) as e:
+        except (CaseError, FoldLost, LostResult) as e:
             say(f"warning: no gradient of {name} by {parameter}: {e}")
     return gradients
 
@@ -165,7 +165,7 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
         return instabilities(scene, history.located, name, 1, history.begins)[0]
     reason = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
     if result.stopped or reason or history.end is None:
-        raise Lost(result.stopped or reason or "the path has no end")
+        raise LostResult(result.stopped or reason or "the path has no end")
     refuse_moving(scene, history.end, name)
     return adjoint_at_end(scene, history, name)
 

@@ -32,7 +32,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
     FOLDS,
-    Lost,
+    LostResult,
     instabilities,
     refuse_moving,
 )
@@ -54,7 +54,7 @@ TRIES = 4  # how often a place between two points comes nearer to one of them be
 ByField = Callable[[FieldGradient], Array]
 
 
-class NotRead(Lost):
+class NotRead(LostResult):
     """A place at which there is no equilibrium.
 
     Attributes
@@ -253,7 +253,7 @@ class Read:
         scene, of = self.scene, reading.of
         if reading.at is None:
             if self._lost and of not in FOLDS:
-                raise Lost(self._lost)
+                raise LostResult(self._lost)
             try:
                 if of in FOLDS:
                     return instabilities(scene, self._records, of, begins=self._history.begins)[0][
@@ -262,7 +262,7 @@ class Read:
                 refuse_moving(scene, self._records[-1], of)
                 return adjoint_at_end(scene, self._history, of)[1]
             except FoldLost as e:
-                raise Lost(f"no {of}: {e}") from None
+                raise LostResult(f"no {of}: {e}") from None
         return self.adjoint_at(self.record_at(reading.at), of)
 
     def adjoint_at(self, record: Record, of: str) -> Adjoint:
@@ -332,7 +332,7 @@ class Read:
             state = self._between_states(
                 stage_of(self.scene, places.step, low[1]), low, high, place
             )
-        except Lost as e:
+        except LostResult as e:
             raise NotRead(
                 f"no equilibrium is found at {places.column} = {place:.6g}: {e}", place
             ) from None
@@ -358,7 +358,7 @@ class Read:
         if ended.converged and max_abs(comm, state.u - guess.u) <= apart:
             return state
         if not tries:
-            raise Lost("the iteration has left the path" if ended.converged else ended.reason)
+            raise LostResult("the iteration has left the path" if ended.converged else ended.reason)
         half = (place + (first if part < 0.5 else last)) / 2
         middle = half, self._between_states(stage, low, high, half, tries - 1)
         ends = (middle, high) if part < 0.5 else (low, middle)
@@ -402,7 +402,7 @@ def read(
         path.adjoint_at(path.begin, of) for of in changed
     ]
     placed = [each.at is not None for each in wanted] + [True for _ in changed]
-    values = np.array([each.shown for each in adjoints])
+    values = np.array([each.value_in_unit for each in adjoints])
     by = np.zeros((len(adjoints), len(keys) + sum(count for count, _ in (fields or {}).values())))
     for i, key in enumerate(keys if slopes else ()):
         by[:, i] = path.slopes(adjoints, key, placed)

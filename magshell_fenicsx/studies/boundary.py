@@ -41,9 +41,16 @@ from magshell_fenicsx.simulate.varied import WAVES, Varied, instability
 from magshell_fenicsx.studies.boundary_journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.boundary_start import Start, start_from
-from magshell_fenicsx.studies.naming import load_said
+from magshell_fenicsx.studies.naming import load_text
 from magshell_fenicsx.studies.points import value_at
-from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, heard, rest_said
+from magshell_fenicsx.studies.runner import (
+    Folder,
+    MakeCase,
+    Say,
+    compute,
+    heard,
+    remaining_time_text,
+)
 
 FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder(
@@ -53,9 +60,9 @@ FOLDER = Folder(
 )
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
 STEPS, MOST_STEPS = 20, 1000
-REACHED = 1e-6  # of the range: so close to its end a boundary is there
+END_TOLERANCE = 1e-6  # of the range: so close to its end a boundary is there
 SPECIAL = ("cusp", "turn", "meeting", "crossing")
-SAID = {
+WORDS_OF_KINDS = {
     "cusp": "a cusp, where two folds are born",
     "turn": "the boundary turns: two instabilities meet there",
     "meeting": "a second mode is neutral",
@@ -117,7 +124,8 @@ def parse_range(text: str) -> Range:
         raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
     if key.split(".")[0] in BESIDE:
         raise CaseError(
-            f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has no boundary"
+            f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has "
+            "no boundary"
         )
     return Range(key, first, last, unit, steps)
 
@@ -156,7 +164,7 @@ def boundary(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
     *,
-    made: Made,
+    make_case: MakeCase,
     start: str | None = None,
 ) -> StabilityBoundary:
     """Follow the instability at the end of a case in a second key; collective, two ranks work.
@@ -172,7 +180,7 @@ def boundary(
         `first:last:steps`.
     out
         Folder of boundary.csv, boundary.json, boundary.png and points/.
-    made
+    make_case
         Makes a case of its source.
     start
         Another instability: "DIR:POINT", a located point of the run in a folder, whose case takes
@@ -195,35 +203,41 @@ def boundary(
         override(source, setting)
     folder, name = user_folder(out), Path(file).name
     once: Say = say if comm.rank == 0 else lambda line: None
-    with FOLDER.held(folder, comm, name), heard(comm, once) as once:
+    with FOLDER.locked(folder, comm, name), heard(comm, once) as once:
         say = once if comm.rank == 0 else say
-        journal = partial(Journal, folder / "points", _identity(source, span, made, begun_at.text))
-        value = _value(source, span, made, outside=not start)
+        journal = partial(
+            Journal, folder / "points", _identity(source, span, make_case, begun_at.text)
+        )
+        value = _value(source, span, make_case, may_be_outside=not start)
         begin = access_disk(
-            comm, lambda: _begin(source, span, value, made, journal("start"), say, begun_at)
+            comm, lambda: _begin(source, span, value, make_case, journal("start"), say, begun_at)
         )
         name_of_mode = begin["mode"]
         if name_of_mode == "antisymmetric":
             once("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
-            again = begun_at.anywhere()
+            half_source = begun_at.anywhere()
             begin = access_disk(
-                comm, lambda: _begin(source, span, value, made, journal("whole"), say, again)
+                comm,
+                lambda: _begin(source, span, value, make_case, journal("whole"), say, half_source),
             )
         if not begin["label"]:
             instability([])
         name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
         begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
         once(
-            f"{span.key} = {span.text(value)}: {begin['label']} at {load_said(begin['row'], begin['amplitude'])}"
+            f"{span.key} = {span.text(value)}: {begin['label']} at "
+            f"{load_text(begin['row'], begin['amplitude'])}"
         )
         senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
 
         def followed(sense: int) -> Iterator[str]:
-            own = journal("down" if sense < 0 else "up")
-            if not own.outcome:
-                own.finish(_followed(source, span, value, sense, made, begin, own, say))
-            rows = own.outcome["rows"]
+            part_journal = journal("down" if sense < 0 else "up")
+            if not part_journal.outcome:
+                part_journal.finish(
+                    _followed(source, span, value, sense, make_case, begin, part_journal, say)
+                )
+            rows = part_journal.outcome["rows"]
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
         compute(senses, followed, comm, say)
@@ -231,20 +245,20 @@ def boundary(
             comm,
             lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses},
         )
-        done = _put_together(outcomes, begin, span, name, settings)
-        access_disk(comm, lambda: _write(done, folder))
-    for line in done.content["said"]:
+        stability_boundary = _put_together(outcomes, begin, span, name, settings)
+        access_disk(comm, lambda: _write(stability_boundary, folder))
+    for line in stability_boundary.content["said"]:
         once(line)
-    return done
+    return stability_boundary
 
 
-def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
+def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: bool) -> float:
     """Where the boundary starts: the case's own value, or where that may be outside, the end that
     is nearest to it.
     """
     words = span.key.split(".")
     raw = value_at(source.data, words)
-    raw = value_at(made(source).model_dump(mode="json"), words) if raw is None else raw
+    raw = value_at(make_case(source).model_dump(mode="json"), words) if raw is None else raw
     try:
         value = in_unit(str(raw), span.unit)
     except ValueError:
@@ -253,14 +267,15 @@ def _value(source: Source, span: Range, made: Made, outside: bool) -> float:
                 f"--over {span.key}: is no number in the case, but {type(raw).__name__}"
             ) from None
         value = span.first
-    if not outside and not span.ends[0] <= value <= span.ends[1]:
+    if not may_be_outside and not span.ends[0] <= value <= span.ends[1]:
         raise CaseError(
-            f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the range"
+            f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the "
+            "range"
         )
     return float(np.clip(value, *span.ends))
 
 
-def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
+def _problem(source: Source, span: Range, make_case: MakeCase, value: float) -> Problem:
     """The problem at a value of the key.
 
     Raises
@@ -268,45 +283,51 @@ def _problem(source: Source, span: Range, made: Made, value: float) -> Problem:
     CaseError
         If it is not valid.
     """
-    varied, assignment = copy.deepcopy(source), f"{span.key}={span.text(value)}"
+    source_at_value, assignment = copy.deepcopy(source), f"{span.key}={span.text(value)}"
     try:
-        override(varied, assignment)
-        problem: Problem = made(varied).problem()
+        override(source_at_value, assignment)
+        problem: Problem = make_case(source_at_value).problem()
         refuse_beyond_memory(problem)
     except CaseError as e:
         raise CaseError(str(e).replace(f"--set {assignment}", f"--over {assignment}")) from None
     return with_modes(problem, MPI.COMM_SELF) if problem.pending_modes else problem
 
 
-def _identity(source: Source, span: Range, made: Made, start: str) -> str:
+def _identity(source: Source, span: Range, make_case: MakeCase, start: str) -> str:
     """Hash of the case, the range and the start."""
-    case = made(source)
+    case = make_case(source)
     data = [case.model_dump(mode="json") | case.outside, asdict(span), *([start] if start else [])]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _begin(
-    source: Source, span: Range, value: float, made: Made, journal: Journal, say: Say, start: Start
+    source: Source,
+    span: Range,
+    value: float,
+    make_case: MakeCase,
+    journal: Journal,
+    say: Say,
+    start: Start,
 ) -> dict[str, Any]:
     """The run to the instability, as data; without a label there is none."""
     for end in span.ends:
-        _problem(source, span, made, end)
+        _problem(source, span, make_case, end)
     if journal.outcome:
         return journal.outcome
-    scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
-    records, lost = list[Record](), None
+    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
+    records, lost_reason = list[Record](), None
     try:
         for record in follow_alone(scene, remark=say):
             records.append(record)
             if start.complete(records):
                 break
     except Stopped as e:  # what lies beyond an instability does not matter
-        lost = e
+        lost_reason = e
     try:
-        located = start.of(records)
+        located = start.instability_in(records)
     except CaseError:
-        if lost:
-            raise lost from None
+        if lost_reason:
+            raise lost_reason from None
         if start.text:
             raise
         return {"label": "", "mode": ""}
@@ -331,70 +352,79 @@ def _followed(
     span: Range,
     value: float,
     sense: int,
-    made: Made,
+    make_case: MakeCase,
     begin: dict[str, Any],
-    own: Journal,
+    part_journal: Journal,
     say: Say,
 ) -> dict[str, Any]:
     """One direction of the boundary: its rows from the start, and why it stopped if it did."""
-    scene = Scene(_problem(source, span, made, value), MPI.COMM_SELF)
+    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
     u = vector_of(begin["u"])
     point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
-        varied = Varied(scene, record, partial(_problem, source, span, made), value, span.ends)
+        family = Varied(scene, record, partial(_problem, source, span, make_case), value, span.ends)
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     rows: list[dict[str, Any]] = []
-    begun, end = time.perf_counter(), span.ends[sense > 0]
+    start_time, end = time.perf_counter(), span.ends[sense > 0]
 
     def take(label: Label, locus: BoundaryPoint, mode: Boundary) -> None:
-        row = _row(varied, label, locus, mode, begin["name_of_mode"])
+        row = _row(family, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
         part = max(
-            (each["key"] - value) / (end - value) for each in rows
+            (row_of_curve["key"] - value) / (end - value) for row_of_curve in rows
         )  # of the way, which may turn back
-        left = rest_said((time.perf_counter() - begun) * (1 / part - 1)) if part > 0 else ""
-        beside = f", {row['unstable']} other unstable" if row["unstable"] else ""
-        at = f"{row['key']:.9g} {span.unit}".rstrip()
-        say(f"{span.key} = {at}: {row['kind']} at {load_said(row, varied.name)}{beside}{left}")
+        remaining = (
+            remaining_time_text((time.perf_counter() - start_time) * (1 / part - 1))
+            if part > 0
+            else ""
+        )
+        other_modes = f", {row['unstable']} other unstable" if row["unstable"] else ""
+        key_text = f"{row['key']:.9g} {span.unit}".rstrip()
+        say(
+            f"{span.key} = {key_text}: {row['kind']} at "
+            f"{load_text(row, family.name)}{other_modes}{remaining}"
+        )
 
-    def curve(m: int, at: BoundaryPoint | None = None) -> Boundary:
-        kind = varied.kind_of(m, at)
-        return Boundary(varied, varied.name, kind, scales, own.recorded, m, varied.excludes)
+    def curve(m: int, start_point: BoundaryPoint | None = None) -> Boundary:
+        kind = family.kind_of(m, start_point)
+        return Boundary(
+            family, family.name, kind, scales, part_journal.recorded, m, family.excludes
+        )
 
     try:
-        mode = curve(varied.m)
-        start = mode.start(value, *varied.start)
+        mode = curve(family.m)
+        start = mode.start(value, *family.start)
         if begin["is_first"]:
-            mode, start = first_mode(curve, varied.mode_at, mode, start)
-        rows.append(_row(varied, "start", start, mode, begin["name_of_mode"]))
-        for label, locus, on in critical_boundary(
-            curve, varied.mode_at, mode, start, sense, span.ends, span.steps
+            mode, start = first_mode(curve, family.mode_at, mode, start)
+        rows.append(_row(family, "start", start, mode, begin["name_of_mode"]))
+        for label, locus, points_of_curve in critical_boundary(
+            curve, family.mode_at, mode, start, sense, span.ends, span.steps
         ):
-            take(label, locus, on)
+            take(label, locus, points_of_curve)
     except (BoundaryLost, NoSystem) as e:
         if not rows:
             raise Stopped(str(e)) from None
-        return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": varied.alone}
-    return {"rows": rows, "stopped": "", "alone": varied.alone}
+        return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": family.alone}
+    return {"rows": rows, "stopped": "", "alone": family.alone}
 
 
 def _row(
-    varied: Varied, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
+    family: Varied, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
 ) -> dict[str, Any]:
     """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
     whole."""
     families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
-    own = "" if varied.m else name_of_mode
+    mode_name = "" if family.m else name_of_mode
     if len(families) > 1 and not families[0]:
-        own = varied.kind_of(0, locus)
+        mode_name = family.kind_of(0, locus)
     return {
         "key": float(locus.p),
-        **_load(varied.name, locus.state.mu[varied.name], varied.problem(locus.p)),
+        **_load(family.name, locus.state.mu[family.name], family.problem(locus.p)),
         "kind": label if label in SPECIAL else mode.kind,
-        "mode": ", ".join(f"{WAVES}{m}" if m else own for m in families),
+        "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in families),
         "error": float(locus.load_error),
         "unstable": int(
             locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
@@ -420,18 +450,19 @@ def _put_together(
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
-    said = [
+    sentences = [
         f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
-        + f", {load_said(row, begin['amplitude'])}: {CHANGED if 'fold' in row['mode'] else SAID[row['kind']]}"
+        + f", {load_text(row, begin['amplitude'])}: {CHANGED if 'fold' in row['mode'] else WORDS_OF_KINDS[row['kind']]}"
         + (f", {row['mode']}" if row["kind"] == "crossing" else "")
         for row in special
     ]
     stopped = [part["stopped"] for part in (down, up) if part["stopped"]]
-    reached = min(row["key"] for row in rows), max(row["key"] for row in rows)
-    for end, key in zip(sorted((span.first, span.last)), reached, strict=True):
-        if not stopped and abs(key - end) > REACHED * abs(span.last - span.first):
-            said.append(
-                f"between {span.text(end)} and {span.text(key)} it has no points: it turns back before"
+    key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
+    for end, key in zip(sorted((span.first, span.last)), key_range, strict=True):
+        if not stopped and abs(key - end) > END_TOLERANCE * abs(span.last - span.first):
+            sentences.append(
+                f"between {span.text(end)} and {span.text(key)} it has no points: it turns back "
+                "before"
             )
     content = {
         "case": name,
@@ -445,7 +476,8 @@ def _put_together(
         "mode": begin["name_of_mode"],
         "points": len(rows),
         "special": special,
-        "said": said or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],
+        "said": sentences
+        or [f"no cusp between {span.text(span.first)} and {span.text(span.last)}"],
         "factorisations": {
             "run": begin["factorisations"],
             "boundary": sum(row["factorisations"] for row in rows),
@@ -455,8 +487,8 @@ def _put_together(
     return StabilityBoundary(rows, content)
 
 
-def _write(done: StabilityBoundary, folder: Path) -> None:
-    more = [name for name in done.rows[0] if name not in COLUMNS]
-    write_object(folder / "boundary.json", done.content)
-    write_csv(done.rows, (*COLUMNS, *more), folder / "boundary.csv")
-    draw_boundary(done.rows, done.content, folder / "boundary.png")
+def _write(stability_boundary: StabilityBoundary, folder: Path) -> None:
+    extra_columns = [name for name in stability_boundary.rows[0] if name not in COLUMNS]
+    write_object(folder / "boundary.json", stability_boundary.content)
+    write_csv(stability_boundary.rows, (*COLUMNS, *extra_columns), folder / "boundary.csv")
+    draw_boundary(stability_boundary.rows, stability_boundary.content, folder / "boundary.png")

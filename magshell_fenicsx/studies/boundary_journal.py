@@ -12,9 +12,9 @@ from pydantic import TypeAdapter
 from magshell_fenicsx.continuation.augmented import BoundaryPoint, CurveVector
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.platform.environment import code_version
-from magshell_fenicsx.studies.runner import keep, kept
+from magshell_fenicsx.studies.runner import keep, stored_outcome
 
-ANY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+PLAIN_DATA: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 
 class Journal:
@@ -29,7 +29,7 @@ class Journal:
     @property
     def outcome(self) -> dict[str, Any]:
         """What the part has found; empty until it is finished."""
-        return self._kept(self._name) or {}
+        return self._stored_outcome(self._name) or {}
 
     def finish(self, outcome: dict[str, Any]) -> None:
         """Keep the whole part in place of its solves."""
@@ -40,15 +40,17 @@ class Journal:
     def recorded(self, solve: Callable[[], BoundaryPoint | str]) -> BoundaryPoint | str:
         """The result of a solve, or that of an interrupted boundary at this place."""
         name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
-        if (saved := self._kept(name)) is not None:
+        if (saved := self._stored_outcome(name)) is not None:
             return _locus(saved) if "state" in saved else str(saved["reason"])
         solved = solve()
         content = {"reason": solved} if isinstance(solved, str) else _as_data(solved)
         keep(self._folder / f"{name}.json", {"sources": code_version(), "outcome": content})
         return solved
 
-    def _kept(self, name: str) -> dict[str, Any] | None:
-        return kept(self._folder / f"{name}.json", ANY, "outcome", sources=code_version())
+    def _stored_outcome(self, name: str) -> dict[str, Any] | None:
+        return stored_outcome(
+            self._folder / f"{name}.json", PLAIN_DATA, "outcome", sources=code_version()
+        )
 
 
 def text_of(v: Vector) -> str:
@@ -60,13 +62,13 @@ def vector_of(text: str) -> Vector:
 
 
 def _as_data(locus: BoundaryPoint) -> dict[str, Any]:
-    data = {each.name: getattr(locus, each.name) for each in fields(locus)}
+    data = {attribute.name: getattr(locus, attribute.name) for attribute in fields(locus)}
     state = {"u": text_of(locus.state.u), "mu": locus.state.mu}
-    way = {"du": text_of(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
-    return data | {"state": state, "way": way, "phi": text_of(locus.phi)}
+    tangent = {"du": text_of(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
+    return data | {"state": state, "way": tangent, "phi": text_of(locus.phi)}
 
 
 def _locus(data: dict[str, Any]) -> BoundaryPoint:
     state = State(vector_of(data["state"]["u"]), data["state"]["mu"])
-    way = CurveVector(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
-    return BoundaryPoint(**{**data, "state": state, "way": way, "phi": vector_of(data["phi"])})
+    tangent = CurveVector(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
+    return BoundaryPoint(**{**data, "state": state, "way": tangent, "phi": vector_of(data["phi"])})

@@ -17,7 +17,7 @@ from magshell_fenicsx.simulate.varied import Excluded, NoInstability
 from magshell_fenicsx.studies.boundary import COLUMNS, StabilityBoundary, boundary, parse_range
 from magshell_fenicsx.studies.boundary_picture import draw_map
 from magshell_fenicsx.studies.points import Axis, parse_axis
-from magshell_fenicsx.studies.runner import Folder, Made, Say
+from magshell_fenicsx.studies.runner import Folder, MakeCase, Say
 
 FOLDER = Folder(
     "a map of boundaries",
@@ -43,7 +43,8 @@ def second_axis(text: str, first: str) -> Axis:
         or axis.name.split(".")[0] in BESIDE
     ):
         raise CaseError(
-            f"--over {text}: the second key of a map is another number of the shell or its loads, written as "
+            f"--over {text}: the second key of a map is another number of the shell or its loads, "
+            "written as "
             "key.path=first:last:count or key.path=value,value,..."
         )
     numbers = [axis.number(value) for value in axis.values]
@@ -64,7 +65,7 @@ def boundary_map(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
     *,
-    made: Made,
+    make_case: MakeCase,
     start: str | None = None,
 ) -> StabilityBoundary:
     """Follow the instability of a case in one key, for each value of a second one if there is one;
@@ -89,7 +90,7 @@ def boundary_map(
         See `boundary`; or if there is an instability at no value of the second key.
     """
     if len(overs) == 1:
-        return boundary(file, overs[0], settings, out, comm, say, made=made, start=start)
+        return boundary(file, overs[0], settings, out, comm, say, make_case=make_case, start=start)
     if start:
         raise CaseError(
             f"--from {start}: a map starts at the end of each of its cases: give one --over"
@@ -105,41 +106,43 @@ def boundary_map(
             raise CaseError(f"--set {setting}: this key is swept by --over")
     folder, once = user_folder(out), say if comm.rank == 0 else (lambda line: None)
     rows, without, lines = list[dict[str, Any]](), dict[str, str](), dict[str, StabilityBoundary]()
-    with FOLDER.held(folder, comm, Path(file).name):
+    with FOLDER.locked(folder, comm, Path(file).name):
         for number, value in enumerate(axis.values, 1):
             once(f"{axis.name} = {value}, {number} of {len(axis.values)}")
-            own = [*settings, f"{axis.name}={value}"]
+            line_settings = [*settings, f"{axis.name}={value}"]
             try:
-                one = boundary(
+                line_boundary = boundary(
                     file,
                     overs[0],
-                    own,
+                    line_settings,
                     folder / "boundaries" / f"{number:03d}",
                     comm,
                     say,
-                    made=made,
+                    make_case=make_case,
                 )
             except (Excluded, NoInstability, Stopped) as e:
                 without[value] = str(e)
                 once(f"{axis.name} = {value}: no boundary: {e}")
                 continue
             except CaseError as e:
-                raise CaseError(str(e).replace(f"--set {own[-1]}", f"--over {own[-1]}")) from None
-            lines[value] = one
+                raise CaseError(
+                    str(e).replace(f"--set {line_settings[-1]}", f"--over {line_settings[-1]}")
+                ) from None
+            lines[value] = line_boundary
             rows += [
-                {"second": axis.number(value), "amplitude": one.content["load"], **row}
-                for row in one.rows
+                {"second": axis.number(value), "amplitude": line_boundary.content["load"], **row}
+                for row in line_boundary.rows
             ]
         if not rows:
             raise CaseError(
                 f"--over {overs[1]}: the case has an instability at none of these values"
             )
         content = _content(file, settings, lines, without, axis)
-        done = StabilityBoundary(rows, content)
-        access_disk(comm, lambda: _write(done, folder))
+        stability_map = StabilityBoundary(rows, content)
+        access_disk(comm, lambda: _write(stability_map, folder))
     for line in content["said"]:
         once(line)
-    return done
+    return stability_map
 
 
 def _content(
@@ -158,7 +161,7 @@ def _content(
         for value, line in lines.items()
         for each in line.special
     ]
-    said = [
+    sentences = [
         f"{axis.name} = {value}: {text}"
         for value, line in lines.items()
         for text in line.content["said"]
@@ -176,7 +179,7 @@ def _content(
             for value, line in lines.items()
         },
         "special": special,
-        "said": said + [f"{axis.name} = {value}: no boundary" for value in without],
+        "said": sentences + [f"{axis.name} = {value}: no boundary" for value in without],
         "without": without,
         "stopped": [
             f"{axis.name} = {value}: {why}" for value, line in lines.items() for why in line.stopped
@@ -184,15 +187,18 @@ def _content(
     }
 
 
-def _write(done: StabilityBoundary, folder: Path) -> None:
-    more = dict.fromkeys(
-        name for row in done.rows for name in row if name not in ("second", "amplitude", *COLUMNS)
+def _write(stability_map: StabilityBoundary, folder: Path) -> None:
+    extra_columns = dict.fromkeys(
+        name
+        for row in stability_map.rows
+        for name in row
+        if name not in ("second", "amplitude", *COLUMNS)
     )
-    columns = ("second", "amplitude", *COLUMNS, *more)
-    write_object(folder / "map.json", done.content)
+    columns = ("second", "amplitude", *COLUMNS, *extra_columns)
+    write_object(folder / "map.json", stability_map.content)
     write_csv(
-        [{name: row.get(name, "") for name in columns} for row in done.rows],
+        [{name: row.get(name, "") for name in columns} for row in stability_map.rows],
         columns,
         folder / "boundary.csv",
     )
-    draw_map(done.rows, done.content, folder / "boundary.png")
+    draw_map(stability_map.rows, stability_map.content, folder / "boundary.png")

@@ -52,8 +52,8 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
             pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])
         )
         for unstable, group in pairs:
-            joined = [*group]
-            line = [joined[0][0], *(two for _, two in joined)]
+            segments = [*group]
+            line = [segments[0][0], *(upper_point for _, upper_point in segments)]
             _line(plot, line, color="C0", linestyle="--" if unstable else "-")
     plot.margins(y=0.2 if len(parts) > 1 else None)
     _marks(plot, "load", rows)
@@ -63,8 +63,8 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     if arms:
         low, high = arms
         x, y = (
-            np.concatenate([one, two[::-1]])
-            for one, two in zip(_joined(low), _joined(high), strict=True)
+            np.concatenate([lower_point, upper_point[::-1]])
+            for lower_point, upper_point in zip(_smoothed(low), _smoothed(high), strict=True)
         )
         plot.fill(x, y, color="C0", alpha=0.12, linewidth=0)
     plot.set(xlabel=key_label(content["key"], content["unit"]), ylabel=label, title=_title(content))
@@ -92,9 +92,9 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     others = [row for row in rows if row["amplitude"] != content["load"]]
     empty = sorted(set(content["values"]) - {row["second"] for row in rows})
     of_plane = bool(others or empty or any(row["kind"] in MARKS for row in rows))
-    wide = 10.2 if of_plane else 6.4
+    width_inches = 10.2 if of_plane else 6.4
     figure, plots = plt.subplots(
-        1, 1 + of_plane, figsize=(wide, 4.4), layout="constrained", squeeze=False
+        1, 1 + of_plane, figsize=(width_inches, 4.4), layout="constrained", squeeze=False
     )
     plot, plane = plots[0, 0], plots[0, -1]
     names = [
@@ -119,25 +119,29 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
 
 def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
     """Rows whose load is in the case's units if they have it in these, and the label of its axis."""
-    of = shown_quantity(amplitude(load).column, {name for row in rows for name in row})
-    return [{**row, "load": row.get(of.name, row["load"])} for row in rows], of.label
+    load_quantity = shown_quantity(amplitude(load).column, {name for row in rows for name in row})
+    return [
+        {**row, "load": row.get(load_quantity.name, row["load"])} for row in rows
+    ], load_quantity.label
 
 
 def _plane(
     plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
 ) -> None:
     """Lines of both keys on which there is an instability, by which load, and where there is none."""
-    named = set[str]()
+    load_words = set[str]()
 
     def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:
-        plane.plot([min(x), max(x)], [value] * 2, label="" if words in named else words, **style)
-        named.add(words)
+        plane.plot(
+            [min(x), max(x)], [value] * 2, label="" if words in load_words else words, **style
+        )
+        load_words.add(words)
 
     for value, group in groupby(rows, key=lambda row: float(row["second"])):
         line = [*group]
-        by = quantity(amplitude(line[0]["amplitude"]).column).words
+        load_quantity = quantity(amplitude(line[0]["amplitude"]).column).words
         colour = "C0" if line[0]["amplitude"] == content["load"] else "C1"
-        draw([row["key"] for row in line], value, f"by the {by}", color=colour, lw=2)
+        draw([row["key"] for row in line], value, f"by the {load_quantity}", color=colour, lw=2)
     for value in empty:
         draw(content["range"], value, "nowhere", color="0.5", ls=":")
     _marks(plane, "second", rows)
@@ -153,7 +157,7 @@ def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
 
 def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) -> None:
     """A smooth line through the points of a boundary, with dots where one is to see them."""
-    x, y = _joined(
+    x, y = _smoothed(
         [(row["key"], row["load"]) for row in rows], [row["kind"] in MARKS for row in rows]
     )
     plot.plot(x, y, **style)
@@ -166,7 +170,7 @@ def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) ->
         )
 
 
-def _joined(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
+def _smoothed(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
     x, y = zip(*places, strict=True)
     return smooth(x, y, located)
 
@@ -180,13 +184,14 @@ def _arms(
     rows: Sequence[Row],
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:
     """The two folds of the first cusp, from it on; None without one."""
-    at = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
-    if at is None:
+    cusp_row = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
+    if cusp_row is None:
         return None
-    before, after = (
-        [(row["key"], row["load"]) for row in part] for part in (rows[at::-1], rows[at:])
+    first_arm, second_arm = (
+        [(row["key"], row["load"]) for row in part]
+        for part in (rows[cusp_row::-1], rows[cusp_row:])
     )
-    return before, after
+    return first_arm, second_arm
 
 
 def _regions(
@@ -197,59 +202,67 @@ def _regions(
     Where a bifurcation comes after other instabilities it divides nothing that is stable.
     """
     rows = [row for row in rows if not row["unstable"]] or rows
-    parts, whole = _by_mode(rows), _beside(rows, content, limits)
+    parts, all_regions = _by_mode(rows), _regions_of_mode(rows, content, limits)
     if len(parts) < 2:
-        return whole
-    extent, named = (
+        return all_regions
+    extent, regions = (
         np.ptp([row["key"] for row in rows]),
-        [each for each in whole if each[2] == "stable"],
+        [region for region in all_regions if region[2] == "stable"],
     )
     for mode, part in parts:
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
         )
-        for x, y, words in _beside(part, {**content, "kind": kind, "mode": mode}, limits)[:1]:
+        for x, y, words in _regions_of_mode(part, {**content, "kind": kind, "mode": mode}, limits)[
+            :1
+        ]:
             width = np.ptp([row["key"] for row in part]) / extent
             outer = limits[1] if y > 0 else limits[0]
             y = (y + outer) / 2 if width < LOW else y  # beside the names of its neighbours
-            named.append((x, y, mode if width < NARROW and mode else words))
-    return named
+            regions.append((x, y, mode if width < NARROW and mode else words))
+    return regions
 
 
-def _beside(
+def _regions_of_mode(
     rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
 ) -> list[tuple[Any, ...]]:
     """The same of a boundary with one mode."""
-    lost = "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
+    instability_words = (
+        "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
+    )
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
     crossed = sorted(
-        one["load"] + (x - one["key"]) / (two["key"] - one["key"]) * (two["load"] - one["load"])
-        for one, two in pairwise(rows)
-        if (one["key"] - x) * (two["key"] - x) <= 0 and one["key"] != two["key"]
+        lower_row["load"]
+        + (x - lower_row["key"])
+        / (upper_row["key"] - lower_row["key"])
+        * (upper_row["load"] - lower_row["load"])
+        for lower_row, upper_row in pairwise(rows)
+        if (lower_row["key"] - x) * (upper_row["key"] - x) <= 0
+        and lower_row["key"] != upper_row["key"]
     )
     if not crossed:
         return []
     up = np.mean(crossed) > 0  # loads are negative elsewhere
     outer, inner = (limits[1], limits[0]) if up else (limits[0], limits[1])
     last, first = (crossed[-1], crossed[0]) if up else (crossed[0], crossed[-1])
-    named = [(x, (last + outer) / 2, lost), (x, (first + inner) / 2, "stable")]
+    regions = [(x, (last + outer) / 2, instability_words), (x, (first + inner) / 2, "stable")]
     if len(crossed) > 1:
-        between = "bistable" if content["kind"] == "fold" else lost
-        named.append((x, (crossed[0] + crossed[-1]) / 2, between))
+        middle_words = "bistable" if content["kind"] == "fold" else instability_words
+        regions.append((x, (crossed[0] + crossed[-1]) / 2, middle_words))
         if content["kind"] != "fold":
-            named[0] = (x, (last + outer) / 2, "stable")
-    return named
+            regions[0] = (x, (last + outer) / 2, "stable")
+    return regions
 
 
 def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     """The modes one after the other, each with its rows and the crossings at their ends."""
     ends = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
     parts = ([*rows[a : b + 1]] for a, b in pairwise([0, *ends, len(rows) - 1]))
-    named = (
+    mode_parts = (
         (next((row["mode"] for row in part if row["kind"] != "crossing"), None), part)
         for part in parts
     )
-    return [(mode, part) for mode, part in named if mode is not None]
+    return [(mode, part) for mode, part in mode_parts if mode is not None]
 
 
 def _mode(mode: str) -> str:

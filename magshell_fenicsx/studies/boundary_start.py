@@ -15,7 +15,7 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.varied import NoInstability, instability
 
-SAME = 1e-3  # of a load: the run and its repetition, on another processor
+LOAD_TOLERANCE = 1e-3  # of a load: the run and its repetition, on another processor
 FORM = "write it as DIR:POINT, with the folder of a run and the number of a fold or bifurcation in its path.csv"
 
 
@@ -41,7 +41,7 @@ class Start:
         """Whether no further records are needed."""
         return 0 <= self.point < len(records)
 
-    def of(self, records: Sequence[Record]) -> Record:
+    def instability_in(self, records: Sequence[Record]) -> Record:
         """The instability of a history.
 
         Raises
@@ -51,14 +51,16 @@ class Start:
         """
         if not self.text:
             return instability(records)
-        near = [
-            r for r in records if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=SAME)
+        candidates = [
+            r
+            for r in records
+            if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=LOAD_TOLERANCE)
         ]
-        if self.complete(records) and records[self.point] in near:
+        if self.complete(records) and records[self.point] in candidates:
             return records[self.point]
-        if not near:
+        if not candidates:
             raise NoInstability(f"--from {self.text}: the run, repeated, has no such point")
-        return min(near, key=lambda r: abs(_load(r) - self.load))
+        return min(candidates, key=lambda r: abs(_load(r) - self.load))
 
     def anywhere(self) -> "Start":
         """The same instability in a history of other points, as that of the whole shell is."""

@@ -21,7 +21,7 @@ from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
-from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
+from magshell_fenicsx.studies.runner import Folder, MakeCase, Say, compute, keep, stored_outcome
 from magshell_fenicsx.studies.study_report import estimated_error
 
 Errors = Mapping[str, Sequence[tuple[float, float]]]
@@ -94,19 +94,24 @@ def run_model(
     NothingLeft
         If there is nothing to compare.
     """
-    chosen = [*settings, f"model={model}", f"mesh.refinement={refinement:g}", *WITHOUT[model]]
-    asked = {
+    model_settings = [
+        *settings,
+        f"model={model}",
+        f"mesh.refinement={refinement:g}",
+        *WITHOUT[model],
+    ]
+    request = {
         "case": case.read_text(encoding="utf-8"),
-        "settings": chosen,
+        "settings": model_settings,
         "sources": code_version(),
     }
-    used, results, why = kept(folder / "usage.json", TypeAdapter(Used)), None, ""
-    if used and used.asked == asked:
+    used, results, why = stored_outcome(folder / "usage.json", TypeAdapter(Used)), None, ""
+    if used and used.asked == request:
         try:
             results = read_summary(folder), read_lines(folder / "path.csv")
         except (OSError, Damaged) as e:
             why = str(e)
-    elif used and used.asked | {"sources": asked["sources"]} == asked:
+    elif used and used.asked | {"sources": request["sources"]} == request:
         why = "the folder has results of other sources of magshell_fenicsx"
     if why:
         say(f"{model} at refinement {refinement:g}: computed again, {why}")
@@ -114,9 +119,10 @@ def run_model(
         name = _case_in(folder)
         if name and Path(name).stem != case.stem:
             raise CaseError(
-                f"--out {folder.parent}: has a comparison of {name}, which is kept; give another folder"
+                f"--out {folder.parent}: has a comparison of {name}, which is kept; give another "
+                "folder"
             )
-        sets = [part for setting in chosen for part in ("--set", setting)]
+        sets = [part for setting in model_settings for part in ("--set", setting)]
         measured = measure(
             "magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"]
         )
@@ -125,7 +131,7 @@ def run_model(
                 f"model: {model}: {measured.last_error or f'exit code {measured.code}'}"
             )
         results = read_summary(folder), read_lines(folder / "path.csv")
-        used = Used({**asked, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
+        used = Used({**request, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
         keep(folder / "usage.json", asdict(used))
     summary, rows = results
     compiling = float(summary["timing"]["jit_s"])
@@ -178,15 +184,21 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also
     stretches the thickness. The displacement since the end of the field excludes this.
     """
-    varied = amplitude_of(run)
-    x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # the same point in both models
-    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == varied)
-    before = run.rows[max(first - 1, 0)]
+    load_name = amplitude_of(run)
+    x = (
+        "w_point_over_h" if load_name == "force" else "w_pole_over_h"
+    )  # the same point in both models
+    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == load_name)
+    row_before = run.rows[max(first - 1, 0)]
     part = [
-        before,
-        *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0"),
+        row_before,
+        *(
+            row
+            for row in run.rows[first:]
+            if row["amplitude"] == load_name and row["branch"] == "0"
+        ),
     ]
-    return [{**row, W: repr(float(row[x]) - float(before[x]))} for row in part]
+    return [{**row, W: repr(float(row[x]) - float(row_before[x]))} for row in part]
 
 
 def places(runs: Sequence[ModelRun]) -> list[float]:
@@ -202,13 +214,13 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
     """The differences at the displacements that both runs reach."""
-    both = (
+    loads_at_places = (
         (place, load_at(shell, place), load_at(solid, place)) for place in places([shell, solid])
     )
     return [
-        Difference(place, one, two)
-        for place, one, two in both
-        if one is not None and two is not None
+        Difference(place, shell_load, solid_load)
+        for place, shell_load, solid_load in loads_at_places
+        if shell_load is not None and solid_load is not None
     ]
 
 
@@ -218,7 +230,7 @@ def load_at(run: ModelRun, w: float) -> float | None:
 
 
 def judge(
-    runs: Sequence[ModelRun], at: float | None, scalar: Scalar | None
+    runs: Sequence[ModelRun], judged_place: float | None, scalar: Scalar | None
 ) -> tuple[str, Callable[[ModelRun], float | None]]:
     """The name of the compared number, and what gives it of a run.
 
@@ -228,10 +240,11 @@ def judge(
         scalar = parse_scalar("knockdown")
     if scalar:
         return scalar.name, lambda run: scalar.of(run.summary, run.rows)
-    if at is None:
+    if judged_place is None:
         return "nothing", lambda run: None
-    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", lambda run: load_at(
-        run, at
+    return (
+        f"{amplitude(amplitude_of(runs[0])).column} at w/h = {judged_place:g}",
+        lambda run: load_at(run, judged_place),
     )
 
 
@@ -276,7 +289,7 @@ def compare(
     *,
     refinements: Mapping[ModelName, Sequence[float]],
     out: Path | str,
-    made: Made,
+    make_case: MakeCase,
     result: str | None = None,
     say: Say = print,
 ) -> Comparison:
@@ -291,7 +304,7 @@ def compare(
     refinements
         Mesh refinements of each model. The finest runs are compared. Errors are relative to the
         limit that the three finest runs extrapolate to.
-    made
+    make_case
         Makes a case of its source.
     result
         The number that is compared, as of `magshell study`; by default k_d, or the load at a
@@ -306,9 +319,13 @@ def compare(
     """
     file, folder, scalar = Path(file), user_folder(out), parse_scalar(result) if result else None
     for model in MODELS:
-        case = made(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
-    varied = case.programme[-1].name if case.programme else ""
-    if not varied or varied in UNCOMPARED or (varied == "lambda_m" and case.loading is None):
+        case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
+    load_name = case.programme[-1].name if case.programme else ""
+    if (
+        not load_name
+        or load_name in UNCOMPARED
+        or (load_name == "lambda_m" and case.loading is None)
+    ):
         raise CaseError(
             "compare: needs a load whose curve can be compared: pressure, indentation or field"
         )
@@ -316,15 +333,17 @@ def compare(
 
     def computed(task: tuple[ModelName, float]) -> Iterator[str]:
         model, refinement = task
-        done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}", say)
-        runs[model].append(done)
-        yield f"{model} at refinement {refinement:g}: {done.dofs} unknowns, {done.cpu_s:.1f} s CPU"
-        if not amplitude_of(done):
+        model_run = run_model(
+            file, settings, model, refinement, folder / f"{model}_{refinement:g}", say
+        )
+        runs[model].append(model_run)
+        yield f"{model} at refinement {refinement:g}: {model_run.dofs} unknowns, {model_run.cpu_s:.1f} s CPU"
+        if not amplitude_of(model_run):
             raise NothingLeft(
-                f"the {model} did not leave its undeformed state: {done.summary['stopped']}"
+                f"the {model} did not leave its undeformed state: {model_run.summary['stopped']}"
             )
 
-    with FOLDER.held(folder, MPI.COMM_SELF, file.name):
+    with FOLDER.locked(folder, MPI.COMM_SELF, file.name):
         tasks = [
             (model, refinement)
             for model in MODELS
@@ -338,8 +357,8 @@ def compare(
                 f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did"
             )
         differing = differences(shell, solid)
-        at = max(places([run for model in MODELS for run in runs[model]]), default=None)
-        content = {"case": file.name, **_content(runs, at, differing, scalar)}
+        judged_place = max(places([run for model in MODELS for run in runs[model]]), default=None)
+        content = {"case": file.name, **_content(runs, judged_place, differing, scalar)}
         access_disk(MPI.COMM_SELF, lambda: _write(content, differing, folder))
         errors: Errors = {
             model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]]
@@ -384,14 +403,16 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
 
 def _content(
     runs: dict[ModelName, list[ModelRun]],
-    at: float | None,
+    judged_place: float | None,
     differing: Sequence[Difference],
     scalar: Scalar | None,
 ) -> dict[str, Any]:
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
-    name, value_of = judge([run for series in runs.values() for run in series], at, scalar)
+    name, value_of = judge(
+        [run for series in runs.values() for run in series], judged_place, scalar
+    )
     for model, series in runs.items():
         values = [value_of(run) for run in series]
         limit = extrapolated(values, [run.refinement for run in series])
@@ -412,11 +433,11 @@ def _content(
         limits[model] = limit
         measured = [(e, run.cpu_s) for e, run in zip(errors, series, strict=True) if e is not None]
         seconds[model] = time_at(ONE_PERCENT, measured)
-    both = [accounts[model][-1]["value"] for model in MODELS]
+    final_values = [accounts[model][-1]["value"] for model in MODELS]
     times = [seconds[model] for model in MODELS]
     return {
         "result": name,
-        "difference": both[1] / both[0] - 1 if None not in both else None,
+        "difference": final_values[1] / final_values[0] - 1 if None not in final_values else None,
         "largest_difference_of_the_curves": max((abs(d.relative) for d in differing), default=None),
         "limits": limits,
         "seconds_to_one_percent": seconds,
@@ -464,10 +485,10 @@ def draw_comparison(
 
     panels = 1 + bool(differing) + any(errors.values())
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
-    varied = amplitude(amplitude_of(shell))
+    load_amplitude = amplitude(amplitude_of(shell))
     x_label, y_label = (
-        f"{quantity('w_over_h').latex} {varied.place} since the field",
-        quantity(varied.column).label,
+        f"{quantity('w_over_h').latex} {load_amplitude.place} since the field",
+        quantity(load_amplitude.column).label,
     )
     first, *others = figure.subplots(1, panels, squeeze=False)[0]
     first.plot(

@@ -30,16 +30,25 @@ from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.gradients.fields import MASS, mass
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, LostResult
 from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_end
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.standing import Standing
-from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate
-from magshell_fenicsx.studies.design_picture import Reached, draw_design, reached_shape
+from magshell_fenicsx.studies.design_evaluation import DISTANCE, DesignEvaluation, evaluate
+from magshell_fenicsx.studies.design_picture import ReachedShape, draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
-from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
+from magshell_fenicsx.studies.design_wanted import DesignGoal, design_goal_of, search_optimum
 from magshell_fenicsx.studies.points import identity
-from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, heard, keep, kept, rest_said
+from magshell_fenicsx.studies.runner import (
+    Case,
+    Folder,
+    MakeCase,
+    Say,
+    heard,
+    keep,
+    remaining_time_text,
+    stored_outcome,
+)
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
@@ -47,9 +56,9 @@ FOLDER = Folder(
     ("summary.json", "design.csv", "best.yaml", "best.csv", "design.png"),
     ("objective", "best"),
 )
-WAY = 4  # stages before the last have this part of the iterations
-NOTHING = 1e-10  # change of a result, relative, over the whole range of a variable
-FAR = 0.3  # relative difference of a result that is another result
+STAGES_PART = 4  # stages before the last have this part of the iterations
+INFLUENCE_TOLERANCE = 1e-10  # change of a result, relative, over the whole range of a variable
+OTHER_RESULT_DIFFERENCE = 0.3  # relative difference of a result that is another result
 ROUNDING = 1e-12  # a smaller one is none
 
 
@@ -74,17 +83,17 @@ class Design:
     """
 
     variables: Variables
-    wanted: Wanted
+    goal: DesignGoal
     folder: Path
     comm: MPI.Comm
     say: Say
     rows: list[dict[str, Any]] = field(default_factory=list)
-    tried: list[tuple[Array, Evaluation]] = field(default_factory=list)
+    tried: list[tuple[Array, DesignEvaluation]] = field(default_factory=list)
     stage: int = 0
     seconds: list[float] = field(default_factory=list)
     _scene: Standing = field(default_factory=Standing)
 
-    def __call__(self, x: Array) -> Evaluation:
+    def __call__(self, x: Array) -> DesignEvaluation:
         """The evaluation of a vector, known or new; collective."""
         x = np.array(self.comm.bcast(x))
         for tried, evaluated in reversed(self.tried):
@@ -94,13 +103,16 @@ class Design:
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
         evaluation = on_first_rank(
-            self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine)
+            self.comm,
+            lambda: stored_outcome(
+                file, TypeAdapter(DesignEvaluation), "evaluation", **self._identity
+            ),
         )
         if evaluation is None:
-            begun = time.perf_counter()
-            evaluation = self._new(x, vectors)
-            self.seconds.append(time.perf_counter() - begun)
-            content = {**self._mine, "evaluation": asdict(evaluation)}
+            start_time = time.perf_counter()
+            evaluation = self._evaluated_anew(x, vectors)
+            self.seconds.append(time.perf_counter() - start_time)
+            content = {**self._identity, "evaluation": asdict(evaluation)}
             on_first_rank(self.comm, lambda: keep(file, content))
         self._add(x, evaluation, name)
         return evaluation
@@ -108,38 +120,40 @@ class Design:
     def begin(self, stage: int, targets: Sequence[Mapping[str, Target]]) -> None:
         """Want the next of several shapes."""
         self.stage = (stage + 1) % len(targets)
-        self.wanted.targets = targets[stage]
+        self.goal.targets = targets[stage]
         self.tried.clear()
 
-    def _new(self, x: Array, vectors: Path) -> Evaluation:
+    def _evaluated_anew(self, x: Array, vectors: Path) -> DesignEvaluation:
         access_disk(self.comm, lambda: self.variables.write(x, vectors))
-        case, wanted = self.variables.case_of(x, vectors), self.wanted
+        case, goal = self.variables.case_of(x, vectors), self.goal
         evaluation = evaluate(
-            case, x, self.variables, wanted.results, wanted.targets, self.comm, self._scene
+            case, x, self.variables, goal.results, goal.targets, self.comm, self._scene
         )
-        return Evaluation(**self.comm.bcast(asdict(evaluation)))
+        return DesignEvaluation(**self.comm.bcast(asdict(evaluation)))
 
     @cached_property
-    def _mine(self) -> dict[str, str]:
+    def _identity(self) -> dict[str, str]:
         """What the evaluations of this design have in their files: a hash of what is designed, and
         the sources.
         """
-        asked = self.wanted.section.model_dump_json(exclude={"iterations", "verify"})
-        designed = hashlib.sha256((identity(self.variables.case) + asked).encode()).hexdigest()[:16]
+        section_text = self.goal.section.model_dump_json(exclude={"iterations", "verify"})
+        designed = hashlib.sha256(
+            (identity(self.variables.case) + section_text).encode()
+        ).hexdigest()[:16]
         return {"design": designed, "sources": code_version()}
 
-    def _add(self, x: Array, evaluation: Evaluation, name: str) -> None:
+    def _add(self, x: Array, evaluation: DesignEvaluation, name: str) -> None:
         self.tried.append((x, evaluation))
         best, solved = self.best, bool(evaluation.values)
         row = {
             "evaluation": len(self.rows) + 1,
-            **{result: evaluation.values.get(result) for result in self.wanted.results},
+            **{result: evaluation.values.get(result) for result in self.goal.results},
             **evaluation.seen,
-            "objective": self.wanted.objective(evaluation) if solved else None,
-            "violation": self.wanted.violation(evaluation) if solved else None,
+            "objective": self.goal.objective(evaluation) if solved else None,
+            "violation": self.goal.violation(evaluation) if solved else None,
             "best": bool(best and best[0] is x),
             **self.variables.numbers(x),
-            **({"stage": self.stage or "last"} if self.wanted.stages else {}),
+            **({"stage": self.stage or "last"} if self.goal.stages else {}),
             "note": evaluation.note,
             "point": name,
         }
@@ -150,16 +164,19 @@ class Design:
         )
         note = f" ({evaluation.note})" if values and evaluation.note else evaluation.note
         self.say(
-            f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}{self._left}"
+            f"{row['evaluation']:5d}  "
+            f"{values}{note}{'  best' if row['best'] else ''}{self._time_left}"
         )
 
     @property
-    def _left(self) -> str:
+    def _time_left(self) -> str:
         """How long the iterations that may follow take, if each is one evaluation."""
-        ahead = self.wanted.section.iterations + 1 - len(self.rows)
+        remaining_iterations = self.goal.section.iterations + 1 - len(self.rows)
         return (
-            rest_said(float(np.mean(self.seconds)) * ahead, "at most about ")
-            if self.seconds and ahead > 0
+            remaining_time_text(
+                float(np.mean(self.seconds)) * remaining_iterations, "at most about "
+            )
+            if self.seconds and remaining_iterations > 0
             else ""
         )
 
@@ -173,10 +190,10 @@ class Design:
         write_csv(self.rows, columns, self.folder / "design.csv")
 
     @property
-    def best(self) -> tuple[Array, Evaluation] | None:
+    def best(self) -> tuple[Array, DesignEvaluation] | None:
         """The evaluation with the least objective of those that keep the constraints best."""
-        solved = [each for each in self.tried if each[1].values]
-        return min(solved, key=lambda each: self.wanted.merit(each[1])) if solved else None
+        solved = [evaluated for evaluated in self.tried if evaluated[1].values]
+        return min(solved, key=lambda evaluated: self.goal.merit(evaluated[1])) if solved else None
 
 
 def design(
@@ -184,7 +201,7 @@ def design(
     settings: Sequence[str] = (),
     out: Path | str = "results/design",
     *,
-    made: Made,
+    make_case: MakeCase,
     resume: bool = False,
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
@@ -197,7 +214,7 @@ def design(
         Folder of design.csv (all evaluations), best.yaml with best.csv (the best case and its
         remanence), design.png, summary.json, verified/ (the run of the best case on a finer mesh)
         and points/.
-    made
+    make_case
         Makes a case of its source, the same on all ranks.
     resume
         See that the folder has evaluations of this design.
@@ -211,33 +228,42 @@ def design(
         optimum found.
     """
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
-    case, folder = made(source), user_folder(out)
+    case, folder = make_case(source), user_folder(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:
-        vary, wanted = variables(source, case, case.design, made), wanted_of(case, case.design)
-        with FOLDER.held(folder, comm, Path(file).name):
+        vary, goal = (
+            variables(source, case, case.design, make_case),
+            design_goal_of(case, case.design),
+        )
+        with FOLDER.locked(folder, comm, Path(file).name):
             if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
-            with heard(comm, say) as told:
-                return _designed(Design(vary, wanted, folder, comm, told), Path(file), comm)
+            with heard(comm, say) as progress:
+                return _designed(Design(vary, goal, folder, comm, progress), Path(file), comm)
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
 
 
-def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
-    vary, wanted, section, folder = made.variables, made.wanted, made.wanted.section, made.folder
-    first, best, x, ended = _optimised(made)
+def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
+    vary, design_goal, section, folder = (
+        search.variables,
+        search.goal,
+        search.goal.section,
+        search.folder,
+    )
+    first, best, x, ended = _optimised(search)
     steps = section.remanence.steps if section.remanence else None
     if steps:
         x = vary.rounded(x, steps)
-        before, best = best, made(x)
+        unrounded, best = best, search(x)
         if not best.values:
             raise Missed(f"with angles in {steps} steps of a turn there is no result: {best.note}")
-        made.say(
-            f"angles rounded to {steps} steps of a turn: {wanted.words(before)} -> {wanted.words(best)}"
+        search.say(
+            f"angles rounded to {steps} steps of a turn: {design_goal.words(unrounded)} -> "
+            f"{design_goal.words(best)}"
         )
-    access_disk(comm, partial(_write_best, made, x, file))
+    access_disk(comm, partial(_write_best, search, x, file))
     content: dict[str, Any] = {
         "case": file.name,
         "objective": section.objective.model_dump(exclude_none=True),
@@ -246,73 +272,79 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
         "numbers": vary.numbers(x),
         "ended": ended,
         "without_influence": _without_influence(vary, first),
-        "evaluations": len(made.rows),
+        "evaluations": len(search.rows),
         "note": best.note,
-        "violation": wanted.violation(best),
+        "violation": design_goal.violation(best),
         "sources": code_version(),
     }
     goal = section.objective
-    asked = {goal.reach: goal.value} if goal.reach and goal.value is not None else {}
-    drawn = partial(draw_design, made.rows, wanted.results, vary, x, folder / "design.png", asked)
-    access_disk(comm, drawn)
+    target_values = {goal.reach: goal.value} if goal.reach and goal.value is not None else {}
+    draw_result = partial(
+        draw_design, search.rows, design_goal.results, vary, x, folder / "design.png", target_values
+    )
+    access_disk(comm, draw_result)
     access_disk(comm, lambda: write_object(folder / "summary.json", content))
-    content["verified"] = verified(made, best, comm)
-    targets: Sequence[Callable[[Array], Array] | None] = [*wanted.targets.values()] or [None]
+    content["verified"] = verified(search, best, comm)
+    targets: Sequence[Callable[[Array], Array] | None] = [*design_goal.targets.values()] or [None]
     for target in targets:
-        access_disk(comm, partial(_draw_reached, drawn, folder / "verified", target))
+        access_disk(comm, partial(_draw_reached, draw_result, folder / "verified", target))
     access_disk(comm, lambda: write_object(folder / "summary.json", content))
-    if missed := wanted.missed(best):
+    if missed := design_goal.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
     return content
 
 
 def _draw_reached(
-    drawn: Callable[[Reached | None], None], folder: Path, target: Target | None
+    draw_result: Callable[[ReachedShape | None], None], folder: Path, target: Target | None
 ) -> None:
-    drawn(reached_shape(folder, target))
+    draw_result(reached_shape(folder, target))
 
 
-def _optimised(made: Design) -> tuple[Evaluation, Evaluation, Array, str]:
+def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Array, str]:
     """The first evaluation, the best one with its variables, and why the optimiser ended."""
-    vary, wanted, iterations = made.variables, made.wanted, made.wanted.section.iterations
-    targets = [*wanted.stages, wanted.targets]
-    made.begin(0, targets)
-    first, x = made(vary.first), vary.first
+    vary, goal, iterations = search.variables, search.goal, search.goal.section.iterations
+    targets = [*goal.stages, goal.targets]
+    search.begin(0, targets)
+    first, x = search(vary.start_values), vary.start_values
     if not first.values:
         raise Missed(f"the case itself has no result to start from: {first.note}")
-    wanted.begin(first)
+    goal.begin(first)
     idle = _without_influence(vary, first)
     for name in idle:
-        made.say(
-            f"warning: {name} has no influence on {', '.join(wanted.results)} where the design starts"
+        search.say(
+            f"warning: {name} has no influence on {', '.join(goal.results)} where the design starts"
         )
     if len(idle) == len(vary.blocks):
         raise Missed(
-            f"no variable has an influence on {', '.join(wanted.results)} where the design starts"
+            f"no variable has an influence on {', '.join(goal.results)} where the design starts"
         )
     for stage in range(len(targets)):
         if stage:
-            made.begin(stage, targets)
-            wanted.begin(made(x))
+            search.begin(stage, targets)
+            goal.begin(search(x))
         last = stage == len(targets) - 1
-        ended = searched(made, wanted, vary, x, iterations if last else -(-iterations // WAY))
-        assert made.best
-        x, best = made.best
+        ended = search_optimum(
+            search, goal, vary, x, iterations if last else -(-iterations // STAGES_PART)
+        )
+        assert search.best
+        x, best = search.best
     return first, best, x, ended
 
 
-def _without_influence(vary: Variables, first: Evaluation) -> list[str]:
+def _without_influence(vary: Variables, first: DesignEvaluation) -> list[str]:
     """The variables that change no result."""
     slopes = np.array([first.gradients[result] for result in first.values])
     size = np.array([abs(value) or 1.0 for value in first.values.values()])
     strongest = (np.abs(slopes) / size[:, None]).max(axis=0)
-    return [name for name, part in vary.blocks.items() if strongest[part].max() < NOTHING]
+    return [
+        name for name, part in vary.blocks.items() if strongest[part].max() < INFLUENCE_TOLERANCE
+    ]
 
 
-def _write_best(made: Design, x: Array, file: Path) -> None:
+def _write_best(search: Design, x: Array, file: Path) -> None:
     """The best case as a file that `magshell run` takes, and its remanence beside it."""
-    folder, data = made.folder, made.variables.data(x, "best.csv")
-    made.variables.write(x, folder / "best.csv")
+    folder, data = search.folder, search.variables.data(x, "best.csv")
+    search.variables.write(x, folder / "best.csv")
     _from_here(data, file.parent.absolute(), folder.absolute())
     text = f"# The best case of a design: {file.name}\n" + yaml.safe_dump(data, sort_keys=False)
     write_whole(folder / "best.yaml", text.encode())
@@ -330,48 +362,52 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
         _from_here(value, old, new)
 
 
-def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, Any]:
+def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dict[str, Any]:
     """The results of best.yaml by `run` into verified/, and what its excluded modes say;
     collective.
     """
-    wanted, say, file, settings = made.wanted, made.say, made.folder / "best.yaml", list[str]()
+    goal, say, file, settings = search.goal, search.say, search.folder / "best.yaml", list[str]()
 
     def best_case() -> Case:
-        return made.variables.made(on_first_rank(comm, lambda: read_source(file, settings)))
+        return search.variables.make_case(on_first_rank(comm, lambda: read_source(file, settings)))
 
     case = best_case()
     if case.several or case.shell.geometry != "mesh":
-        settings = [f"mesh.refinement={case.mesh.refinement * wanted.section.verify:.6g}"]
+        settings = [f"mesh.refinement={case.mesh.refinement * goal.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"
     result = run(
-        case.problem(), made.folder / "verified", comm, overwrite=True
+        case.problem(), search.folder / "verified", comm, overwrite=True
     )  # the folder is the design's
-    values = {name: _value(result, name) for name in wanted.results if name not in wanted.targets}
-    seen = dict[str, float]()
-    for target in wanted.targets.values():
-        seen["rms_distance"], seen[DISTANCE] = distances(result.scene, result.last, target)
-    for name, value in (values | seen).items():
+    values = {name: _value(result, name) for name in goal.results if name not in goal.targets}
+    extra_results = dict[str, float]()
+    for target in goal.targets.values():
+        extra_results["rms_distance"], extra_results[DISTANCE] = distances(
+            result.scene, result.last, target
+        )
+    for name, value in (values | extra_results).items():
         designed = best.values.get(name, best.seen.get(name))
         if value is None:
             say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
         elif designed is not None:
-            away = value / designed - 1
+            relative_difference = value / designed - 1
             say(
-                f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {designed:.9g}"
+                f"verified ({how}): {name} = {value:.9g}, {_difference_words(relative_difference)} "
+                f"the design's {designed:.9g}"
             )
-            if abs(away) > FAR:
+            if abs(relative_difference) > OTHER_RESULT_DIFFERENCE:
                 say(
-                    f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria"
+                    f"warning: {name} is another one there: the mesh is too coarse, or there are "
+                    "several equilibria"
                 )
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
-    if modes and not any(name in FOLDS for name in wanted.results):
+    if modes and not any(name in FOLDS for name in goal.results):
         say(f"warning: the run sees modes that the design did not: {', '.join(modes)}")
     excluded = int(result.rows[-1]["excluded_pivots"]) if result.rows else 0
     return {
         "settings": settings,
         **values,
-        **seen,
+        **extra_results,
         "excluded_modes": modes,
         "excluded_pivots": excluded,
     }
@@ -394,19 +430,21 @@ def _value(result: Result, name: str) -> float | None:
     row = result.rows[-1]
     try:
         omega2 = vibration_at_end(result.scene, result.path_history, name)
-    except Lost:
+    except LostResult:
         return None
     return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2
 
 
-def _beside(away: float) -> str:
+def _difference_words(relative_difference: float) -> str:
     """A relative difference in words.
 
     Examples
     --------
-    >>> _beside(-3.19e-8), _beside(1.62e-2), _beside(-8.9e-15)
+    >>> _difference_words(-3.19e-8), _difference_words(1.62e-2), _difference_words(-8.9e-15)
     ('3.2e-06 % below', '1.6 % above', 'equal to')
     """
-    if abs(away) < ROUNDING:
+    if abs(relative_difference) < ROUNDING:
         return "equal to"
-    return f"{100 * abs(away):.2g} % {'above' if away > 0 else 'below'}"
+    return (
+        f"{100 * abs(relative_difference):.2g} % {'above' if relative_difference > 0 else 'below'}"
+    )

@@ -16,7 +16,7 @@ from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 Limits = tuple[float | None, float | None]
-Found = Mapping[str, Any]  # the gradients of a result, numbers and those by fields
+GradientsByName = Mapping[str, Any]  # the gradients of a result, numbers and those by fields
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Bounded:
     bounds: tuple[float, float]
 
     @property
-    def first(self) -> Array:
+    def start_values(self) -> Array:
         """The variables at the start."""
         return np.asarray((self.start - self.bounds[0]) / (self.bounds[1] - self.bounds[0])).ravel()
 
@@ -52,7 +52,7 @@ class Bounded:
 
 
 @dataclass(frozen=True)
-class Number(Bounded):
+class NumberVariable(Bounded):
     """A number of the case, in a unit."""
 
     unit: str
@@ -62,7 +62,7 @@ class Number(Bounded):
         """The key with its unit, if it has one."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
-    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
+    def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
         slope = gradients.get(self.name, 0.0)
         return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
 
@@ -79,14 +79,16 @@ class Number(Bounded):
         )
 
 
-def by_components(scene: Scene, by: FieldGradient) -> Array:
+def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
     """The derivatives by the components of the remanence at its points; collective."""
     loads = scene.problem.loads
     magnetic = loads.magnetic or loads.remanence
     assert magnetic
     assert isinstance(magnetic.remanent, ByControls)
     return np.asarray(
-        by.field.function_space.mesh.comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
+        field_gradient.field.function_space.mesh.comm.allreduce(
+            magnetic.remanent.pulled(field_gradient.places, field_gradient.forces)
+        )
     )
 
 
@@ -121,9 +123,9 @@ class Vectors:
         return len(self.start) * (1 if self.planar else 2)
 
     @property
-    def first(self) -> Array:
-        across = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
-        parts = [np.arctan2(across, self.start[:, -1])]
+    def start_values(self) -> Array:
+        horizontal = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
+        parts = [np.arctan2(horizontal, self.start[:, -1])]
         if not self.planar:
             parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
         if self.lengths:
@@ -141,47 +143,53 @@ class Vectors:
         """At the points, (n, 3) or (n, 2)."""
         return self._polar(x)[0]
 
-    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
-        if not isinstance(by := gradients.get(self.name), FieldGradient):
+    def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
+        if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
-        forces = by_components(scene, by)
-        return np.concatenate([np.sum(forces * way, axis=1) for way in self._polar(x)[1]])
+        forces = by_components(scene, field_gradient)
+        return np.concatenate(
+            [np.sum(forces * angle_derivative, axis=1) for angle_derivative in self._polar(x)[1]]
+        )
 
     def _polar(self, x: Array) -> tuple[Array, list[Array]]:
         """Vectors, and their derivatives by each of their variables."""
-        polar, *more = x.reshape(-1, len(self.start))
+        polar, *other_variables = x.reshape(-1, len(self.start))
         s, c = np.sin(polar), np.cos(polar)
         size, grows = np.linalg.norm(self.start, axis=1), 0.0
         if self.lengths:
             grows = self.lengths[1] - self.lengths[0]
-            size = self.lengths[0] + more[-1] * grows
-        one = size[:, None]
+            size = self.lengths[0] + other_variables[-1] * grows
+        lengths = size[:, None]
         if self.planar:
-            still = [] if self.controls.around else [0 * s]
-            unit, turned = (np.stack(v, axis=1) for v in ([s, *still, c], [c, *still, -s]))
-            ways = [one * turned]
+            no_component = [] if self.controls.around else [0 * s]
+            unit, polar_derivative = (
+                np.stack(v, axis=1) for v in ([s, *no_component, c], [c, *no_component, -s])
+            )
+            derivatives = [lengths * polar_derivative]
         else:
-            a, b = np.cos(more[0]), np.sin(more[0])
+            a, b = np.cos(other_variables[0]), np.sin(other_variables[0])
             unit = np.stack([s * a, s * b, c], axis=1)
-            ways = [
-                one * np.stack([c * a, c * b, -s], axis=1),
-                one * np.stack([-s * b, s * a, 0 * s], axis=1),
+            derivatives = [
+                lengths * np.stack([c * a, c * b, -s], axis=1),
+                lengths * np.stack([-s * b, s * a, 0 * s], axis=1),
             ]
-        return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
+        return lengths * unit, [*derivatives, *([grows * unit] if self.lengths else [])]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
         remanent = data["magnetic"].get("remanent") or {}
-        kept = {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
+        flux_density = (
+            {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
+        )
         data["magnetic"]["remanent"] = {
             "kind": "points",
             "file": "",
             "filter": self.controls.width,
-            **kept,
+            **flux_density,
         }
 
 
 @dataclass(frozen=True)
-class Between(Bounded):
+class ControlPointField(Bounded):
     """The values (n, components) of a scalar field at points, of which each place has the mean.
 
     They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a
@@ -200,14 +208,14 @@ class Between(Bounded):
     length: float = 1.0
     shells: Mapping[str, tuple[ShellPose, float]] = field(default_factory=dict)
 
-    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
-        if not isinstance(by := gradients.get(self.name), FieldGradient):
+    def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
+        if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
-        places = by.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
-        forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
+        places = field_gradient.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
+        forces = field_gradient.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
         if self.name == "thickness" and self.shells:
-            forces = forces * self._of_own(scene, by.forces.shape[:2])
-        comm = by.field.function_space.mesh.comm
+            forces = forces * self._shell_ratios(scene, field_gradient.forces.shape[:2])
+        comm = field_gradient.field.function_space.mesh.comm
         pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
         unit = scene.problem.material.h if self.name == "deviation" else 1.0
         return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
@@ -215,13 +223,13 @@ class Between(Bounded):
     def put(self, data: dict[str, Any], x: Array) -> None:
         values = self.values(x).T
         if self.name == "curvature":
-            texts = [self._formula(each, self.controls, self.length) for each in values]
+            texts = [self._formula(component, self.controls, self.length) for component in values]
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
             return
         alone = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
         of_several = {
-            name: (data["shells"][name]["shell"], *self._own(*own))
-            for name, own in self.shells.items()
+            name: (data["shells"][name]["shell"], *self._controls_on_shell(*pose_and_ratio))
+            for name, pose_and_ratio in self.shells.items()
         }
         for shell, controls, ratio in (alone | of_several).values():
             if self.name == "thickness":
@@ -231,14 +239,18 @@ class Between(Bounded):
             new = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), new]
 
-    def _own(self, place: ShellPose, ratio: float) -> tuple[Controls, float]:
+    def _controls_on_shell(self, place: ShellPose, ratio: float) -> tuple[Controls, float]:
         """The points in the frame of one of several shells, over its own length."""
-        at = self.controls.places
-        x = place.to_shell_frame(np.insert(at, 1, 0.0, axis=1) if self.controls.around else at)
-        own = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
-        return Controls(own, self.controls.width / place.scale), ratio
+        control_points = self.controls.places
+        x = place.to_shell_frame(
+            np.insert(control_points, 1, 0.0, axis=1) if self.controls.around else control_points
+        )
+        points_of_shell = (
+            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
+        )
+        return Controls(points_of_shell, self.controls.width / place.scale), ratio
 
-    def _of_own(self, scene: Scene, shape: tuple[int, ...]) -> Array:
+    def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:
         """What the thickness over h changes by (nodes of cells, 1) with the factor of each one's
         own shell.
         """
@@ -253,8 +265,10 @@ class Between(Bounded):
         """Of places, over R but for a curvature."""
         if np.ptp(values) == 0:
             return repr(float(values[0] / R))
-        below = repr(float(controls.width * R) ** 2)
-        weights = [f"exp(-({self._square(place * R)})/{below})" for place in controls.places]
+        squared_width = repr(float(controls.width * R) ** 2)
+        weights = [
+            f"exp(-({self._square(place * R)})/{squared_width})" for place in controls.places
+        ]
         parts = (f"{float(v / R)!r}*{w}" for v, w in zip(values, weights, strict=True))
         return f"({' + '.join(parts)})/({' + '.join(weights)})"
 

@@ -16,17 +16,17 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
 from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
-    BESIDE,
     FOLDS,
-    MOST,
-    Lost,
+    MAX_INSTABILITIES,
+    MAX_LOAD_RATIO,
+    LostResult,
     instabilities,
     load,
     located,
     refuse_moving,
 )
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
-from magshell_fenicsx.simulate.gradients.vibration import FIRST, adjoints_of_vibrations
+from magshell_fenicsx.simulate.gradients.vibration import FIRST_FREQUENCIES, adjoints_of_vibrations
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.scene import Scene
@@ -38,11 +38,11 @@ Array = NDArray[np.float64]
 
 DISTANCE = "largest_distance"
 WITH_MASS = ("thickness", "deviation")  # fields that the mass depends on
-LOWEST = (*FOLDS, *FIRST)  # results that others of their kind may cross
+LOWEST = (*FOLDS, *FIRST_FREQUENCIES)  # results that others of their kind may cross
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class DesignEvaluation:
     """The results of one vector of variables.
 
     Attributes
@@ -72,67 +72,78 @@ def evaluate(
     results: Sequence[str],
     targets: Mapping[str, Target],
     comm: MPI.Comm,
-    standing: Standing,
-) -> Evaluation:
+    scene_cache: Standing,
+) -> DesignEvaluation:
     """Follow the path of a case, and differentiate its results; collective.
 
     `known` is of the case before.
     """
-    lost, named = "", variables.case.design.named
+    lost_reason, named_sections = "", variables.case.design.named_results
     records, history, remarks = list[Record](), History(), list[str]()
     try:
-        scene = standing.of(case.problem(variables.smooth), comm)
+        scene = scene_cache.of(case.problem(variables.smooth), comm)
         for result in results:
             if result != MASS and result not in targets:
-                refuse_no_result(scene, [result], named[result], more=[MASS])
+                refuse_no_result(scene, [result], named_sections[result], extra_results=[MASS])
         for record in follow_alone(scene, remark=remarks.append):
             records.append(record)
             history.add(record)
             if _enough(records, results):
                 break
     except MeshError as e:
-        return Evaluation(note=f"no shell: {e}")
+        return DesignEvaluation(note=f"no shell: {e}")
     except Stopped as e:
-        lost = str(e)
-    lost = lost or next((text for text in remarks if text.startswith(BEYOND)), "")
-    made, notes = Evaluation(), [f"the path is lost: {lost}"] if lost else []
+        lost_reason = str(e)
+    lost_reason = lost_reason or next((text for text in remarks if text.startswith(BEYOND)), "")
+    evaluation, notes = (
+        DesignEvaluation(),
+        [f"the path is lost: {lost_reason}"] if lost_reason else [],
+    )
 
-    def slope(by: Mapping[str, float | FieldGradient]) -> list[float]:
-        return [float(v) for v in variables.gradient(x, scene, by)]
+    def slope(gradients: Mapping[str, float | FieldGradient]) -> list[float]:
+        return [float(v) for v in variables.gradient(x, scene, gradients)]
 
     try:
         for result in results:
             if result == MASS:
                 of_mass = mass(scene)
-                by = [name for name in variables.names if name in WITH_MASS or "shell." in name]
-                made.values[result] = of_mass.value
-                made.gradients[result] = slope(
-                    {name: derivative(of_mass, name) for name in by if of_mass.forms}
+                scalar_keys = [
+                    name for name in variables.names if name in WITH_MASS or "shell." in name
+                ]
+                evaluation.values[result] = of_mass.value
+                evaluation.gradients[result] = slope(
+                    {name: derivative(of_mass, name) for name in scalar_keys if of_mass.forms}
                 )
                 continue
-            if lost and result not in FOLDS:
-                return Evaluation(note=notes[0])
+            if lost_reason and result not in FOLDS:
+                return DesignEvaluation(note=notes[0])
             if result in LOWEST:
                 adjoints = _lowest(scene, records, result, history.begins)
                 notes.append(
                     "lowest: "
-                    + ", ".join(f"{mode or 'mode'} at {each.shown:.6g}" for mode, each in adjoints)
+                    + ", ".join(
+                        f"{mode or 'mode'} at {adjoint_of_mode.value_in_unit:.6g}"
+                        for mode, adjoint_of_mode in adjoints
+                    )
                 )
             else:
                 refuse_moving(scene, records[-1], targets.get(result, result))
                 adjoints = [adjoint_at_end(scene, history, targets.get(result, result))]
                 notes += [f"{result}: {kind}" for kind, _ in adjoints if kind]
-            (made.values[result], made.gradients[result]), *others = [
-                (each.shown, slope({name: derivative(each, name) for name in variables.names}))
-                for _, each in adjoints
+            (evaluation.values[result], evaluation.gradients[result]), *others = [
+                (
+                    adjoint_of_mode.value_in_unit,
+                    slope({name: derivative(adjoint_of_mode, name) for name in variables.names}),
+                )
+                for _, adjoint_of_mode in adjoints
             ]
             if result in LOWEST:
-                made.beside[result] = others
-    except (Lost, FoldLost) as e:
-        return Evaluation(note="; ".join([f"no {result}: {e}", *notes]))
+                evaluation.beside[result] = others
+    except (LostResult, FoldLost) as e:
+        return DesignEvaluation(note="; ".join([f"no {result}: {e}", *notes]))
     for target in targets.values():
-        made.seen[DISTANCE] = distances(scene, records[-1].point.state, target)[1]
-    return replace(made, note="; ".join(notes))
+        evaluation.seen[DISTANCE] = distances(scene, records[-1].point.state, target)[1]
+    return replace(evaluation, note="; ".join(notes))
 
 
 def _lowest(
@@ -142,7 +153,12 @@ def _lowest(
     if result in FOLDS:
         return instabilities(scene, records, result, begins=begins)
     return adjoints_of_vibrations(
-        scene, records[-1], result, beside=BESIDE, most=MOST, begins=begins
+        scene,
+        records[-1],
+        result,
+        max_ratio=MAX_LOAD_RATIO,
+        max_count=MAX_INSTABILITIES,
+        begins=begins,
     )
 
 
@@ -154,4 +170,4 @@ def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:
     (name,) = amplitudes
     assert name
     lowest = min((load(r, name) for r in located(records, name)), default=np.inf)
-    return records[-1].amplitude == name and load(records[-1], name) > BESIDE * lowest
+    return records[-1].amplitude == name and load(records[-1], name) > MAX_LOAD_RATIO * lowest

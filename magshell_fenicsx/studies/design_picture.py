@@ -15,7 +15,7 @@ from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.picture import edge_lines
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.quantities.registry import endings, quantity
-from magshell_fenicsx.studies.design_blocks import Between
+from magshell_fenicsx.studies.design_blocks import ControlPointField
 from magshell_fenicsx.studies.design_variables import Variables
 from magshell_fenicsx.studies.naming import result_words, split_unit
 
@@ -32,20 +32,20 @@ MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 
 @dataclass(frozen=True)
-class Reached:
+class ReachedShape:
     """The one that is reached, and if there is one the wanted: places (n, 3) along the middle of
     the shell.
 
     `edges`: those of the undeformed shell (m, 3), with nan between them.
     """
 
-    wanted: Array | None
-    reached: Array
+    target: Array | None
+    points: Array
     undeformed: Array
     edges: Array
 
 
-def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reached | None:
+def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> ReachedShape | None:
     """The shape at a run's last point, along the shell's nodes in the plane y = 0; None without any
     point.
     """
@@ -56,13 +56,15 @@ def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reac
         return None
     surface, _ = read_point(folder / "fields", numbers[-1])
     off = np.abs(surface.r0[:, 1])
-    at = np.flatnonzero(off <= off.min() + IN_PLANE)
-    at = at[np.argsort(surface.r0[at, 0], kind="stable")]
-    wanted, edges = (
-        target(surface.r0[at]) if target else None,
+    points_in_plane = np.flatnonzero(off <= off.min() + IN_PLANE)
+    points_in_plane = points_in_plane[np.argsort(surface.r0[points_in_plane, 0], kind="stable")]
+    target_points, edges = (
+        target(surface.r0[points_in_plane]) if target else None,
         edge_lines(replace(surface, u=0 * surface.u)),
     )
-    return Reached(wanted, (surface.r0 + surface.u)[at], surface.r0[at], edges)
+    return ReachedShape(
+        target_points, (surface.r0 + surface.u)[points_in_plane], surface.r0[points_in_plane], edges
+    )
 
 
 def draw_design(
@@ -71,14 +73,14 @@ def draw_design(
     vary: Variables,
     x: Array,
     file: Path,
-    asked: Mapping[str, float] | None = None,
-    shape: Reached | None = None,
+    target_values: Mapping[str, float] | None = None,
+    shape: ReachedShape | None = None,
 ) -> None:
     """Write the picture.
 
     Parameters
     ----------
-    asked
+    target_values
         Result -> the value that is wanted.
     shape
         The shape that is reached, if it is known.
@@ -88,7 +90,7 @@ def draw_design(
     units = dict.fromkeys(map(_unit, results))
     panels = (
         1
-        + (shape is not None and shape.wanted is not None)
+        + (shape is not None and shape.target is not None)
         + (vary.controls is not None)
         + len(vary.fields)
     )
@@ -96,18 +98,22 @@ def draw_design(
         figsize=(4.0 * panels, max(3.6, 2.1 * len(units))), dpi=160, layout="constrained"
     )
     grid = figure.add_gridspec(len(units), panels)
-    above: Any = None
+    previous_axes: Any = None
     for i, unit in enumerate(units):
-        above = figure.add_subplot(grid[i, 0], sharex=above)
+        previous_axes = figure.add_subplot(grid[i, 0], sharex=previous_axes)
         _draw_history(
-            above, rows, [result for result in results if _unit(result) == unit], unit, asked or {}
+            previous_axes,
+            rows,
+            [result for result in results if _unit(result) == unit],
+            unit,
+            target_values or {},
         )
-        above.tick_params(labelbottom=i == len(units) - 1)
-    above.set_xlabel("evaluation (line: the best so far)")
-    above.xaxis.get_major_locator().set_params(integer=True)
+        previous_axes.tick_params(labelbottom=i == len(units) - 1)
+    previous_axes.set_xlabel("evaluation (line: the best so far)")
+    previous_axes.xaxis.get_major_locator().set_params(integer=True)
     others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
-    if shape is not None and shape.wanted is not None:
-        _draw_shape(others.pop(0), shape, shape.wanted)
+    if shape is not None and shape.target is not None:
+        _draw_shape(others.pop(0), shape, shape.target)
     if vary.controls and vary.remanence:
         _draw_remanence(others[0], vary, x, shape)
     for axes, field in zip(others[len(others) - len(vary.fields) :], vary.fields, strict=True):
@@ -120,7 +126,7 @@ def _draw_history(
     rows: Sequence[dict[str, Any]],
     results: Sequence[str],
     unit: str,
-    asked: Mapping[str, float],
+    target_values: Mapping[str, float],
 ) -> None:
     """Results of one unit over the evaluations: all that were tried as faint dots, the best so far
     as a line.
@@ -134,32 +140,32 @@ def _draw_history(
         values = np.array(
             [np.nan if row[result] is None else row[result] for row in rows], dtype=float
         )
-        colour, wide = (
+        colour, line_width = (
             f"C{i}",
             1.6 + 1.6 * (len(results) - 1 - i),
         )  # lines that lie on each other are all seen
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         until = np.append(number[best], number[-1:] if best.any() else [])
-        reached = np.append(values[best], values[best][-1:])
+        best_values = np.append(values[best], values[best][-1:])
         axes.plot(
             until,
-            reached,
+            best_values,
             "-",
             drawstyle="steps-post",
             color=colour,
-            linewidth=wide,
+            linewidth=line_width,
             label=result_words(result),
         )
-        if result in asked:
-            axes.axhline(asked[result], color=colour, linestyle=":", linewidth=1)
+        if result in target_values:
+            axes.axhline(target_values[result], color=colour, linestyle=":", linewidth=1)
         if result == "shape":
             axes.set_yscale("log")
     if axes.get_yscale() == "linear":
         axes.yaxis.set_major_formatter(number_format())
-    shown = unit if unit in {"Hz", *endings().values()} else ""
-    several = shown or _common([result_words(result) for result in results])
+    unit_text = unit if unit in {"Hz", *endings().values()} else ""
+    several = unit_text or _common([result_words(result) for result in results])
     axes.set_ylabel(
-        result_words(results[0]) + (f"  ({shown})" if shown else "")
+        result_words(results[0]) + (f"  ({unit_text})" if unit_text else "")
         if len(results) == 1
         else several
     )
@@ -179,17 +185,17 @@ def _common(words: Sequence[str]) -> str:
     return heads.pop() or "results" if len(heads) == 1 else "results"
 
 
-def _draw_shape(axes: Any, shape: Reached, wanted: Array) -> None:
+def _draw_shape(axes: Any, shape: ReachedShape, target_points: Array) -> None:
     """The wanted and the reached shape from the side."""
     axes.plot(*shape.undeformed[:, ::2].T, "--", color="0.6", linewidth=0.8, label="undeformed")
-    axes.plot(*wanted[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
-    axes.plot(*shape.reached[:, ::2].T, color="C0", linewidth=1.3, label="reached")
+    axes.plot(*target_points[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
+    axes.plot(*shape.points[:, ::2].T, color="C0", linewidth=1.3, label="reached")
     axes.set(xlabel="$x/R$", ylabel="$z/R$", title="along the middle, $y = 0$")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8)
 
 
-def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: Reached | None) -> None:
+def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | None) -> None:
     """The vectors at their places on the undeformed shell and its edges, with room for the longest."""
     assert vary.controls
     places, vectors = vary.controls.places, vary.vectors(x)
@@ -197,18 +203,26 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: Reached | None)
     widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
     planar = vary.remanence is not None and vary.remanence.planar
     first, second = (0, len(names) - 1) if planar else sorted(int(i) for i in widest)
-    across, up = places[:, first], places[:, second]
-    joined = "-" if vary.controls.around or not places[:, 1:].any() else ""
-    axes.plot(across, up, joined + ".", color="0.6", markersize=3, linewidth=1)
+    horizontal, up = places[:, first], places[:, second]
+    line_style = "-" if vary.controls.around or not places[:, 1:].any() else ""
+    axes.plot(horizontal, up, line_style + ".", color="0.6", markersize=3, linewidth=1)
     if shape is not None and not vary.controls.around:
         axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
     size = ARROW * float(np.ptp(places, axis=0).max()) / longest
-    right, above = size * vectors[:, first], size * vectors[:, second]
+    right, vertical = size * vectors[:, first], size * vectors[:, second]
     axes.quiver(
-        across, up, right, above, color="C3", width=0.006, angles="xy", scale_units="xy", scale=1
+        horizontal,
+        up,
+        right,
+        vertical,
+        color="C3",
+        width=0.006,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
     )
-    axes.update_datalim(np.column_stack([across + right, up + above]))
+    axes.update_datalim(np.column_stack([horizontal + right, up + vertical]))
     axes.set(xlabel=f"${names[first]}/R$", ylabel=f"${names[second]}/R$")
     axes.set_title(r"remanence over $|B^\mathrm{r}|$, undeformed")
     axes.set_aspect("equal", adjustable="datalim")
@@ -226,24 +240,26 @@ def _unit(result: str) -> str:
     """
     if matched := re.fullmatch(r"(omega2|hertz)_\d+", result):
         return {"omega2": "omega2", "hertz": "Hz"}[matched[1]]
-    if given := split_unit(result):
-        return given[1]
-    own = {
+    if result_and_unit := split_unit(result):
+        return result_and_unit[1]
+    own_units = {
         "critical_field": quantity("lambda_m").scale,
         "barrier": quantity("energy").scale,
         "shape": "shape",
     }
-    return own.get(result) or quantity(result).scale
+    return own_units.get(result) or quantity(result).scale
 
 
-def _draw_field(axes: Any, field: Between, values: Array) -> None:
+def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
     """The values at the points: along a meridian or a strip as lines, else as colours from above."""
     places, title = field.controls.places, TITLES[field.name]
     if field.controls.around or not places[:, 1:].any():
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+        arc_length = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+        )
         for number, (line, marker) in enumerate(zip(values.T, ("o-", "s--"), strict=False), 1):
             axes.plot(
-                along,
+                arc_length,
                 line,
                 marker,
                 markersize=3,
@@ -258,8 +274,8 @@ def _draw_field(axes: Any, field: Between, values: Array) -> None:
         if values.shape[1] > 1:
             axes.legend(frameon=False, fontsize=8)
     else:
-        shown = axes.scatter(
+        points = axes.scatter(
             *places[:, :2].T, c=values[:, 0], vmin=field.bounds[0], vmax=field.bounds[1], s=14
         )
-        axes.figure.colorbar(shown, ax=axes, label=title)
+        axes.figure.colorbar(points, ax=axes, label=title)
         axes.set(xlabel="$x/R$", ylabel="$y/R$", aspect="equal")

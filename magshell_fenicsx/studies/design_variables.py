@@ -22,9 +22,15 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.studies.design_blocks import Between, Found, Limits, Number, Vectors
+from magshell_fenicsx.studies.design_blocks import (
+    ControlPointField,
+    GradientsByName,
+    Limits,
+    NumberVariable,
+    Vectors,
+)
 from magshell_fenicsx.studies.points import value_at
-from magshell_fenicsx.studies.runner import Case, Made
+from magshell_fenicsx.studies.runner import Case, MakeCase
 from magshell_fenicsx.studies.sections import DesignSection, RemanenceVariables
 
 Array = NDArray[np.float64]
@@ -42,7 +48,7 @@ class Variables:
     ----------
     case
         At the start.
-    made
+    make_case
         Makes a case of its source.
     remanence
         None if it stays as it is.
@@ -50,19 +56,19 @@ class Variables:
 
     source: Source
     case: Case
-    made: Made
-    scalars: tuple[Number, ...]
+    make_case: MakeCase
+    scalars: tuple[NumberVariable, ...]
     remanence: Vectors | None = None
-    fields: tuple[Between, ...] = ()
+    fields: tuple[ControlPointField, ...] = ()
 
     @property
-    def parts(self) -> Sequence[Number | Vectors | Between]:
+    def parts(self) -> Sequence[NumberVariable | Vectors | ControlPointField]:
         return [*self.scalars, *([self.remanence] if self.remanence else []), *self.fields]
 
     @property
     def blocks(self) -> dict[str, slice]:
         """What varies -> its variables."""
-        ends = np.cumsum([0, *(part.first.size for part in self.parts)])
+        ends = np.cumsum([0, *(part.start_values.size for part in self.parts)])
         return {part.name: slice(*ends[i : i + 2]) for i, part in enumerate(self.parts)}
 
     @property
@@ -76,22 +82,22 @@ class Variables:
         return self.remanence.controls if self.remanence else None
 
     @property
-    def first(self) -> Array:
+    def start_values(self) -> Array:
         """The vector of the case itself."""
-        return np.concatenate([part.first for part in self.parts])
+        return np.concatenate([part.start_values for part in self.parts])
 
     @property
     def smooth(self) -> list[str]:
         """Keys whose formulas are means over the distance of points: there is nothing between
         samples to look for.
         """
-        wide = [
+        smooth_fields = [
             name
-            for name, of in (self.case.design.fields.items() if self.case.design else ())
-            if of.filter is None
+            for name, field_section in (self.case.design.fields.items() if self.case.design else ())
+            if field_section.filter is None
         ]
         keys = {"thickness": THICKNESS, "curvature": "natural.curvature"}
-        return [keys[name] for name in wide if name in keys]
+        return [keys[name] for name in smooth_fields if name in keys]
 
     @property
     def limits(self) -> list[Limits]:
@@ -109,7 +115,7 @@ class Variables:
         assert self.remanence
         return self.remanence.vectors(x[self.blocks["remanence"]])
 
-    def gradient(self, x: Array, scene: Scene, gradients: Found) -> Array:
+    def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
         """A gradient by the vector from those of `simulate.gradients`; by what is not among them it
         is zero.
         """
@@ -144,10 +150,10 @@ class Variables:
     def case_of(self, x: Array, vectors: Path) -> Case:
         """The case of a vector, whose remanence is in a file."""
         data = self.data(x, str(vectors.absolute()))
-        return self.made(Source(self.source.name, data, folder=self.source.folder))
+        return self.make_case(Source(self.source.name, data, folder=self.source.folder))
 
 
-def variables(source: Source, case: Case, design: DesignSection, made: Made) -> Variables:
+def variables(source: Source, case: Case, design: DesignSection, make_case: MakeCase) -> Variables:
     """What a design varies.
 
     Raises
@@ -161,11 +167,13 @@ def variables(source: Source, case: Case, design: DesignSection, made: Made) -> 
         if not (case.shell.geometry == "strip" or remanence.controls.around):
             source = copy.deepcopy(source)
             source.data["symmetry"] = "none"
-            case = made(source)
-    return Variables(source, case, made, scalars, remanence, _fields(case, design))
+            case = make_case(source)
+    return Variables(source, case, make_case, scalars, remanence, _fields(case, design))
 
 
-def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> tuple[Number, ...]:
+def refuse_unfit_numbers(
+    source: Source, case: Case, design: DesignSection
+) -> tuple[NumberVariable, ...]:
     """The numbers of a design.
 
     Raises
@@ -177,18 +185,18 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
     for key in design.numbers:
         low, high, unit = design.bounds(key)
         try:
-            value, written = number_of(case.context, key), value_at(source.data, key.split("."))
+            value, text = number_of(case.context, key), value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
         start = value / si_size(unit)
-        if isinstance(written, str):
+        if isinstance(text, str):
             try:
-                value = in_unit(written, unit)
+                value = in_unit(text, unit)
             except ValueError:
-                said = (
-                    f"design.numbers: {key}: the case gives {written}: its bounds need such a unit"
+                message = (
+                    f"design.numbers: {key}: the case gives {text}: its bounds need such a unit"
                 )
-                raise CaseError(said) from None
+                raise CaseError(message) from None
         elif unit:
             raise CaseError(
                 f"design.numbers: {key}: is a number without a unit in the case: so are its bounds"
@@ -197,11 +205,11 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
             raise CaseError(
                 f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}"
             )
-        numbers.append(Number(key, np.array([start]), (low, high), unit))
+        numbers.append(NumberVariable(key, np.array([start]), (low, high), unit))
     return tuple(numbers)
 
 
-def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
+def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
     """The scalar fields with their points and values at the start."""
     fields, problem, several = [], case.problem(), case.several
     shells = (
@@ -218,7 +226,8 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
         )
         if name == "thickness" and varies:
             raise CaseError(
-                f"design.thickness: starts even: leave out shells.{varies[0]}.shell.thickness_factor"
+                f"design.thickness: starts even: leave out "
+                f"shells.{varies[0]}.shell.thickness_factor"
             )
         start: Array
         if name == "thickness":  # that of several shells is 1 but for their patches
@@ -230,16 +239,17 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
         low, high = section.values
         if not (low <= start.min() and start.max() <= high):
             raise CaseError(
-                f"design.{name}.values: the case starts with {start.min():g} to {start.max():g}, beyond {low:g} to "
+                f"design.{name}.values: the case starts with {start.min():g} to {start.max():g}, "
+                f"beyond {low:g} to "
                 f"{high:g}"
             )
-        at = places[:, [0, 2]] if problem.meridian else places
+        points = places[:, [0, 2]] if problem.meridian else places
         fields.append(
-            Between(
+            ControlPointField(
                 name,
                 np.asarray(start),
                 (low, high),
-                Controls(at, width),
+                Controls(points, width),
                 case.shell.reference,
                 shells,
             )
@@ -249,14 +259,16 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
 
 def _curvatures(problem: Problem, places: Array) -> Array:
     """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
-    drawn = problem.loads.natural.curvature if problem.loads.natural else None
-    if isinstance(drawn, Mapping | UserField):
+    natural_curvature = problem.loads.natural.curvature if problem.loads.natural else None
+    if isinstance(natural_curvature, Mapping | UserField):
         raise CaseError(
             "design.curvature: natural.curvature starts by patches: start from numbers or formulas"
         )
-    if callable(drawn):
-        return np.asarray(drawn(places[:, None], places[:, None])[:, 0, :2])
-    return np.tile(np.zeros(2) if drawn is None else drawn[:2], (len(places), 1))
+    if callable(natural_curvature):
+        return np.asarray(natural_curvature(places[:, None], places[:, None])[:, 0, :2])
+    return np.tile(
+        np.zeros(2) if natural_curvature is None else natural_curvature[:2], (len(places), 1)
+    )
 
 
 def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tuple[Array, float]:
@@ -274,14 +286,15 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     low, high = lengths
     if not (low - 1e-9 <= sizes.min() and sizes.max() <= high + 1e-9):
         raise CaseError(
-            f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to {sizes.max():g}, beyond "
+            f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to "
+            f"{sizes.max():g}, beyond "
             f"{low:g} to {high:g}"
         )
     return Vectors(controls, start, (low, high))
 
 
 def controls_of(
-    case: Case, count: int | None, width: float | None, where: str
+    case: Case, count: int | None, width: float | None, key: str
 ) -> tuple[Controls, Array]:
     """The points of the remanence, and its vectors there as the case has them.
 
@@ -289,18 +302,19 @@ def controls_of(
     ------
     CaseError
         If there is no remanence, or none at points where no number of points is given; it begins
-        with the key `where`.
+        with the key `key`.
     """
     magnetic = case.magnetic
-    read = case.sensors or (magnetic and magnetic.interaction != "none")
-    if magnetic is None or magnetic.remanent is None or not (case.lambda_m or read):
+    needs_space = case.sensors or (magnetic and magnetic.interaction != "none")
+    if magnetic is None or magnetic.remanent is None or not (case.lambda_m or needs_space):
         raise CaseError(
-            f"{where}: the case has no remanence in a field, of a neighbour or that a sensor reads, so no result "
+            f"{key}: the case has no remanence in a field, of a neighbour or that a sensor reads, "
+            "so no result "
             "depends on it"
         )
     if count is None:
         if not (magnetic.remanent and magnetic.remanent.file):
-            raise CaseError(f"{where}: give points, or magnetic.remanent of kind: points")
+            raise CaseError(f"{key}: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(
             magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files
         )
@@ -310,7 +324,7 @@ def controls_of(
     field = magnetisation(magnetic, case.context, 0.0, problem.within)
     if field.patches is not None:
         raise CaseError(
-            f"{where}.points: the remanence starts by patches of a mesh: start from another kind"
+            f"{key}.points: the remanence starts by patches of a mesh: start from another kind"
         )
     if callable(field.remanent):
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
@@ -330,11 +344,13 @@ def _places(case: Case, problem: Problem, count: int) -> Array:
             sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0]
         )
     if case.shell.geometry == "strip":
-        along = np.linspace(0.0, 1.0, count)
-        return np.column_stack([along, 0 * along, 0 * along])
+        parameters = np.linspace(0.0, 1.0, count)
+        return np.column_stack([parameters, 0 * parameters, 0 * parameters])
     sample = outline(case.shell).sample()
-    chosen, away = [0], np.full(len(sample), np.inf)
-    while len(chosen) < min(count, len(sample)):
-        away = np.minimum(away, np.linalg.norm(sample - sample[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(away)))
-    return np.asarray(sample[chosen])
+    chosen_points, distances = [0], np.full(len(sample), np.inf)
+    while len(chosen_points) < min(count, len(sample)):
+        distances = np.minimum(
+            distances, np.linalg.norm(sample - sample[chosen_points[-1]], axis=1)
+        )
+        chosen_points.append(int(np.argmax(distances)))
+    return np.asarray(sample[chosen_points])

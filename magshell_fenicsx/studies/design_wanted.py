@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, MOST
+from magshell_fenicsx.simulate.gradients.instabilities import MAX_INSTABILITIES, MAX_LOAD_RATIO
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design_evaluation import LOWEST, Evaluation
+from magshell_fenicsx.studies.design_evaluation import LOWEST, DesignEvaluation
 from magshell_fenicsx.studies.design_variables import Variables
-from magshell_fenicsx.studies.raised import raise_lowest
+from magshell_fenicsx.studies.max_min import raise_lowest
 from magshell_fenicsx.studies.runner import Case
 from magshell_fenicsx.studies.sections import DesignSection, LimitSection, ShapeSection
 
 Array = NDArray[np.float64]
 
-EQUAL = 1e-3  # relative difference of results that are to be the same
-KEPT = 1e-6  # a constraint counts as kept to this part of its bound
-REACHED = 1e-3  # a value counts as reached to this part of it
+EQUALITY_TOLERANCE = 1e-3  # relative difference of results that are to be the same
+CONSTRAINT_TOLERANCE = 1e-6  # a constraint counts as kept to this part of its bound
+TARGET_TOLERANCE = 1e-3  # a value counts as reached to this part of it
 WORSE = 1.0  # a lost path counts as this much worse than the worst known
-FINE = 4001  # points by which the length of a spline is measured
+SPLINE_POINTS = 4001  # points by which the length of a spline is measured
 AT_ROOT = 1e-6
 
 
@@ -41,15 +41,15 @@ class Limit:
     other: str = ""
     margin: float = 0.0
 
-    def left(self, values: Mapping[str, float]) -> float:
+    def slack(self, values: Mapping[str, float]) -> float:
         """How far it is from being broken."""
-        against = values[self.other] if self.other else self.bound
-        return self.sign * (values[self.of] - against) + self.margin
+        reference = values[self.other] if self.other else self.bound
+        return self.sign * (values[self.of] - reference) + self.margin
 
     def slope(self, gradients: Mapping[str, Sequence[float]]) -> Array:
-        """The gradient of `left`."""
-        against = np.array(gradients[self.other]) if self.other else 0.0
-        return np.asarray(self.sign * (np.array(gradients[self.of]) - against))
+        """The gradient of `slack`."""
+        reference_slope = np.array(gradients[self.other]) if self.other else 0.0
+        return np.asarray(self.sign * (np.array(gradients[self.of]) - reference_slope))
 
     @property
     def words(self) -> str:
@@ -61,9 +61,15 @@ class Limit:
 def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
     """Those of a section of a case; `scale` has the sizes of results at the start."""
     sides = ((section.least, 1.0), (section.most, -1.0))
-    limits = [Limit(section.of, sign, bound) for bound, sign in sides if bound is not None]
+    limits = [
+        Limit(section.of, sign, bound_value)
+        for bound_value, sign in sides
+        if bound_value is not None
+    ]
     if section.same_as:
-        margin = EQUAL * max(scale.get(of, 0.0) for of in (section.of, section.same_as))
+        margin = EQUALITY_TOLERANCE * max(
+            scale.get(result, 0.0) for result in (section.of, section.same_as)
+        )
         limits += [
             Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)
         ]
@@ -79,14 +85,15 @@ def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
         If a curve is wanted of another shell than a strip, or begins elsewhere than at its root.
     """
     if section.components:
-        along = [formula(text) for text in section.components]
-        return lambda x: np.stack([f(*x.T) for f in along], axis=-1)
+        components = [formula(text) for text in section.components]
+        return lambda x: np.stack([f(*x.T) for f in components], axis=-1)
     if case.shell.geometry != "strip":
         raise CaseError("design.objective.shape.curve: is of a strip; give components")
     points = np.array(section.curve)
     if np.abs(points[0]).max() > AT_ROOT:
         raise CaseError(
-            f"design.objective.shape.curve: begins at {points[0].tolist()}, but the strip's root is at 0, 0, 0"
+            f"design.objective.shape.curve: begins at {points[0].tolist()}, but the strip's root "
+            "is at 0, 0, 0"
         )
     return Curve(points, bent)
 
@@ -99,40 +106,44 @@ class Curve:
     def __init__(self, points: Array, bent: float = 1.0) -> None:
         chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         spline = scipy.interpolate.CubicSpline(chord, points)
-        fine = spline(np.linspace(0.0, chord[-1], FINE))
-        fine = fine if bent == 1.0 else _bent(fine, bent)
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
-        self._at = scipy.interpolate.CubicSpline(length / length[-1], fine / length[-1])
+        dense_points = spline(np.linspace(0.0, chord[-1], SPLINE_POINTS))
+        dense_points = dense_points if bent == 1.0 else _with_part_of_curvature(dense_points, bent)
+        length = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(dense_points, axis=0), axis=1))]
+        )
+        self._at = scipy.interpolate.CubicSpline(length / length[-1], dense_points / length[-1])
 
     def __call__(self, x: Array) -> Array:
         return np.asarray(self._at(x[:, 0])) + x[:, 1:2] * [0.0, 1.0, 0.0]
 
 
-def _bent(points: Array, part: float) -> Array:
+def _with_part_of_curvature(points: Array, part: float) -> Array:
     """The curve with the same first tangent and lengths, and a part of its curvature, in a frame
     without twist.
     """
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    directions, turned = (
+    directions, rotation = (
         [tangents[0]],
         np.eye(3),
     )  # from the frame of the curve to that of the bent one
-    for before, after in itertools.pairwise(tangents):
-        turn = np.cross(before, after)
-        angle = np.arctan2(np.linalg.norm(turn), before @ after)
+    for tangent, next_tangent in itertools.pairwise(tangents):
+        turn = np.cross(tangent, next_tangent)
+        angle = np.arctan2(np.linalg.norm(turn), tangent @ next_tangent)
         axis = turn * (angle / max(float(np.linalg.norm(turn)), 1e-300))
-        back = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
-        turned = (
-            turned @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix() @ back
+        inverse_turn = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
+        rotation = (
+            rotation
+            @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix()
+            @ inverse_turn
         )
-        directions.append(turned @ after)
+        directions.append(rotation @ next_tangent)
     return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(directions), axis=0)])
 
 
 @dataclass
-class Wanted:
+class DesignGoal:
     """What is wanted; results are scaled with their values at the start.
 
     Attributes
@@ -154,28 +165,30 @@ class Wanted:
     def results(self) -> list[str]:
         return self.section.results
 
-    def begin(self, first: Evaluation) -> None:
+    def begin(self, first: DesignEvaluation) -> None:
         """Take the scales."""
         self.scale = {result: abs(value) or 1.0 for result, value in first.values.items()}
 
-    def objective(self, evaluation: Evaluation) -> float:
+    def objective(self, evaluation: DesignEvaluation) -> float:
         """Least is best."""
         return self._objective(evaluation)[0]
 
-    def slope(self, evaluation: Evaluation) -> Array:
+    def slope(self, evaluation: DesignEvaluation) -> Array:
         """Its gradient."""
         return self._objective(evaluation)[1] * np.array(
             evaluation.gradients[self.section.objective.result]
         )
 
-    def _objective(self, evaluation: Evaluation) -> tuple[float, float]:
-        wanted = self.section.objective
-        value = min(evaluation.values[result] for result in wanted.results)
+    def _objective(self, evaluation: DesignEvaluation) -> tuple[float, float]:
+        objective = self.section.objective
+        value = min(evaluation.values[result] for result in objective.results)
         scale = self._scale or abs(value) or 1.0
-        if wanted.value is not None:
-            scale = abs(wanted.value) or scale
-            return ((value - wanted.value) / scale) ** 2, 2 * (value - wanted.value) / scale**2
-        sign = -1.0 if wanted.maximise else 1.0
+        if objective.value is not None:
+            scale = abs(objective.value) or scale
+            return ((value - objective.value) / scale) ** 2, 2 * (
+                value - objective.value
+            ) / scale**2
+        sign = -1.0 if objective.maximise else 1.0
         return sign * value / scale, sign / scale
 
     @property
@@ -190,42 +203,48 @@ class Wanted:
         """Whether the lowest of several values is to be raised: of results, instabilities or
         frequencies.
         """
-        wanted = self.section.objective
-        return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
+        objective = self.section.objective
+        return objective.maximise is not None and (
+            len(objective.results) > 1 or objective.result in LOWEST
+        )
 
     @property
     def crossed(self) -> bool:
         """Whether values are raised that others cross, which may be of any number."""
         return self.lowest and any(result in LOWEST for result in self.section.objective.results)
 
-    def lowest_values(self, evaluation: Evaluation) -> Array:
+    def lowest_values(self, evaluation: DesignEvaluation) -> Array:
         """All of them over the scale, always as many: where fewer are near, what is surely above."""
-        every = [
-            _several(evaluation.values[of], evaluation.beside.get(of))
-            for of in self.section.objective.results
+        groups = [
+            _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
+            for result in self.section.objective.results
         ]
         return np.asarray(
-            np.concatenate([[value for value, _ in several] for several in every]) / self._scale
+            np.concatenate([[value for value, _ in several] for several in groups]) / self._scale
         )
 
-    def lowest_slopes(self, evaluation: Evaluation) -> Array:
+    def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
         """(values, variables)."""
         results = self.section.objective.results
-        every = [
-            _several(evaluation.values[of], evaluation.beside.get(of), evaluation.gradients[of])
-            for of in results
+        groups = [
+            _value_and_close_ones(
+                evaluation.values[result],
+                evaluation.beside.get(result),
+                evaluation.gradients[result],
+            )
+            for result in results
         ]
         return np.asarray(
-            np.concatenate([[slope for _, slope in several] for several in every]) / self._scale
+            np.concatenate([[slope for _, slope in several] for several in groups]) / self._scale
         )
 
-    def constraints(self, evaluation: Evaluation) -> Array:
+    def constraints(self, evaluation: DesignEvaluation) -> Array:
         """Not negative where all are kept."""
         return np.array(
-            [limit.left(evaluation.values) / self._size(limit) for limit in self._limits]
+            [limit.slack(evaluation.values) / self._size(limit) for limit in self._limits]
         )
 
-    def constraint_slopes(self, evaluation: Evaluation) -> Array:
+    def constraint_slopes(self, evaluation: DesignEvaluation) -> Array:
         """(constraints, variables)."""
         return np.array(
             [limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits]
@@ -235,70 +254,77 @@ class Wanted:
     def _limits(self) -> list[Limit]:
         """Of all constraints."""
         return [
-            each for section in self.section.constraints for each in limits_of(section, self.scale)
+            limit
+            for section in self.section.constraints
+            for limit in limits_of(section, self.scale)
         ]
 
     def _size(self, limit: Limit) -> float:
         return (
             abs(limit.bound)
-            or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other))
+            or max(self.scale.get(result, 0.0) for result in (limit.of, limit.other))
             or 1.0
         )
 
-    def violation(self, evaluation: Evaluation) -> float:
+    def violation(self, evaluation: DesignEvaluation) -> float:
         """By how much the constraints are not kept, relative."""
         return float(max([0.0, *(-self.constraints(evaluation))]))
 
-    def merit(self, evaluation: Evaluation) -> tuple[float, float]:
+    def merit(self, evaluation: DesignEvaluation) -> tuple[float, float]:
         """By what evaluations are compared: least is best."""
         violation = self.violation(evaluation)
-        return (violation if violation > KEPT else 0.0, self.objective(evaluation))
+        return (violation if violation > CONSTRAINT_TOLERANCE else 0.0, self.objective(evaluation))
 
-    def words(self, evaluation: Evaluation) -> str:
+    def words(self, evaluation: DesignEvaluation) -> str:
         """The results of an evaluation."""
         return ", ".join(
             f"{key} = {value:.6g}" for key, value in (evaluation.values | evaluation.seen).items()
         )
 
-    def missed(self, evaluation: Evaluation) -> str:
+    def missed(self, evaluation: DesignEvaluation) -> str:
         """What is not as wanted; empty if all is."""
-        wanted, said = self.section.objective, list[str]()
-        if wanted.value is not None and wanted.reach:
-            value = evaluation.values[wanted.reach]
-            if abs(value - wanted.value) > REACHED * (abs(wanted.value) or 1.0):
-                asked = f"{wanted.reach} = {wanted.value:g} is not reached within the bounds"
-                said.append(f"{asked}: the nearest found is {value:.6g}")
-        for limit in self._limits:
-            if limit.left(evaluation.values) < -KEPT * self._size(limit):
-                said.append(
-                    f"{limit.words} is not kept: the nearest found is {evaluation.values[limit.of]:.6g}"
+        objective, sentences = self.section.objective, list[str]()
+        if objective.value is not None and objective.reach:
+            value = evaluation.values[objective.reach]
+            if abs(value - objective.value) > TARGET_TOLERANCE * (abs(objective.value) or 1.0):
+                request = (
+                    f"{objective.reach} = {objective.value:g} is not reached within the bounds"
                 )
-        return "; ".join(said)
+                sentences.append(f"{request}: the nearest found is {value:.6g}")
+        for limit in self._limits:
+            if limit.slack(evaluation.values) < -CONSTRAINT_TOLERANCE * self._size(limit):
+                sentences.append(
+                    f"{limit.words} is not kept: the nearest found is "
+                    f"{evaluation.values[limit.of]:.6g}"
+                )
+        return "; ".join(sentences)
 
 
-def _several(
-    value: float, beside: Sequence[tuple[float, list[float]]] | None, slope: Sequence[float] = ()
+def _value_and_close_ones(
+    value: float,
+    close_values: Sequence[tuple[float, list[float]]] | None,
+    slope: Sequence[float] = (),
 ) -> list[tuple[float, Sequence[float]]]:
     """A result and those beside it with their slopes: MOST of what may cross others, else one."""
-    if beside is None:
+    if close_values is None:
         return [(value, slope)]
-    above = (BESIDE * value, [BESIDE * v for v in slope])
-    return [(value, slope), *beside, *[above] * MOST][:MOST]
+    upper_value = (MAX_LOAD_RATIO * value, [MAX_LOAD_RATIO * v for v in slope])
+    return [(value, slope), *close_values, *[upper_value] * MAX_INSTABILITIES][:MAX_INSTABILITIES]
 
 
-def wanted_of(case: Case, section: DesignSection) -> Wanted:
+def design_goal_of(case: Case, section: DesignSection) -> DesignGoal:
     """What the section of a case wants."""
     shape = section.objective.shape
     if shape is None:
-        return Wanted(section, {})
+        return DesignGoal(section, {})
     parts = [(i + 1) / shape.stages for i in range(shape.stages)]
     *stages, last = [{"shape": target_of(shape, case, part)} for part in parts]
-    return Wanted(section, last, stages)
+    return DesignGoal(section, last, stages)
 
 
-def searched(
-    evaluated: Callable[[Array], Evaluation],
-    goal: Wanted,
+def search_optimum(
+    evaluated: Callable[[Array], DesignEvaluation],
+    goal: DesignGoal,
     vary: Variables,
     first: Array,
     iterations: int,
@@ -307,28 +333,31 @@ def searched(
     if goal.crossed:
         return raise_lowest(evaluated, goal, vary.limits, first, iterations)
     if goal.lowest:
-        return _raised(evaluated, goal, vary, first, iterations)
+        return _raise_lowest_smooth(evaluated, goal, vary, first, iterations)
     tried: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
         evaluation = evaluated(x)
         if not evaluation.values:
-            away = x - min(tried, key=lambda each: each[1])[0]
-            uphill = np.asarray(away / max(float(np.linalg.norm(away)), 1e-300))
+            direction = x - min(tried, key=lambda evaluated_point: evaluated_point[1])[0]
+            uphill = np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
             return max(value for _, value in tried) + WORSE, uphill
         value = goal.objective(evaluation)
         tried.append((np.array(x), value))
         return value, goal.slope(evaluation)
 
-    def kept(x: Array) -> Array:
+    def constraint_values(x: Array) -> Array:
         return goal.constraints(last(x)[0])
 
-    def kept_slopes(x: Array) -> Array:
+    def constraint_gradients(x: Array) -> Array:
         return goal.constraint_slopes(last(x)[0])
 
     last, how = _last_known(evaluated), dict[str, Any]()
     if goal.section.constraints:
-        how = {"method": "SLSQP", "constraints": {"type": "ineq", "fun": kept, "jac": kept_slopes}}
+        how = {
+            "method": "SLSQP",
+            "constraints": {"type": "ineq", "fun": constraint_values, "jac": constraint_gradients},
+        }
     options = (
         {"maxiter": iterations, "ftol": 1e-9}
         if how
@@ -341,9 +370,9 @@ def searched(
     return str(ended.message)
 
 
-def _raised(
-    evaluated: Callable[[Array], Evaluation],
-    goal: Wanted,
+def _raise_lowest_smooth(
+    evaluated: Callable[[Array], DesignEvaluation],
+    goal: DesignGoal,
     vary: Variables,
     first: Array,
     iterations: int,
@@ -354,7 +383,7 @@ def _raised(
     """
     last = _last_known(evaluated)
 
-    def above(z: Array) -> Array:
+    def values_above_level(z: Array) -> Array:
         evaluation, converged = last(z[:-1])
         values: Array = np.concatenate(
             [goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)]
@@ -376,22 +405,22 @@ def _raised(
         jac=True,
         method="SLSQP",
         bounds=[*vary.limits, (None, None)],
-        constraints={"type": "ineq", "fun": above, "jac": slopes},
+        constraints={"type": "ineq", "fun": values_above_level, "jac": slopes},
         options={"maxiter": iterations, "ftol": 1e-7},
     )
     return str(ended.message)
 
 
 def _last_known(
-    evaluated: Callable[[Array], Evaluation],
-) -> Callable[[Array], tuple[Evaluation, bool]]:
+    evaluated: Callable[[Array], DesignEvaluation],
+) -> Callable[[Array], tuple[DesignEvaluation, bool]]:
     """What evaluates a vector; of a lost path the last one that is known, and False."""
-    last: list[Evaluation] = []
+    last: list[DesignEvaluation] = []
 
-    def at(x: Array) -> tuple[Evaluation, bool]:
+    def evaluate_or_last(x: Array) -> tuple[DesignEvaluation, bool]:
         evaluation = evaluated(x)
         if evaluation.values:
             last[:] = [evaluation]
         return last[0], bool(evaluation.values)
 
-    return at
+    return evaluate_or_last

@@ -35,14 +35,14 @@ from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
     FAILED,
     Folder,
-    Made,
+    MakeCase,
     Outcome,
     Say,
     compute,
     keep_outcome,
-    kept_outcome,
     outcome_of,
     part_of,
+    stored_outcome_of_case,
 )
 from magshell_fenicsx.studies.samples import Sample, make_samples
 from magshell_fenicsx.studies.statistics import (
@@ -77,7 +77,7 @@ def ensemble(
     *,
     samples: int,
     seed: int,
-    made: Made,
+    make_case: MakeCase,
     result: str = "knockdown",
     out: Path | str = "results/ensemble",
     part: str | None = None,
@@ -91,7 +91,7 @@ def ensemble(
 
     Parameters
     ----------
-    made
+    make_case
         Makes a case of its source.
     result
         As of `magshell study`: knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or
@@ -122,18 +122,21 @@ def ensemble(
     scalar, numbers = parse_scalar(result), _numbers(samples, seed, part)
     ending = f"_{part.replace('/', '_of_')}" if part else ""
 
-    def drawn() -> list[list[Sample]]:
+    def drawn_samples() -> list[list[Sample]]:
         source = read_source(Path(file), settings)
         return [
-            make_samples(source, seed, numbers, made, less) for less in sorted({0, delete_weakest})
+            make_samples(source, seed, numbers, make_case, deleted)
+            for deleted in sorted({0, delete_weakest})
         ]
 
-    variants = on_first_rank(comm, drawn)
-    every = {sample.key: sample for variant in variants for sample in variant}
+    variants = on_first_rank(comm, drawn_samples)
+    samples_by_key = {sample.key: sample for variant in variants for sample in variant}
     folder, name = user_folder(out), Path(file).name
     parts = [Path(place) for place in merge]
     if resume or merge:
-        access_disk(comm, lambda: _refuse_strange(parts or [folder], every, merge=bool(merge)))
+        access_disk(
+            comm, lambda: _refuse_strange(parts or [folder], samples_by_key, merge=bool(merge))
+        )
     tables = (
         f"summary{ending}.json",
         f"samples{ending}.csv",
@@ -142,33 +145,37 @@ def ensemble(
     )
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
-        access_disk(comm, lambda: _copy(every, parts, folder))
+        access_disk(comm, lambda: _copy(samples_by_key, parts, folder))
     missing = (
         []
         if merge
-        else access_disk(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
+        else access_disk(
+            comm, lambda: [key for key in samples_by_key if not _is_known(folder, key, scalar)]
+        )
     )
     if comm.rank == 0:
         ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
-        say(f"{len(every)} samples, {len(missing)} to compute on {ranks}")
+        say(f"{len(samples_by_key)} samples, {len(missing)} to compute on {ranks}")
     folds = KnownFolds()
 
     def sample_computed(key: str) -> Iterator[str]:
-        sample = every[key]
+        sample = samples_by_key[key]
         outcome = solve(sample, scalar, folds)
         keep_outcome(outcome, sample.case, _file(folder, key))
         value = outcome.value(scalar)
-        said = (
+        outcome_text = (
             f"no {scalar.name}"
             if value is None
             else f"{scalar.name} = {value:.9g} ({outcome.found})"
         )
         why = f", {outcome.stopped}" if outcome.stopped else ""
         place = f"{missing.index(key) + 1:5d}/{len(missing)}"
-        yield f"{place}  sample {sample.number}: {said}{why}, {outcome.cpu_s:.1f} s CPU"
+        yield f"{place}  sample {sample.number}: {outcome_text}{why}, {outcome.cpu_s:.1f} s CPU"
 
     compute(missing, sample_computed, comm, say)
-    rows = [_row(each, folder, scalar) for each in zip(*variants, strict=True)]
+    rows = [
+        _row(sample_variants, folder, scalar) for sample_variants in zip(*variants, strict=True)
+    ]
     content = {
         "case": name,
         "settings": list(settings),
@@ -202,7 +209,7 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
     """Whether the folder has a usable outcome; an error may have been of the machine, and is tried
     again.
     """
-    outcome = kept_outcome(_file(folder, key))
+    outcome = stored_outcome_of_case(_file(folder, key))
     return bool(
         outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED)
     )
@@ -214,16 +221,19 @@ def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge
     """
     for place in places:
         points = place / "points"
-        begun = not merge and points.is_dir() and not any(points.glob("*.json"))
-        if not begun and not any(kept_outcome(_file(place, key)) for key in keys):
+        interrupted = not merge and points.is_dir() and not any(points.glob("*.json"))
+        if not interrupted and not any(stored_outcome_of_case(_file(place, key)) for key in keys):
             raise CaseError(
-                f"{place}: has no sample of this ensemble that these sources computed: look at case, --seed and --set"
+                f"{place}: has no sample of this ensemble that these sources computed: look at "
+                "case, --seed and --set"
             )
 
 
 def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> None:
     for key in keys:
-        source = next((file for place in places if kept_outcome(file := _file(place, key))), None)
+        source = next(
+            (file for place in places if stored_outcome_of_case(file := _file(place, key))), None
+        )
         if source and source.resolve() != _file(folder, key).resolve():
             write_whole(_file(folder, key), source.read_bytes())
 
@@ -233,7 +243,8 @@ def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
     result of that.
     """
     rows = [
-        make_row(sample, kept_outcome(_file(folder, sample.key)), scalar) for sample in variants
+        make_row(sample, stored_outcome_of_case(_file(folder, sample.key)), scalar)
+        for sample in variants
     ]
     row = rows[0]
     if len(rows) > 1:
@@ -278,20 +289,22 @@ def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
 
 def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     """The fold from the first point of the path that leads to it, or the end of the path."""
-    result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
+    result, row_maker, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
-            result.rows.append(made.row(record, 0.0))
+            result.rows.append(row_maker.row(record, 0.0))
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue
-            guess = FoldGuess(record.point.state, record.point.du) if record.label == "fold" else None
+            guess = (
+                FoldGuess(record.point.state, record.point.du) if record.label == "fold" else None
+            )
             if record.label == "step" and tries and not record.point.negative_pivots:
                 guess = fold_ahead(scene.newton, record.point, "pressure")
                 tries -= guess is not None
             if guess is None:
                 continue
             try:
-                fold = folds.polished(sample.values, scene, guess)
+                fold = folds.refined(sample.values, scene, guess)
             except FoldLost:
                 continue
             if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:

@@ -19,7 +19,7 @@ from magshell_fenicsx.studies.statistics import (
 
 Array = NDArray[np.float64]
 KNOCKDOWN = r"knockdown factor  $k_\mathrm{d}$"
-FEW = 20  # samples: of fewer each is shown, no histogram
+MIN_SAMPLES_FOR_HISTOGRAM = 20  # samples: of fewer each is shown, no histogram
 TAIL = 1e-3  # probability of the lowest value that a fitted curve shows
 
 
@@ -37,17 +37,19 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     strongest = max(
         correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None
     )
-    fitted = fit(values) if len(values) else None
-    with_density = fitted is not None or len(values) >= FEW  # marks alone have none
+    weibull = fit(values) if len(values) else None
+    with_density = (
+        weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
+    )  # marks alone have none
     panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
     *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]
     others = figure.axes[1 + with_density :]
     if density:
         density[0].set(xlabel=label, ylabel="probability density")
-        _draw_density(density[0], values, fitted)
+        _draw_density(density[0], values, weibull)
     if len(values):
-        _draw_function(function, values, results(rows, WITHOUT), fitted)
+        _draw_function(function, values, results(rows, WITHOUT), weibull)
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
     if strongest:
         _draw_correlation(others[0], rows, strongest[0], label)
@@ -56,16 +58,16 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     figure.savefig(file)
 
 
-def _places(values: Array, fitted: Weibull) -> Array:
+def _places(values: Array, weibull: Weibull) -> Array:
     """Where a fitted curve is drawn: from its lowest value that is likely."""
-    least = float(values.min())
-    low = max(fitted.quantile(TAIL), least - np.ptp(values))
-    return np.linspace(min(low, least), values.max() + 0.1 * np.ptp(values), 400)
+    smallest_value = float(values.min())
+    low = max(weibull.quantile(TAIL), smallest_value - np.ptp(values))
+    return np.linspace(min(low, smallest_value), values.max() + 0.1 * np.ptp(values), 400)
 
 
-def _draw_density(density: Any, values: Array, fitted: Weibull | None) -> None:
+def _draw_density(density: Any, values: Array, weibull: Weibull | None) -> None:
     """The histogram, a mark for each sample, and Weibull's distribution."""
-    if len(values) >= FEW:
+    if len(values) >= MIN_SAMPLES_FOR_HISTOGRAM:
         density.hist(
             values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4
         )
@@ -78,13 +80,13 @@ def _draw_density(density: Any, values: Array, fitted: Weibull | None) -> None:
         clip_on=False,
         label="samples",
     )
-    if fitted:
-        x = _places(values, fitted)
-        density.plot(x, fitted.density(x), color="C3")
+    if weibull:
+        x = _places(values, weibull)
+        density.plot(x, weibull.density(x), color="C3")
     density.set_ylim(bottom=0)
 
 
-def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull | None) -> None:
+def _draw_function(function: Any, values: Array, without: Array, weibull: Weibull | None) -> None:
     """The distribution function of the samples and of Weibull's distribution."""
     ordered = np.sort(values)
     part = np.arange(len(values) + 1) / len(values)
@@ -95,14 +97,21 @@ def _draw_function(function: Any, values: Array, without: Array, fitted: Weibull
         color="C0",
         label=f"{len(values)} samples",
     )
-    if len(less := np.sort(without)):
-        part = np.arange(1, len(less) + 1) / len(less)
+    if len(values_without_weakest := np.sort(without)):
+        part = np.arange(1, len(values_without_weakest) + 1) / len(values_without_weakest)
         function.step(
-            less, part, where="post", color="C2", linewidth=1, label="without the weakest defects"
+            values_without_weakest,
+            part,
+            where="post",
+            color="C2",
+            linewidth=1,
+            label="without the weakest defects",
         )
-    if fitted:
-        x = _places(values, fitted)
-        function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
+    if weibull:
+        x = _places(values, weibull)
+        function.plot(
+            x, weibull.probability_below(x), color="C3", label=f"Weibull, shape {weibull.shape:.3g}"
+        )
     function.legend(frameon=False, fontsize=8)
 
 
@@ -134,15 +143,15 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     from scipy.stats import permutation_test, rankdata, spearmanr
 
     rho, chance = spearmanr(x, y)
-    if len(x) >= FEW or np.isnan(rho):
+    if len(x) >= MIN_SAMPLES_FOR_HISTOGRAM or np.isnan(rho):
         return float(rho), float(chance)
-    ranks, other = (rankdata(each) - (len(x) + 1) / 2 for each in (x, y))
+    ranks, other = (rankdata(sample) - (len(x) + 1) / 2 for sample in (x, y))
 
-    def together(values: Array, axis: int = -1) -> Array:
+    def correlation_words(values: Array, axis: int = -1) -> Array:
         return np.asarray(np.sum(values * other, axis=axis))
 
     tried = permutation_test(
-        (ranks,), together, permutation_type="pairings", vectorized=True, random_state=1
+        (ranks,), correlation_words, permutation_type="pairings", vectorized=True, random_state=1
     )
     return float(rho), float(tried.pvalue)
 
@@ -157,7 +166,7 @@ def words(key: str) -> str:
     >>> words("severest.amplitude")
     'amplitude over $h$ of the most severe defect'
     """
-    of, _, last = key.rpartition(".")
+    parent, _, last = key.rpartition(".")
     name, _, ending = last.rpartition("_")
     name, unit = (
         (name, "mm")
@@ -165,5 +174,5 @@ def words(key: str) -> str:
         else (last, "degrees" if last in ("polar", "azimuth") else "")
     )
     name = "amplitude over $h$" if name == "amplitude" and not unit else name.replace("_", " ")
-    whose = " of the most severe defect" if of.startswith("severest") else ""
+    whose = " of the most severe defect" if parent.startswith("severest") else ""
     return f"{name}{whose}" + (f"  ({unit})" if unit else "")

@@ -20,7 +20,7 @@ from magshell_fenicsx.studies.runner import Case
 from magshell_fenicsx.studies.samples import Values
 
 Array = NDArray[np.float64]
-KEPT = 3  # folds of one continuation, for a quadratic extrapolation
+MAX_PREDICTOR_FOLDS = 3  # folds of one continuation, for a quadratic extrapolation
 MOST_FOLDS = 20  # that are kept of earlier samples
 MOST_UNKNOWNS = 200_000  # of all kept scenes: 1 GB with their factors
 LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a jump to another fold
@@ -47,13 +47,13 @@ def fold_row(scene: Scene, fold: Fold) -> Row:
     return {**row, **scene.sizes.values(row)}
 
 
-def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
+def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
     """Reject a fold that is not the first instability under growing pressure, as far as this state
     shows.
 
     Parameters
     ----------
-    expected
+    reference_mode
         The null vector of the fold that it was continued from.
 
     Raises
@@ -62,7 +62,7 @@ def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
         If its null vector is another, it is no maximum, or the shell is unstable there in another
         direction.
     """
-    comm, a, b = scene.newton.system.comm, fold.phi, expected
+    comm, a, b = scene.newton.system.comm, fold.phi, reference_mode
     if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
@@ -72,10 +72,10 @@ def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
         raise FoldLost("another instability comes before the fold")
 
 
-def _held(scene: Scene) -> dict[str, float]:
+def _held_amplitudes(scene: Scene) -> dict[str, float]:
     """The amplitudes beside the pressure, the field in full."""
-    held = dict(scene.unloaded().mu)
-    return held | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in held else {})
+    amplitudes = dict(scene.unloaded().mu)
+    return amplitudes | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in amplitudes else {})
 
 
 class Continuation:
@@ -108,11 +108,11 @@ class Continuation:
         FoldLost
             If none is found, or if there is evidence that it is not the first instability.
         """
-        moved = [(q, self._moved(fold, scene)) for q, fold in self._known]
-        guess = predict_fold(scene.newton.system, moved, p, _held(scene))
+        transferred = [(q, self._transferred(fold, scene)) for q, fold in self._known]
+        guess = predict_fold(scene.newton.system, transferred, p, _held_amplitudes(scene))
         fold = find_fold(scene.newton, guess, "pressure")
-        refuse_later(scene, fold, moved[-1][1].phi)
-        self._known, self._scene = [*moved, (p, fold)][-KEPT:], scene
+        refuse_later(scene, fold, transferred[-1][1].phi)
+        self._known, self._scene = [*transferred, (p, fold)][-MAX_PREDICTOR_FOLDS:], scene
         return fold
 
     def from_here(self) -> "Continuation":
@@ -123,19 +123,19 @@ class Continuation:
 
     def has_mesh_of(self, scene: Scene) -> bool:
         """Whether a scene has the mesh of the last one."""
-        alike = (
+        same_model = (
             type(scene.model) is type(self._scene.model)
             and scene.problem.is_half == self._scene.problem.is_half
         )
-        return alike and same_mesh(self._scene, scene)
+        return same_model and same_mesh(self._scene, scene)
 
-    def _moved(self, fold: Fold, scene: Scene) -> Fold:
+    def _transferred(self, fold: Fold, scene: Scene) -> Fold:
         u, phi = (transfer(self._scene, scene, v) for v in (fold.state.u, fold.phi))
         return replace(fold, state=State(u, fold.state.mu), phi=phi)
 
 
 @dataclass(frozen=True)
-class _Known:
+class _StoredFold:
     """A fold without its scene: the drawn values, the nodes in the chart, displacement, pressure
     and null vector.
     """
@@ -153,10 +153,10 @@ class KnownFolds:
     """
 
     def __init__(self) -> None:
-        self._known: list[_Known] = []
+        self._known: list[_StoredFold] = []
 
-    def polished(
-        self, values: Values, scene: Scene, guess: FoldGuess, expected: Vector | None = None
+    def refined(
+        self, values: Values, scene: Scene, guess: FoldGuess, reference_mode: Vector | None = None
     ) -> Fold:
         """The fold near a guess, to 1e-9; it is kept.
 
@@ -170,10 +170,10 @@ class KnownFolds:
             If none is found, or it is not seen to be the first instability.
         """
         fold = find_fold(scene.newton, guess, "pressure")
-        refuse_later(scene, fold, fold.phi if expected is None else expected)
+        refuse_later(scene, fold, fold.phi if reference_mode is None else reference_mode)
         self._known = [
             *self._known,
-            _Known(values, chart(scene), fold.state.u, fold.value, fold.phi),
+            _StoredFold(values, chart(scene), fold.state.u, fold.value, fold.phi),
         ][-MOST_FOLDS:]
         return fold
 
@@ -183,19 +183,28 @@ class KnownFolds:
         Raises
         ------
         FoldLost
-            If no known fold is on this mesh; and see `polished`.
+            If no known fold is on this mesh; and see `refined`.
         """
-        held = _held(scene)
-        if held.keys() - {"pressure", "lambda_m"}:
+        amplitudes = _held_amplitudes(scene)
+        if amplitudes.keys() - {"pressure", "lambda_m"}:
             raise FoldLost("other amplitudes are driven before the pressure")
         nodes = chart(scene)
-        for near in sorted(self._known, key=lambda near: self._distance(values, near.values)):
-            order = matching(near.nodes, nodes) if near.nodes.shape == nodes.shape else None
+        for neighbour in sorted(
+            self._known, key=lambda neighbour: self._distance(values, neighbour.values)
+        ):
+            order = (
+                matching(neighbour.nodes, nodes) if neighbour.nodes.shape == nodes.shape else None
+            )
             if order is None:
                 continue
-            u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (near.u, near.phi))
-            return self.polished(
-                values, scene, FoldGuess(State(u, held | {"pressure": near.pressure}), phi), phi
+            u, phi = (
+                v.reshape(len(nodes), -1)[order].ravel() for v in (neighbour.u, neighbour.phi)
+            )
+            return self.refined(
+                values,
+                scene,
+                FoldGuess(State(u, amplitudes | {"pressure": neighbour.pressure}), phi),
+                phi,
             )
         raise FoldLost("no fold is known on this mesh")
 
@@ -226,7 +235,7 @@ class Scenes:
     def __init__(self) -> None:
         self._kept: dict[str, Scene] = {}
 
-    def of(self, case: Case) -> Scene:
+    def scene_of(self, case: Case) -> Scene:
         """The scene of a case, made anew if none is kept.
 
         Raises
@@ -242,7 +251,8 @@ class Scenes:
             scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene
         while (
-            sum(each.newton.system.size for each in self._kept.values()) > MOST_UNKNOWNS
+            sum(scene_in_use.newton.system.size for scene_in_use in self._kept.values())
+            > MOST_UNKNOWNS
             and len(self._kept) > 1
         ):
             self._kept.pop(next(iter(self._kept)))
@@ -253,11 +263,11 @@ def _apart_from_strength(case: Case) -> str:
     """What determines all of a scene but the size of lambda_m, which is an amplitude."""
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
-        both = (
+        has_both = (
             magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
         )  # then their ratio counts
         magnetic.pop("lambda_m", None)
-        if magnetic["remanent"] and not both:
+        if magnetic["remanent"] and not has_both:
             magnetic["remanent"].pop("flux_density", None)
         if not case.sources:  # otherwise it is that of the field beside them
             magnetic["applied"].pop("flux_density", None)

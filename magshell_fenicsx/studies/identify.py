@@ -25,9 +25,9 @@ from magshell_fenicsx.simulate.readings import Reading
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.studies.identify_data import (
     OF_POINTS,
-    Names,
+    MeasuredTable,
     Parameter,
-    Table,
+    ResultNames,
     candidate,
     parameters_of,
     table_of,
@@ -35,21 +35,21 @@ from magshell_fenicsx.studies.identify_data import (
 )
 from magshell_fenicsx.studies.identify_field import NAME, field_of, flux_density
 from magshell_fenicsx.studies.identify_picture import draw_identified
-from magshell_fenicsx.studies.identify_predicted import Predictor, varied
+from magshell_fenicsx.studies.identify_predicted import Predictor, source_with_numbers
 from magshell_fenicsx.studies.identify_programmes import Programme, programme
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.identify_words import sentences
 from magshell_fenicsx.studies.laplace import (
     NORMAL,
-    Fit,
     Measured,
     NoNoise,
     NotSeen,
-    fitted,
+    Posterior,
+    fit_posterior,
     nonlinearity,
 )
-from magshell_fenicsx.studies.points import identity, short
-from magshell_fenicsx.studies.runner import Folder, Made, Say
+from magshell_fenicsx.studies.points import identity, short_key
+from magshell_fenicsx.studies.runner import Folder, MakeCase, Say
 
 Array = NDArray[np.float64]
 FOLDER = Folder(
@@ -57,7 +57,9 @@ FOLDER = Folder(
     ("identify.json", "identify.csv", "identify.png", "remanence.csv"),
     ("case", "parameters", "predicted"),
 )
-NOTHING = 1e-9  # change of a result over that of a parameter, both relative: it has no influence
+INFLUENCE_TOLERANCE = (
+    1e-9  # change of a result over that of a parameter, both relative: it has no influence
+)
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Identified:
     """
 
     content: dict[str, Any]
-    fit: Fit
+    fit: Posterior
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -97,7 +99,7 @@ def identify(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
     *,
-    made: Made,
+    make_case: MakeCase,
 ) -> Identified:
     """Find the numbers of a case that fit measured data, and how sure they are; collective.
 
@@ -108,7 +110,7 @@ def identify(
     out
         Folder of identify.json, identify.csv (data, predictions and bands), identify.png and
         points/; of a field also remanence.csv, its vectors.
-    made
+    make_case
         Makes a case of its source, the same on all ranks.
 
     Raises
@@ -120,7 +122,7 @@ def identify(
         If the path of the case is lost.
     """
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
-    case, folder, name = made(source), user_folder(out), Path(file).name
+    case, folder, name = make_case(source), user_folder(out), Path(file).name
     section: IdentifySection | None = case.identify
     if section is None:
         raise CaseError(f"{file}: identify: is missing: it says which parameters are looked for")
@@ -128,37 +130,49 @@ def identify(
         parameters = parameters_of(source, case, section)
         field, wider = field_of(source, case, section.remanence, len(parameters))
         wider, rows, shape = on_first_rank(comm, lambda: with_shape(Path(data), wider))
-        case = made(wider)
+        case = make_case(wider)
         table = on_first_rank(comm, lambda: table_of(Path(data), case, section, rows, shape))
-        names = Names(case)
+        names = ResultNames(case)
         others = [
-            candidate(names, each, f"identify.candidates.{i}")
-            for i, each in enumerate(section.candidates)
+            candidate(names, item, f"identify.candidates.{i}")
+            for i, item in enumerate(section.candidates)
         ]
         _refuse_few(table, parameters)
-        _refuse_priors(wider, parameters, made)
+        _refuse_priors(wider, parameters, make_case)
         programmes = [
-            programme(name, wider, parameters, each, made, with_field=field is not None)
-            for name, each in section.predict.items()
+            programme(name, wider, parameters, item, make_case, with_field=field is not None)
+            for name, item in section.predict.items()
         ]
-        with FOLDER.held(folder, comm, name):
+        with FOLDER.locked(folder, comm, name):
             once: Say = say if comm.rank == 0 else lambda line: None
-            mark = identity(made(_without_predictions(wider))) + repr(
-                [each.key for each in parameters]
+            mark = identity(make_case(_without_predictions(wider))) + repr(
+                [item.key for item in parameters]
             )
             predictor = Predictor(
-                wider, made, parameters, dict(table.readings), folder, mark, comm, field, table.rows
+                wider,
+                make_case,
+                parameters,
+                dict(table.readings),
+                folder,
+                mark,
+                comm,
+                field,
+                table.rows,
             )
-            done, drawn = _identified(predictor, section, table, others, once, flux_density(case))
-            done.content.update(case=name, data=Path(data).name, settings=list(settings))
-            for each in programmes:
-                each.compute(predictor, done.fit, say)
-            access_disk(comm, lambda: _write(done, drawn, folder, predictor, programmes))
+            identified, draw_result = _fit_and_predict(
+                predictor, section, table, others, once, flux_density(case)
+            )
+            identified.content.update(case=name, data=Path(data).name, settings=list(settings))
+            for item in programmes:
+                item.compute(predictor, identified.fit, say)
+            access_disk(
+                comm, lambda: _write(identified, draw_result, folder, predictor, programmes)
+            )
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
-    for line in done.content["said"]:
+    for line in identified.content["said"]:
         once(line)
-    return done
+    return identified
 
 
 def _without_predictions(source: Source) -> Source:
@@ -167,7 +181,7 @@ def _without_predictions(source: Source) -> Source:
     return replace(source, data={**source.data, "identify": section})
 
 
-def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
+def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
     """See that there are data enough.
 
     Raises
@@ -175,22 +189,28 @@ def _refuse_few(table: Table, parameters: Sequence[Parameter]) -> None:
     CaseError
         If there are fewer than parameters without a prior, or too few to estimate their noise.
     """
-    bare = [each.key for each in parameters if np.isinf(each.deviation)]
+    bare = [parameter.key for parameter in parameters if np.isinf(parameter.deviation)]
     if len(table.data) < len(bare):
         raise CaseError(
-            f"identify.parameters: {len(table.data)} data do not determine {len(bare)} parameters without a prior "
-            f"({', '.join(bare)}): give prior and deviation of {len(bare) - len(table.data)} of them, or more data"
+            f"identify.parameters: {len(table.data)} data do not determine {len(bare)} parameters "
+            "without a prior "
+            f"({', '.join(bare)}): give prior and deviation of {len(bare) - len(table.data)} of "
+            "them, or more data"
         )
     keys = {setting.partition("=")[0] for settings in table.readings for setting in settings}
-    if both := next((each.key for each in parameters if each.key in keys), None):
-        raise CaseError(f"identify.parameters.{both}: is a column of the data, so it is known")
+    if parameter_in_data := next(
+        (parameter.key for parameter in parameters if parameter.key in keys), None
+    ):
+        raise CaseError(
+            f"identify.parameters.{parameter_in_data}: is a column of the data, so it is known"
+        )
     for number, column in enumerate(table.columns):
         count = int((table.column == number).sum())
         if np.isnan(column.noise) and count <= len(bare):
             raise _no_noise(table, number, len(bare))
 
 
-def _refuse_priors(source: Source, parameters: Sequence[Parameter], made: Made) -> None:
+def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: MakeCase) -> None:
     """See that a case may have the mean of each prior: its keys have bounds, and so have
     parameters.
 
@@ -199,35 +219,38 @@ def _refuse_priors(source: Source, parameters: Sequence[Parameter], made: Made) 
     CaseError
         With the key of the prior, and what the case says.
     """
-    for each in parameters:
-        if np.isinf(each.deviation):
+    for parameter in parameters:
+        if np.isinf(parameter.deviation):
             continue
         try:
-            made(varied(source, [each.number], np.array([each.mean])))
+            make_case(source_with_numbers(source, [parameter.number], np.array([parameter.mean])))
         except CaseError as e:
-            raise CaseError(f"identify.parameters.{each.key}.prior: {e}") from None
+            raise CaseError(f"identify.parameters.{parameter.key}.prior: {e}") from None
 
 
-def _no_noise(table: Table, column: int, parameters: int) -> CaseError:
+def _no_noise(table: MeasuredTable, column: int, parameters: int) -> CaseError:
     header, count = table.columns[column].header, int((table.column == column).sum())
     return CaseError(
-        f"identify.noise: {header}: {count} data do not say the noise beside {parameters} parameters: give it"
+        f"identify.noise: {header}: {count} data do not say the noise beside {parameters} "
+        "parameters: give it"
     )
 
 
-def _identified(
+def _fit_and_predict(
     predictor: Predictor,
     section: IdentifySection,
-    table: Table,
+    table: MeasuredTable,
     others: Sequence[tuple[Reading, str, float]],
     say: Say,
-    over: tuple[float, str],
+    flux_scale: tuple[float, str],
 ) -> tuple[Identified, Callable[[Path], None]]:
     parameters, field = predictor.parameters, predictor.field
-    numbers = field.first if field else np.zeros(0)
-    start = np.array([*(each.start for each in parameters), *numbers])
-    mean = np.array([*(each.mean for each in parameters), *numbers])
-    deviation = np.array([*(each.deviation for each in parameters), *np.full(numbers.size, np.inf)])
+    numbers = field.start_values if field else np.zeros(0)
+    start = np.array([*(parameter.start for parameter in parameters), *numbers])
+    mean = np.array([*(parameter.mean for parameter in parameters), *numbers])
+    deviation = np.array(
+        [*(parameter.deviation for parameter in parameters), *np.full(numbers.size, np.inf)]
+    )
     noise = np.array([column.noise for column in table.columns])
     measured = Measured(
         table.data, table.column, noise, mean, deviation, field.smooth if field else None
@@ -243,43 +266,50 @@ def _identified(
     _refuse_idle(np.array(first.slopes), np.array(first.values), size, parameters)
 
     def model(x: Array, *, slopes: bool = True) -> tuple[Array, Array] | None:
-        seen = predictor(x, slopes=slopes)
-        if seen.note:
-            say(f"       {_said(parameters, x)}: {seen.note}")
+        prediction = predictor(x, slopes=slopes)
+        if prediction.note:
+            say(f"       {_parameters_text(parameters, x)}: {prediction.note}")
             return None
-        return np.array(seen.values), np.array(seen.slopes)
+        return np.array(prediction.values), np.array(prediction.slopes)
 
-    def told(step: int, x: Array, misfit: float) -> None:
-        say(f"{step:5d}  misfit {misfit:.4g} of the noise squared, {_said(parameters, x)}")
+    def report_step(step: int, x: Array, misfit: float) -> None:
+        say(
+            f"{step:5d}  misfit {misfit:.4g} of the noise squared, "
+            f"{_parameters_text(parameters, x)}"
+        )
 
     try:
-        fit = fitted(model, measured, start, size, section.steps, told)
+        posterior = fit_posterior(model, measured, start, size, section.steps, report_step)
     except NotSeen as e:
-        alike = [parameters[number].key for number in e.numbers]
+        indistinguishable = [parameters[number].key for number in e.numbers]
         raise CaseError(
-            f"identify.parameters: {' and '.join(alike)} cannot be told apart by these data: give one of them a prior"
+            f"identify.parameters: {' and '.join(indistinguishable)} cannot be told apart by these "
+            "data: give one of them a prior"
         ) from None
     except NoNoise as e:
         raise _no_noise(table, e.column, len(parameters)) from None
-    bent, lost = nonlinearity(partial(model, slopes=False), fit)
-    content = _content(predictor, table, fit)
-    content["remanence"] = field.found(fit, over) if field else None
-    content["normal"] = {"difference": bent, "lost": lost, "within": NORMAL}
-    content["predicted"], content["next"] = _others(predictor, section, fit, others)
+    bent, lost_count = nonlinearity(partial(model, slopes=False), posterior)
+    content = _content(predictor, table, posterior)
+    content["remanence"] = field.summary(posterior, flux_scale) if field else None
+    content["normal"] = {"difference": bent, "lost": lost_count, "within": NORMAL}
+    content["predicted"], content["next"] = _predict_candidates(
+        predictor, section, posterior, others
+    )
     content["evaluations"] = predictor.count
     content["programmes"] = {}
-    content["said"] = sentences(content, fit, table)
-    drawn = partial(draw_identified, content, _curves(predictor, table, fit))
-    return Identified(content, fit), drawn
+    content["said"] = sentences(content, posterior, table)
+    draw_result = partial(draw_identified, content, _curves(predictor, table, posterior))
+    return Identified(content, posterior), draw_result
 
 
-def _said(parameters: Sequence[Parameter], x: Array) -> str:
-    said = [
-        f"{short(p.key)} = {v:.6g} {p.unit}".rstrip() for p, v in zip(parameters, x, strict=False)
+def _parameters_text(parameters: Sequence[Parameter], x: Array) -> str:
+    sentences = [
+        f"{short_key(p.key)} = {v:.6g} {p.unit}".rstrip()
+        for p, v in zip(parameters, x, strict=False)
     ]
     if len(x) > len(parameters):
-        said.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
-    return ", ".join(said)
+        sentences.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
+    return ", ".join(sentences)
 
 
 def _refuse_idle(
@@ -299,94 +329,99 @@ def _refuse_idle(
         (NAME, of_field.max(initial=np.inf)),
     ]
     changes = changes if of_field.size else changes[:-1]
-    if idle := [key for key, change in changes if change < NOTHING]:
+    if idle := [key for key, change in changes if change < INFLUENCE_TOLERANCE]:
         raise CaseError(
-            f"identify.parameters: {', '.join(idle)}: has no influence on these data where the case starts"
+            f"identify.parameters: {', '.join(idle)}: has no influence on these data where the "
+            "case starts"
         )
 
 
-def _content(predictor: Predictor, table: Table, fit: Fit) -> dict[str, Any]:
+def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -> dict[str, Any]:
     """What is found, as plain data."""
-    measured = fit.known
-    low, high = fit.band
-    far = fit.quantiles(np.eye(len(fit.x)))
+    measured = posterior.measured
+    low, high = posterior.band
+    quantiles = posterior.quantiles(np.eye(len(posterior.x)))
     parameters = {
         p.key: {
-            "value": float(fit.x[i]),
-            "deviation": float(fit.deviation[i]),
+            "value": float(posterior.x[i]),
+            "deviation": float(posterior.deviation[i]),
             "low": float(low[i]),
             "high": float(high[i]),
-            "quantile": float(far[i]),
+            "quantile": float(quantiles[i]),
             "unit": p.unit,
             "start": p.start,
             "prior": None if np.isinf(p.deviation) else {"mean": p.mean, "deviation": p.deviation},
         }
         for i, p in enumerate(predictor.parameters)
     }
-    spread, s = fit.spread(fit.slopes), fit.noise[table.column]
-    half = fit.quantiles(fit.slopes) * spread
-    half_measured = fit.quantiles(fit.slopes, table.column) * np.hypot(spread, s)
-    listed = [(settings, each) for settings, of in table.readings.items() for each in of]
+    spread, s = posterior.spread(posterior.slopes), posterior.noise[table.column]
+    half = posterior.quantiles(posterior.slopes) * spread
+    half_measured = posterior.quantiles(posterior.slopes, table.column) * np.hypot(spread, s)
+    listed = [
+        (settings, reading) for settings, readings in table.readings.items() for reading in readings
+    ]
     rows = [
         {
-            "result": each.of,
+            "result": reading.of,
             "column": table.columns[table.column[i]].header,
             "settings": "; ".join(settings),
-            "at": "end" if each.at is None else each.at,
+            "at": "end" if reading.at is None else reading.at,
             "measured": float(table.data[i]),
-            "predicted": float(fit.y[i]),
-            "low": float(fit.y[i] - half[i]),
-            "high": float(fit.y[i] + half[i]),
+            "predicted": float(posterior.y[i]),
+            "low": float(posterior.y[i] - half[i]),
+            "high": float(posterior.y[i] + half[i]),
             "noise": float(s[i]),
-            "low_measured": float(fit.y[i] - half_measured[i]),
-            "high_measured": float(fit.y[i] + half_measured[i]),
+            "low_measured": float(posterior.y[i] - half_measured[i]),
+            "high_measured": float(posterior.y[i] + half_measured[i]),
         }
-        for i, (settings, each) in enumerate(listed)
+        for i, (settings, reading) in enumerate(listed)
     ]
     noise = {
         column.header: {
-            "deviation": float(fit.noise[i]),
+            "deviation": float(posterior.noise[i]),
             "unit": column.unit,
             "estimated": bool(np.isnan(measured.noise[i])),
-            "degrees_of_freedom": None if np.isinf(fit.freedom[i]) else float(fit.freedom[i]),
+            "degrees_of_freedom": None
+            if np.isinf(posterior.freedom[i])
+            else float(posterior.freedom[i]),
         }
         for i, column in enumerate(table.columns)
     }
     return {
         "parameters": parameters,
-        "correlation": fit.correlation.tolist(),
-        "covariance": fit.covariance.tolist(),
+        "correlation": posterior.correlation.tolist(),
+        "covariance": posterior.covariance.tolist(),
         "noise": noise,
         "places": table.places,
         "shape": dict(table.shape),
         "missing": dict(table.missing),
-        "misfit_over_noise": float(np.sqrt(np.mean(((measured.data - fit.y) / s) ** 2))),
-        "steps": fit.steps,
-        "ended": fit.ended,
+        "misfit_over_noise": float(np.sqrt(np.mean(((measured.data - posterior.y) / s) ** 2))),
+        "steps": posterior.steps,
+        "ended": posterior.ended,
         "rows": rows,
         "sources": code_version(),
     }
 
 
-def _others(
+def _predict_candidates(
     predictor: Predictor,
     section: IdentifySection,
-    fit: Fit,
+    posterior: Posterior,
     others: Sequence[tuple[Reading, str, float]],
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
     """The candidates with their bands, and which of them narrows a parameter most."""
     if not others:
         return [], None
-    keys = [each.key for each in predictor.parameters]
-    deviations = _named(keys, fit.deviation)
-    size = np.where(fit.x != 0, np.abs(fit.x), 1.0)
+    keys = [row_or_key.key for row_or_key in predictor.parameters]
+    deviations = _deviations_by_key(keys, posterior.deviation)
+    size = np.where(posterior.x != 0, np.abs(posterior.x), 1.0)
     relative = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
-    chosen = section.narrow or (max(relative, key=relative.__getitem__) if keys else NAME)
+    narrowed_key = section.narrow or (max(relative, key=relative.__getitem__) if keys else NAME)
     rows = list[dict[str, Any]]()
     for reading, unit, noise in others:
         alone = Predictor(
             predictor.source,
-            predictor.made,
+            predictor.make_case,
             predictor.parameters,
             {(): [reading]},
             predictor.folder,
@@ -394,20 +429,20 @@ def _others(
             predictor.comm,
             predictor.field,
         )
-        seen, row = (
-            alone(fit.x),
+        prediction, row = (
+            alone(posterior.x),
             {"result": reading.of, "at": "end" if reading.at is None else reading.at, "unit": unit},
         )
         predictor.count += alone.count
-        if seen.note:
-            rows.append({**row, "note": seen.note})
+        if prediction.note:
+            rows.append({**row, "note": prediction.note})
             continue
-        slope = np.array(seen.slopes[0])
+        slope = np.array(prediction.slopes[0])
         value, half = (
-            seen.values[0],
-            float((fit.quantiles(slope[None]) * fit.spread(slope[None]))[0]),
+            prediction.values[0],
+            float((posterior.quantiles(slope[None]) * posterior.spread(slope[None]))[0]),
         )
-        narrowed = _named(keys, fit.narrowed(slope, noise))
+        narrowed = _deviations_by_key(keys, posterior.narrowed(slope, noise))
         low, high = value - half, value + half
         rows.append(
             {
@@ -419,56 +454,64 @@ def _others(
                 "deviations_then": narrowed,
             }
         )
-    there = [each for each in rows if "value" in each]
-    if not there:
+    predicted_rows = [row_or_key for row_or_key in rows if "value" in row_or_key]
+    if not predicted_rows:
         return rows, None
-    best = min(there, key=lambda each: each["deviations_then"][chosen])
-    how = {"parameter": chosen, "from": deviations[chosen], "to": best["deviations_then"][chosen]}
+    best = min(predicted_rows, key=lambda row_or_key: row_or_key["deviations_then"][narrowed_key])
+    how = {
+        "parameter": narrowed_key,
+        "from": deviations[narrowed_key],
+        "to": best["deviations_then"][narrowed_key],
+    }
     return rows, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
 
 
-def _named(keys: Sequence[str], deviations: Array) -> dict[str, float]:
+def _deviations_by_key(keys: Sequence[str], deviations: Array) -> dict[str, float]:
     """Deviations by keys; of a field their root mean square."""
     of_field = deviations[len(keys) :]
-    own = {NAME: float(np.sqrt(np.mean(of_field**2)))} if of_field.size else {}
-    return {key: float(v) for key, v in zip(keys, deviations, strict=False)} | own
+    field_deviation = {NAME: float(np.sqrt(np.mean(of_field**2)))} if of_field.size else {}
+    return {key: float(v) for key, v in zip(keys, deviations, strict=False)} | field_deviation
 
 
-def _curves(predictor: Predictor, table: Table, fit: Fit) -> dict[str, list[tuple[float, float]]]:
+def _curves(
+    predictor: Predictor, table: MeasuredTable, posterior: Posterior
+) -> dict[str, list[tuple[float, float]]]:
     """Result -> the path at the fit, as far as data go."""
-    seen, curves = predictor(fit.x), dict[str, list[tuple[float, float]]]()
-    for of, curve in seen.curves.items():
-        if of.startswith(OF_POINTS):
+    prediction, curves = predictor(posterior.x), dict[str, list[tuple[float, float]]]()
+    for result, curve in prediction.curves.items():
+        if result.startswith(OF_POINTS):
             continue
         places = [
             r.at
-            for each in table.readings.values()
-            for r in each
-            if r.of == of and r.at is not None
+            for readings in table.readings.values()
+            for r in readings
+            if r.of == result and r.at is not None
         ]
         upto = next(
             (i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))),
             len(curve) - 1,
         )
-        curves[of] = curve[: upto + 1]
+        curves[result] = curve[: upto + 1]
     return curves
 
 
 def _write(
-    done: Identified,
-    drawn: Callable[[Path], None],
+    identified: Identified,
+    draw_result: Callable[[Path], None],
     folder: Path,
     predictor: Predictor,
     programmes: Sequence[Programme],
 ) -> None:
-    for each in programmes:
-        predicted = each.found(folder, done.fit, done.content["noise"])
-        done.content["programmes"][each.name] = predicted.content
-        done.content["said"] += predicted.said
+    for predicted_case in programmes:
+        predicted = predicted_case.prediction(folder, identified.fit, identified.content["noise"])
+        identified.content["programmes"][predicted_case.name] = predicted.content
+        identified.content["said"] += predicted.said
         predicted.write(folder)
-    write_object(folder / "identify.json", done.content)
-    rows = done.content["rows"]
+    write_object(folder / "identify.json", identified.content)
+    rows = identified.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")
-    drawn(folder / "identify.png")
+    draw_result(folder / "identify.png")
     if predictor.field:
-        predictor.field.write(done.fit.x[len(predictor.parameters) :], folder / "remanence.csv")
+        predictor.field.write(
+            identified.fit.x[len(predictor.parameters) :], folder / "remanence.csv"
+        )

@@ -21,12 +21,12 @@ from magshell_fenicsx.input.tables import (
 )
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
-from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
+from magshell_fenicsx.simulate.gradients.results import NamesOnlyScene, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import NAMES
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.readings import Places, Reading
 from magshell_fenicsx.simulate.results import differentiable
-from magshell_fenicsx.studies.design_blocks import Number
+from magshell_fenicsx.studies.design_blocks import NumberVariable
 from magshell_fenicsx.studies.identify_sections import Amount, CandidateSection, IdentifySection
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Case
@@ -51,7 +51,7 @@ class Parameter:
         Of its prior; without one the deviation is infinite.
     """
 
-    number: Number
+    number: NumberVariable
     mean: float
     deviation: float
 
@@ -69,7 +69,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Column:
+class MeasuredColumn:
     """A measured result: its name in the file, and in the case's unit.
 
     Attributes
@@ -85,7 +85,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class MeasuredTable:
     """What was measured.
 
     Attributes
@@ -107,7 +107,7 @@ class Table:
         Settings -> the file and line of each reading, for messages.
     """
 
-    columns: tuple[Column, ...]
+    columns: tuple[MeasuredColumn, ...]
     readings: Mapping[tuple[str, ...], list[Reading]]
     data: Array
     column: NDArray[np.int64]
@@ -117,17 +117,17 @@ class Table:
     rows: Mapping[tuple[str, ...], list[str]] = field(default_factory=dict)
 
 
-class Names:
+class ResultNames:
     """The results of a case, and what its last step prescribes, by their names in a file."""
 
     def __init__(self, case: Case) -> None:
-        self.scene = Expected(case.problem())
+        self.scene = NamesOnlyScene(case.problem())
         try:
             self.places: Places | None = Places(self.scene)
         except CaseError:
             self.places = None
 
-    def of(self, name: str, unit: str | None, where: str) -> tuple[str, str, float]:
+    def of(self, name: str, unit: str | None, location: str) -> tuple[str, str, float]:
         """The result of a name with a unit, the case's unit, and what one of that unit is in it.
 
         Raises
@@ -136,56 +136,64 @@ class Names:
             If there is no such result, or a unit is missing.
         """
         scene = self.scene
-        shown = {q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))}
-        shown |= {of: (of, of.rpartition("_")[2]) for of in SCALES} | {"hertz_1": ("hertz_1", "Hz")}
+        units_by_result = {
+            q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))
+        }
+        units_by_result |= {
+            result_name: (result_name, result_name.rpartition("_")[2]) for result_name in SCALES
+        } | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
-            strange = name not in self._bare and name not in FOLDS
-            near = next(
+            unknown = name not in self._bare and name not in FOLDS
+            nearest = next(
                 (
-                    of
-                    for of, (base, si) in shown.items()
-                    if (base == name and of.startswith(f"{name}_"))
-                    or (strange and of == f"{name}_{si}")
+                    result_name
+                    for result_name, (base, si) in units_by_result.items()
+                    if (base == name and result_name.startswith(f"{name}_"))
+                    or (unknown and result_name == f"{name}_{si}")
                 ),
                 None,
             )
-            if near and near != name:
-                raise CaseError(f"{where}: {name}: has no unit: write {name} [{shown[near][1]}]")
-            own = shown.get(name, ("", ""))[1]
+            if nearest and nearest != name:
+                raise CaseError(
+                    f"{location}: {name}: has no unit: write {name} [{units_by_result[nearest][1]}]"
+                )
+            case_unit = units_by_result.get(name, ("", ""))[1]
             result = name
             factor = 1.0
         else:
             fitting = [
-                of
-                for of in shown
-                if of == name or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", of)
+                result_name
+                for result_name in units_by_result
+                if result_name == name
+                or re.fullmatch(rf"{re.escape(name)}_[A-Za-z]\w*", result_name)
             ]
             if not fitting:
                 raise CaseError(
-                    f"{where}: {name}: has the unit {unit}, but no result of this name has one in this case"
+                    f"{location}: {name}: has the unit {unit}, but no result of this name has one "
+                    "in this case"
                 )
             result = min(fitting, key=len)
-            own = shown[result][1]
+            case_unit = units_by_result[result][1]
             try:
-                factor = column_size(name, unit, own)
+                factor = column_size(name, unit, case_unit)
             except TableError as e:
-                raise CaseError(f"{where}: {e}") from None
+                raise CaseError(f"{location}: {e}") from None
         if self.places is None or result != self.places.column:
-            refuse_no_result(scene, [result], where)
+            refuse_no_result(scene, [result], location)
             if result in SCALES:
                 refuse_unitless(scene, result)
-        return result, own, factor
+        return result, case_unit, factor
 
     @property
     def _bare(self) -> list[str]:
         scene = self.scene
-        own = [self.places.bare] if self.places else []
+        place_names = [self.places.bare] if self.places else []
         return [
-            *own,
-            *(name for name in differentiable(scene, scene.unloaded()) if name not in own),
+            *place_names,
+            *(name for name in differentiable(scene, scene.unloaded()) if name not in place_names),
         ]
 
-    def refuse_strange(self, name: str, where: str) -> None:
+    def refuse_strange(self, name: str, location: str) -> None:
         """See that a column of data may have a name, with or without its unit.
 
         Raises
@@ -193,20 +201,20 @@ class Names:
         CaseError
             If no result has it.
         """
-        units = [q.name for of in self._bare if (q := self.scene.sizes.column(of))]
+        units = [q.name for base_name in self._bare if (q := self.scene.sizes.column(base_name))]
         names = [
             *self._bare,
             *units,
             *FOLDS,
-            *(of.rpartition("_")[0] for of in FOLDS if of in SCALES),
+            *(base_name.rpartition("_")[0] for base_name in FOLDS if base_name in SCALES),
             *MOVED,
         ]
         if name not in names and not NAMES.fullmatch(name):
             raise CaseError(
-                f"{where}: {name}: the case has no such result; allowed are {', '.join(names)}"
+                f"{location}: {name}: the case has no such result; allowed are {', '.join(names)}"
             )
 
-    def amount(self, amount: Amount, of: str, where: str) -> float:
+    def amount(self, amount: Amount, result: str, location: str) -> float:
         """A number for a result, in its unit of the case.
 
         Raises
@@ -215,28 +223,32 @@ class Names:
             If its unit is missing or another one.
         """
         number, unit = number_and_unit(str(amount))
-        _, own, factor = self.of(of, None, where) if not unit else self._of_unit(of, unit, where)
-        if own and not unit and float(number):
+        _, case_unit, factor = (
+            self.of(result, None, location) if not unit else self._of_unit(result, unit, location)
+        )
+        if case_unit and not unit and float(number):
             raise CaseError(
-                f"{where}: {_text(amount)}: needs a unit, such as {_text(amount)} {own}"
+                f"{location}: {_text(amount)}: needs a unit, such as {_text(amount)} {case_unit}"
             )
         return float(number) * factor
 
-    def _of_unit(self, of: str, unit: str, where: str) -> tuple[str, str, float]:
-        result, own, _ = self.of(of, None, where)
-        if not own:
-            raise CaseError(f"{where}: {of} has no unit, so this number has none: {unit}")
+    def _of_unit(self, result_name: str, unit: str, location: str) -> tuple[str, str, float]:
+        result, case_unit, _ = self.of(result_name, None, location)
+        if not case_unit:
+            raise CaseError(
+                f"{location}: {result_name} has no unit, so this number has none: {unit}"
+            )
         try:
-            return result, own, column_size(of, unit, own)
+            return result, case_unit, column_size(result_name, unit, case_unit)
         except TableError as e:
-            raise CaseError(f"{where}: {e}") from None
+            raise CaseError(f"{location}: {e}") from None
 
 
 def _text(amount: Amount) -> str:
     return amount if isinstance(amount, str) else f"{amount:g}"
 
 
-def refuse_size(deviation: float, given: Amount, where: str) -> None:
+def refuse_size(deviation: float, text: Amount, location: str) -> None:
     """See that a standard deviation is one, whose square is a number.
 
     Raises
@@ -245,10 +257,11 @@ def refuse_size(deviation: float, given: Amount, where: str) -> None:
         If it is not positive, or out of bounds.
     """
     if not deviation > 0:
-        raise CaseError(f"{where}: must be positive, here {_text(given)}")
+        raise CaseError(f"{location}: must be positive, here {_text(text)}")
     if not 1 / MAX_MEASURED_NUMBER <= deviation <= MAX_MEASURED_NUMBER:
         raise CaseError(
-            f"{where}: {_text(given)}: allowed are numbers from {1 / MAX_MEASURED_NUMBER:g} to {MAX_MEASURED_NUMBER:g}"
+            f"{location}: {_text(text)}: allowed are numbers from {1 / MAX_MEASURED_NUMBER:g} to "
+            f"{MAX_MEASURED_NUMBER:g}"
         )
 
 
@@ -261,27 +274,30 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
         If a key has no number, or its prior another unit.
     """
     parameters = []
-    for key, given in section.parameters.items():
-        where = f"identify.parameters.{key}"
+    for key, parameter_section in section.parameters.items():
+        location = f"identify.parameters.{key}"
         try:
             number_of(case.context, key)
-            start, unit = _written(source, case, key)
+            start, unit = _number_as_written(source, case, key)
             mean, deviation = (
-                _in_unit_of(unit, amount, key) for amount in (given.prior, given.deviation)
+                _in_unit_of(unit, amount, key)
+                for amount in (parameter_section.prior, parameter_section.deviation)
             )
         except CaseError as e:
-            raise CaseError(f"{where}: {e}") from None
-        if given.deviation is not None:
-            refuse_size(deviation, given.deviation, f"{where}.deviation")
-        prior = (mean, deviation) if given.prior is not None else (start, np.inf)
-        parameters.append(Parameter(Number(key, np.array([start]), (0.0, 1.0), unit), *prior))
+            raise CaseError(f"{location}: {e}") from None
+        if parameter_section.deviation is not None:
+            refuse_size(deviation, parameter_section.deviation, f"{location}.deviation")
+        prior = (mean, deviation) if parameter_section.prior is not None else (start, np.inf)
+        parameters.append(
+            Parameter(NumberVariable(key, np.array([start]), (0.0, 1.0), unit), *prior)
+        )
     return tuple(parameters)
 
 
-def _written(source: Source, case: Case, key: str) -> tuple[float, str]:
+def _number_as_written(source: Source, case: Case, key: str) -> tuple[float, str]:
     """A number of the case as it is written, and its unit."""
-    written = value_at(source.data, key.split("."))
-    number, unit = number_and_unit(str(written))
+    text = value_at(source.data, key.split("."))
+    number, unit = number_and_unit(str(text))
     return (float(number), unit) if number else (number_of(case.context, key), "")
 
 
@@ -313,20 +329,21 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     """
     table = _rows_of(file)
     columns, units = table.columns, table.units
-    where, there = f"--data {file}", [name for name in SHAPE if name in columns]
-    if not there:
+    location, present_axes = f"--data {file}", [name for name in SHAPE if name in columns]
+    if not present_axes:
         return source, [], {}
-    if len(there) < len(SHAPE) or not any(name in columns for name in MOVED):
+    if len(present_axes) < len(SHAPE) or not any(name in columns for name in MOVED):
         raise CaseError(
-            f"{where}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} one or more"
+            f"{location}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} "
+            "one or more"
         )
     rows: list[list[float]] = [
         list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])
     ]
     for axis in SHAPE:
-        _refuse_missing(axis, columns[axis], table.lines, where)
-    chosen = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
-    shape = {chosen[tuple(row)]: row for row in rows}
+        _refuse_missing(axis, columns[axis], table.lines, location)
+    point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
+    shape = {point_names[tuple(row)]: row for row in rows}
     texts = {
         name: [
             f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)
@@ -334,8 +351,8 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
         for name, row in shape.items()
     }
     data = {**source.data, "points": {**(source.data.get("points") or {}), **texts}}
-    varied = Source(source.name, data, source.places, source.folder, source.files)
-    return varied, [chosen[tuple(row)] for row in rows], shape
+    shape_source = Source(source.name, data, source.places, source.folder, source.files)
+    return shape_source, [point_names[tuple(row)] for row in rows], shape
 
 
 def _rows_of(file: Path) -> TableRows:
@@ -345,13 +362,15 @@ def _rows_of(file: Path) -> TableRows:
         raise CaseError(f"--data {file}: {e}") from None
 
 
-def _refuse_missing(name: str, values: Array, lines: Sequence[int], where: str) -> None:
+def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: str) -> None:
     """See that a column that says what a row is of has a number in each."""
     for row in np.flatnonzero(np.isnan(values))[:1]:
-        raise CaseError(f"{where}: line {lines[row]}: {name}: has a row without a number")
+        raise CaseError(f"{location}: line {lines[row]}: {name}: has a row without a number")
 
 
-def refuse_twice(header: str, of: str, before: Mapping[str, str], where: str) -> None:
+def refuse_twice(
+    header: str, result: str, earlier_headers: Mapping[str, str], location: str
+) -> None:
     """See that a column is of another result, or key, than those before it: headers by these.
 
     Raises
@@ -359,15 +378,18 @@ def refuse_twice(header: str, of: str, before: Mapping[str, str], where: str) ->
     CaseError
         With both headers.
     """
-    alike = next((name for name in before if name == of or _one_fold(name, of)), None)
-    if alike is not None:
+    duplicate = next(
+        (name for name in earlier_headers if name == result or _one_fold(name, result)), None
+    )
+    if duplicate is not None:
         raise CaseError(
-            f"{where}: {before[alike]} and {header} are one measurement in two columns: leave one out"
+            f"{location}: {earlier_headers[duplicate]} and {header} are one measurement in two "
+            "columns: leave one out"
         )
 
 
-def _one_fold(of: str, other: str) -> bool:
-    return of in FOLDS and FOLDS[of] == FOLDS.get(other)
+def _one_fold(result: str, other: str) -> bool:
+    return result in FOLDS and FOLDS[result] == FOLDS.get(other)
 
 
 def table_of(
@@ -376,7 +398,7 @@ def table_of(
     section: IdentifySection,
     rows: Sequence[str] = (),
     shape: Mapping[str, list[float]] | None = None,
-) -> Table:
+) -> MeasuredTable:
     """The measured columns; the points of the rows and their places are those of `with_shape`.
 
     Raises
@@ -386,39 +408,45 @@ def table_of(
     """
     rows_of_file = _rows_of(file)
     columns, units = rows_of_file.columns, rows_of_file.units
-    names, where, taken = Names(case), f"--data {file}", dict[str, str]()
-    at: Array = np.full(0, np.nan)
-    keys, results = dict[str, tuple[str, Array]](), list[tuple[Column, Array]]()
+    names, location, headers_by_result = ResultNames(case), f"--data {file}", dict[str, str]()
+    place_values: Array = np.full(0, np.nan)
+    keys, results = dict[str, tuple[str, Array]](), list[tuple[MeasuredColumn, Array]]()
     places = length = ""
     for header, values in columns.items():
         parts = HEADER.fullmatch(header)
         name, unit = (parts[1], parts[2] or units[header]) if parts else (header, None)
         if "." in name:
-            refuse_twice(header, name, taken, where)
-            _refuse_missing(header, values, rows_of_file.lines, where)
-            keys[name], taken[name] = (unit or "", values), header
+            refuse_twice(header, name, headers_by_result, location)
+            _refuse_missing(header, values, rows_of_file.lines, location)
+            keys[name], headers_by_result[name] = (unit or "", values), header
             continue
         if rows and name in SHAPE:
             continue
-        moved = bool(rows) and name in MOVED
-        of, own, factor = names.of(f"{rows[0]}_{name}" if moved else name, unit, where)
-        refuse_twice(header, of, taken, where)
-        taken[of] = header
-        if names.places and of == names.places.column:
-            _refuse_missing(header, values, rows_of_file.lines, where)
-            at, places = values * factor, of
+        is_displacement = bool(rows) and name in MOVED
+        result, case_unit, factor = names.of(
+            f"{rows[0]}_{name}" if is_displacement else name, unit, location
+        )
+        refuse_twice(header, result, headers_by_result, location)
+        headers_by_result[result] = header
+        if names.places and result == names.places.column:
+            _refuse_missing(header, values, rows_of_file.lines, location)
+            place_values, places = values * factor, result
             continue
-        noise = section.noise.get(name, section.noise.get(of))
-        deviation = np.nan if noise is None else names.amount(noise, of, f"identify.noise.{name}")
-        of = of.removeprefix(rows[0]) if moved else of
-        length = own if moved else length
+        noise = section.noise.get(name, section.noise.get(result))
+        deviation = (
+            np.nan if noise is None else names.amount(noise, result, f"identify.noise.{name}")
+        )
+        result = result.removeprefix(rows[0]) if is_displacement else result
+        length = case_unit if is_displacement else length
         if noise is not None:
             refuse_size(deviation, noise, f"identify.noise.{name}")
-        results.append((Column(name, of, own, deviation), values * factor))
+        results.append((MeasuredColumn(name, result, case_unit, deviation), values * factor))
     if not results:
-        raise CaseError(f"{where}: has no column with a result of this case")
-    _refuse_unknown(section, [each for each, _ in results], where)
-    table = _listed(results, keys, at, places, section, where, rows, rows_of_file.lines)
+        raise CaseError(f"{location}: has no column with a result of this case")
+    _refuse_unknown(section, [measured_column for measured_column, _ in results], location)
+    table = _listed(
+        results, keys, place_values, places, section, location, rows, rows_of_file.lines
+    )
     sizes = (
         [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE]
         if shape
@@ -427,34 +455,37 @@ def table_of(
     return replace(
         table,
         shape={
-            name: [a * b for a, b in zip(at, sizes, strict=True)]
-            for name, at in (shape or {}).items()
+            name: [a * b for a, b in zip(place_values, sizes, strict=True)]
+            for name, place_values in (shape or {}).items()
         },
     )
 
 
-def _refuse_unknown(section: IdentifySection, columns: Iterable[Column], where: str) -> None:
-    there = {name for each in columns for name in (each.header, each.of)}
-    for key, named in (("noise", section.noise), ("changes", section.changes)):
-        if strange := next((name for name in named if name not in there), None):
+def _refuse_unknown(
+    section: IdentifySection, columns: Iterable[MeasuredColumn], location: str
+) -> None:
+    column_names = {name for column in columns for name in (column.header, column.of)}
+    for key, items in (("noise", section.noise), ("changes", section.changes)):
+        if unknown := next((name for name in items if name not in column_names), None):
             raise CaseError(
-                f"identify.{key}: {strange}: {where} has no such column, only {', '.join(sorted(there))}"
+                f"identify.{key}: {unknown}: {location} has no such column, only "
+                f"{', '.join(sorted(column_names))}"
             )
 
 
 def _listed(
-    results: list[tuple[Column, Array]],
+    results: list[tuple[MeasuredColumn, Array]],
     keys: Mapping[str, tuple[str, Array]],
-    at: Array,
+    place_values: Array,
     places: str,
     section: IdentifySection,
-    where: str,
+    location: str,
     points: Sequence[str],
     lines: Sequence[int],
-) -> Table:
+) -> MeasuredTable:
     """Rows as readings, those of the same settings together; an empty cell was not measured.
 
-    `where` is the file, and `lines` are those of the rows in it, for messages.
+    `location` is the file, and `lines` are those of the rows in it, for messages.
     """
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
@@ -462,33 +493,43 @@ def _listed(
         settings = tuple(
             f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items()
         )
-        place = float(at[row]) if places else None
-        for number, (own, values) in enumerate(results):
+        place = float(place_values[row]) if places else None
+        for number, (measured_column, values) in enumerate(results):
             value = float(values[row])
             if np.isnan(value):
                 continue
-            bound = (
+            at_place = (
                 place is not None
-                and own.of not in FOLDS
-                and not NAMES.fullmatch(own.of)
-                and own.of != "barrier"
+                and measured_column.of not in FOLDS
+                and not NAMES.fullmatch(measured_column.of)
+                and measured_column.of != "barrier"
             )
-            change = own.of in section.changes or own.header in section.changes
-            of = f"{points[row]}{own.of}" if own.of.startswith("_") else own.of
-            readings.setdefault(settings, []).append(Reading(of, place if bound else None, change))
+            change = (
+                measured_column.of in section.changes or measured_column.header in section.changes
+            )
+            result = (
+                f"{points[row]}{measured_column.of}"
+                if measured_column.of.startswith("_")
+                else measured_column.of
+            )
+            readings.setdefault(settings, []).append(
+                Reading(result, place if at_place else None, change)
+            )
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
-            rows.setdefault(settings, []).append(f"{where}: line {lines[row]}")
-    flat = np.array([value for each in data.values() for value in each])
+            rows.setdefault(settings, []).append(f"{location}: line {lines[row]}")
+    flat = np.array([value for group in data.values() for value in group])
     if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
         raise CaseError(
-            f"{where}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite"
+            f"{location}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite"
         )
-    numbers = np.array([number for each in column.values() for number in each], dtype=np.int64)
-    empty = {own.header: int(np.isnan(values).sum()) for own, values in results}
+    numbers = np.array([number for group in column.values() for number in group], dtype=np.int64)
+    empty = {
+        measured_column.header: int(np.isnan(values).sum()) for measured_column, values in results
+    }
     missing = {header: count for header, count in empty.items() if count}
-    return Table(
-        tuple(own for own, _ in results),
+    return MeasuredTable(
+        tuple(measured_column for measured_column, _ in results),
         readings,
         flat,
         numbers,
@@ -508,15 +549,17 @@ def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -
         With the key.
     """
     parameters_of(source, case, section)
-    names = Names(case)
-    for key, named in (("noise", section.noise), ("changes", section.changes)):
-        for name in named:
+    names = ResultNames(case)
+    for key, items in (("noise", section.noise), ("changes", section.changes)):
+        for name in items:
             names.refuse_strange(name, f"identify.{key}")
-    for i, each in enumerate(section.candidates):
-        candidate(names, each, f"identify.candidates.{i}")
+    for i, candidate_section in enumerate(section.candidates):
+        candidate(names, candidate_section, f"identify.candidates.{i}")
 
 
-def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Reading, str, float]:
+def candidate(
+    names: ResultNames, section: CandidateSection, key: str
+) -> tuple[Reading, str, float]:
     """A further reading, its unit, and its noise.
 
     Raises
@@ -524,13 +567,13 @@ def candidate(names: Names, section: CandidateSection, key: str) -> tuple[Readin
     CaseError
         If it is none.
     """
-    of, unit, _ = names.of(section.of, None, f"{key}.of")
-    noise = names.amount(section.noise, of, f"{key}.noise")
+    result, unit, _ = names.of(section.of, None, f"{key}.of")
+    noise = names.amount(section.noise, result, f"{key}.noise")
     refuse_size(noise, section.noise, f"{key}.noise")
     if section.at is None:
-        return Reading(of), unit, noise
+        return Reading(result), unit, noise
     if names.places is None:
         raise CaseError(
             f"{key}.at: the case has no last step that prescribes a load or a displacement"
         )
-    return Reading(of, names.amount(section.at, names.places.column, f"{key}.at")), unit, noise
+    return Reading(result, names.amount(section.at, names.places.column, f"{key}.at")), unit, noise

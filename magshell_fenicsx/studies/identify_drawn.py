@@ -7,43 +7,50 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.laplace import RIGHT, Fit
+from magshell_fenicsx.studies.laplace import BAND_PROBABILITY, Posterior
 
 Array = NDArray[np.float64]
 ENOUGH = 0.9  # of the samples: a place that fewer reach has no band
-NORMAL = float(scipy.stats.norm.ppf((1 + RIGHT) / 2))
+NORMAL = float(scipy.stats.norm.ppf((1 + BAND_PROBABILITY) / 2))
 
 
-def drawn(fit: Fit, count: int) -> Array:
+def posterior_samples(posterior: Posterior, count: int) -> Array:
     """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the
     bands are.
     """
-    size = fit.deviation
-    spread, axes = np.linalg.eigh(fit.correlation)
+    size = posterior.deviation
+    spread, axes = np.linalg.eigh(posterior.correlation)
     spread = np.maximum(spread, 0.0)
     rng = np.random.default_rng(0)
-    even = [
+    stratified = [
         (rng.permutation(count) + 0.5) / count for _ in size
     ]  # Latin hypercube: each axis has its quantiles
-    normal = _apart(scipy.stats.norm.ppf(np.transpose(even)), np.argsort(-spread))
+    normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
     wider = (
-        fit.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)) / NORMAL
+        posterior.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0))
+        / NORMAL
     )
-    return np.asarray(fit.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
+    return np.asarray(posterior.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
 
 
-def _apart(normal: Array, longest: NDArray[np.int64]) -> Array:
+def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
     """Normal numbers (count, p) without correlations among as many of their longest axes as they
     can say.
     """
     axes = longest[: len(normal) // 2]
     deviation = normal[:, axes].std(axis=0)
-    own, turned = np.linalg.eigh(
+    eigenvalues, eigenvectors = np.linalg.eigh(
         np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
     )
-    apart = np.array(normal)
-    apart[:, axes] = normal[:, axes] / deviation @ (turned / np.sqrt(own)) @ turned.T * deviation
-    return apart
+    uncorrelated = np.array(normal)
+    uncorrelated[:, axes] = (
+        normal[:, axes]
+        / deviation
+        @ (eigenvectors / np.sqrt(eigenvalues))
+        @ eigenvectors.T
+        * deviation
+    )
+    return uncorrelated
 
 
 def band_of(values: Array, samples: int) -> tuple[float, float] | None:
@@ -51,5 +58,7 @@ def band_of(values: Array, samples: int) -> tuple[float, float] | None:
     values = values[np.isfinite(values)]
     if values.size < ENOUGH * samples:
         return None
-    low, high = np.quantile(values, [(1 - RIGHT) / 2, (1 + RIGHT) / 2], method="hazen")
+    low, high = np.quantile(
+        values, [(1 - BAND_PROBABILITY) / 2, (1 + BAND_PROBABILITY) / 2], method="hazen"
+    )
     return float(low), float(high)

@@ -46,10 +46,14 @@ def draw_identified(
         panels.append(partial(_shape, rows=of_shape, shape=shape))
         rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
     ordered = sorted(rows, key=lambda row: str(row["column"]))
-    for _, own in groupby(ordered, key=lambda row: str(row["column"])):
-        column = list(own)
-        of = column[0]["result"].partition(OF_POINTS)[0] or column[0]["column"]
-        panels.append(partial(_data, of=of, rows=column, curve=curves.get(of, ()), content=content))
+    for _, column_rows in groupby(ordered, key=lambda row: str(row["column"])):
+        column = list(column_rows)
+        result = column[0]["result"].partition(OF_POINTS)[0] or column[0]["column"]
+        panels.append(
+            partial(
+                _data, result=result, rows=column, curve=curves.get(result, ()), content=content
+            )
+        )
     if field:
         panels += [partial(_field, field=field, number=i) for i in range(len(field["components"]))]
     if content["parameters"]:
@@ -66,27 +70,50 @@ def draw_identified(
 
 def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:
     """Where the places of a shape are, in the two directions in which most of them move."""
-    far = dict[str, float]()
+    largest_by_axis = dict[str, float]()
     for row in rows:
-        far[row["column"]] = max(far.get(row["column"], 0.0), abs(row["measured"]))
-    both, labelled = sorted(sorted(far, key=lambda name: -far[name])[:2]), False
+        largest_by_axis[row["column"]] = max(
+            largest_by_axis.get(row["column"], 0.0), abs(row["measured"])
+        )
+    plane_axes, labelled = (
+        sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2]),
+        False,
+    )
     for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
-        moved = dict[str, dict[str, Row]]()
+        rows_by_point = dict[str, dict[str, Row]]()
         for row in of_shape:
-            moved.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
-        points = [name for name in shape if all(name in moved.get(axis, {}) for axis in both)]
-        at = [[shape[name]["xyz".index(axis[1])] for name in points] for axis in both]
+            rows_by_point.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
+        points = [
+            name
+            for name in shape
+            if all(name in rows_by_point.get(axis, {}) for axis in plane_axes)
+        ]
+        coordinates = [
+            [shape[name]["xyz".index(axis[1])] for name in points] for axis in plane_axes
+        ]
         for kind, style, colour in (("predicted", "-", "C0"), ("measured", ".", "C1")):
-            u = [[moved[axis][name][kind] for name in points] for axis in both]
+            u = [[rows_by_point[axis][name][kind] for name in points] for axis in plane_axes]
             label = "" if labelled else "fitted" if kind == "predicted" else kind
-            line = style if _in_line(at) else "."
+            line = style if _in_line(coordinates) else "."
             plot.plot(
-                *(np.array(at) + np.array(u)), line, color=colour, label=label, zorder=4, lw=1.2
+                *(np.array(coordinates) + np.array(u)),
+                line,
+                color=colour,
+                label=label,
+                zorder=4,
+                lw=1.2,
             )
         labelled = True
-    plot.plot(*at, "--" if _in_line(at) else ".", color="0.6", lw=0.8, label="undeformed", zorder=1)
+    plot.plot(
+        *coordinates,
+        "--" if _in_line(coordinates) else ".",
+        color="0.6",
+        lw=0.8,
+        label="undeformed",
+        zorder=1,
+    )
     unit = split_unit(rows[0]["result"])
-    labels = [f"${axis[1]}$" + (f"  ({unit[1]})" if unit else "") for axis in both]
+    labels = [f"${axis[1]}$" + (f"  ({unit[1]})" if unit else "") for axis in plane_axes]
     plot.set(xlabel=labels[0], ylabel=labels[1])
     plot.set_aspect("equal", adjustable="datalim")
     plot.legend(frameon=False, fontsize=8)
@@ -96,27 +123,37 @@ def _which(row: Row) -> tuple[str, str]:
     return str(row["settings"]), str(row["at"])
 
 
-def _in_line(at: Sequence[Sequence[float]]) -> bool:
-    return any(np.ptp(v) == 0 for v in at) and all((np.diff(v) >= 0).all() for v in at)
+def _in_line(coordinates: Sequence[Sequence[float]]) -> bool:
+    return any(np.ptp(v) == 0 for v in coordinates) and all(
+        (np.diff(v) >= 0).all() for v in coordinates
+    )
 
 
 def _field(plot: Any, field: Row, number: int) -> None:
     """A component of the field over the arc length with its band; on a surface its colours, rings
     for deviations.
     """
-    over, places = field["over"], np.array(field["places"])
+    flux_scale, places = field["over"], np.array(field["places"])
     value, deviation, low, high, mean = (
-        over["value"] * np.array(field[name])[:, number]
+        flux_scale["value"] * np.array(field[name])[:, number]
         for name in ("value", "deviation", "low", "high", "mean")
     )
     symbol = rf"$B^\mathrm{{r}}_{{{AXES[field['components'][number]]}}}$"
-    label = f"{symbol}  ({over['unit']})" if over["unit"] else rf"{symbol} over $|B^\mathrm{{r}}|$"
+    label = (
+        f"{symbol}  ({flux_scale['unit']})"
+        if flux_scale["unit"]
+        else rf"{symbol} over $|B^\mathrm{{r}}|$"
+    )
     if places.shape[1] == 2 or not places[:, 1:].any():
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
-        half = 1.96 * over["value"] * field["prior"]["deviation"]
-        plot.fill_between(along, mean - half, mean + half, color="0.9", lw=0, label="prior, 95 %")
-        plot.fill_between(along, low, high, color="C0", alpha=0.3, lw=0, label="95 %")
-        plot.plot(along, value, "o-", color="C0", ms=3, lw=1.2, label="fitted")
+        arc_length = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+        )
+        half = 1.96 * flux_scale["value"] * field["prior"]["deviation"]
+        plot.fill_between(
+            arc_length, mean - half, mean + half, color="0.9", lw=0, label="prior, 95 %"
+        )
+        plot.fill_between(arc_length, low, high, color="C0", alpha=0.3, lw=0, label="95 %")
+        plot.plot(arc_length, value, "o-", color="C0", ms=3, lw=1.2, label="fitted")
         room = 0.3 * float(np.ptp([low, high]))
         plot.set(
             xlabel="arc length over $R$", ylabel=label, ylim=(low.min() - room, high.max() + room)
@@ -124,23 +161,23 @@ def _field(plot: Any, field: Row, number: int) -> None:
         plot.legend(frameon=False, fontsize=8)
         return
     first, second = sorted(int(i) for i in np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])
-    shown = plot.scatter(
+    points = plot.scatter(
         places[:, first], places[:, second], c=value, s=10 + 240 * deviation / deviation.max()
     )
-    plot.figure.colorbar(shown, ax=plot, label=label)
-    title = f"standard deviation: area, to {deviation.max():.3g} {over['unit']}".rstrip()
+    plot.figure.colorbar(points, ax=plot, label=label)
+    title = f"standard deviation: area, to {deviation.max():.3g} {flux_scale['unit']}".rstrip()
     plot.set(
         xlabel=f"${'xyz'[first]}/R$", ylabel=f"${'xyz'[second]}/R$", aspect="equal", title=title
     )
 
 
 def _data(
-    plot: Any, of: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row
+    plot: Any, result: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row
 ) -> None:
-    placed = all(row["at"] != "end" for row in rows)
-    rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if placed else rows
-    x = np.array([row["at"] for row in rows]) if placed else np.arange(1.0, len(rows) + 1)
-    alone = len({row["settings"] for row in rows}) == 1 and placed
+    has_places = all(row["at"] != "end" for row in rows)
+    rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if has_places else rows
+    x = np.array([row["at"] for row in rows]) if has_places else np.arange(1.0, len(rows) + 1)
+    alone = len({row["settings"] for row in rows}) == 1 and has_places
 
     def get(name: str) -> Array:
         return np.array([row[name] for row in rows])
@@ -166,7 +203,8 @@ def _data(
         plot.errorbar(x, get("predicted"), half, fmt="_", color="C0", label="fitted, 95 %")
     plot.plot(x, get("measured"), ".", color="C1", label="measured", zorder=5)
     plot.set(
-        xlabel=result_label(content["places"]) if placed else "number", ylabel=result_label(of)
+        xlabel=result_label(content["places"]) if has_places else "number",
+        ylabel=result_label(result),
     )
     plot.legend(frameon=False, fontsize=8)
 
@@ -174,17 +212,17 @@ def _data(
 def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
     """Bands over the value that fits best: before in grey, after in blue."""
     widest = 0.0
-    for i, each in enumerate(parameters.values()):
-        size = abs(each["value"]) or 1.0
-        prior = each["prior"]
+    for i, parameter in enumerate(parameters.values()):
+        size = abs(parameter["value"]) or 1.0
+        prior = parameter["prior"]
         if prior:
             middle, half = (
-                prior["mean"] / size - np.sign(each["value"]),
+                prior["mean"] / size - np.sign(parameter["value"]),
                 1.96 * prior["deviation"] / size,
             )
             plot.barh(i, 200 * half, left=100 * (middle - half), height=0.5, color="0.85")
             widest = max(widest, abs(middle) + half)
-        low, high = ((each[name] - each["value"]) / size for name in ("low", "high"))
+        low, high = ((parameter[name] - parameter["value"]) / size for name in ("low", "high"))
         plot.barh(i, 100 * (high - low), left=100 * low, height=0.25, color="C0")
         widest = max(widest, high)
     names = [
@@ -220,8 +258,8 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
     )
     for plot, column in zip(plots[0], columns, strict=True):
         labels = {"95 %, data", "95 %, curve", "predicted", "measured"}  # each once
-        own = [row for row in rows if row["result"] == column]
-        for _, of_step in groupby(own, key=lambda row: int(row["step"])):
+        result_rows = [row for row in rows if row["result"] == column]
+        for _, of_step in groupby(result_rows, key=lambda row: int(row["step"])):
             _programme_of_step(
                 plot, sorted(of_step, key=lambda row: float(row[place])), place, labels
             )
@@ -238,8 +276,8 @@ def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[s
         labels.discard(text)
         return text if is_new else ""
 
-    def get(of: str) -> Array:
-        return np.array([np.nan if row[of] == "" else row[of] for row in rows], dtype=float)
+    def get(column: str) -> Array:
+        return np.array([np.nan if row[column] == "" else row[column] for row in rows], dtype=float)
 
     x, bands = (
         get(place),

@@ -18,20 +18,20 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
-from magshell_fenicsx.simulate.gradients.instabilities import Lost
+from magshell_fenicsx.simulate.gradients.instabilities import LostResult
 from magshell_fenicsx.simulate.readings import NotRead, Outside, Reading, read
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.studies.design_blocks import Number
+from magshell_fenicsx.studies.design_blocks import NumberVariable
 from magshell_fenicsx.studies.identify_data import Parameter
 from magshell_fenicsx.studies.identify_field import NAME, RemanenceField
-from magshell_fenicsx.studies.runner import Made, keep, kept
+from magshell_fenicsx.studies.runner import MakeCase, keep, stored_outcome
 
 Array = NDArray[np.float64]
 Settings = tuple[str, ...]
 
 
 @dataclass
-class Seen:
+class PredictedReadings:
     """What is predicted for a vector of parameters; with a note there is nothing.
 
     Attributes
@@ -66,7 +66,7 @@ class Predictor:
     """
 
     source: Source
-    made: Made
+    make_case: MakeCase
     parameters: Sequence[Parameter]
     readings: dict[Settings, list[Reading]]
     folder: Path
@@ -76,29 +76,38 @@ class Predictor:
     rows: Mapping[Settings, Sequence[str]] = field_of(default_factory=dict)
     count: int = 0
 
-    def __call__(self, x: Array, *, slopes: bool = True) -> Seen:
+    def __call__(self, x: Array, *, slopes: bool = True) -> PredictedReadings:
         """What is predicted, known or new."""
         x = np.array(self.comm.bcast(x))
         listed = json.dumps(
-            [[settings, [asdict(each) for each in of]] for settings, of in self.readings.items()]
+            [
+                [settings, [asdict(reading) for reading in readings]]
+                for settings, readings in self.readings.items()
+            ]
         )
         text = f"{self.mark} {listed} {slopes}".encode()
         file = (
             self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
         )
-        seen = on_first_rank(
-            self.comm, lambda: kept(file, TypeAdapter(Seen), "seen", sources=code_version())
+        prediction = on_first_rank(
+            self.comm,
+            lambda: stored_outcome(
+                file, TypeAdapter(PredictedReadings), "seen", sources=code_version()
+            ),
         )
-        if seen is None:
+        if prediction is None:
             vectors = file.with_suffix(".csv")
             if self.field:
                 access_disk(self.comm, lambda: self.write(x, vectors))
-            seen = Seen(**self.comm.bcast(asdict(self._new(x, slopes, vectors))))
+            prediction = PredictedReadings(
+                **self.comm.bcast(asdict(self._predict(x, slopes, vectors)))
+            )
             self.count += 1
             on_first_rank(
-                self.comm, lambda: keep(file, {"sources": code_version(), "seen": asdict(seen)})
+                self.comm,
+                lambda: keep(file, {"sources": code_version(), "seen": asdict(prediction)}),
             )
-        return seen
+        return prediction
 
     def write(self, x: Array, vectors: Path) -> None:
         """Write the vectors of a field."""
@@ -106,26 +115,33 @@ class Predictor:
         vectors.parent.mkdir(parents=True, exist_ok=True)
         self.field.write(x[len(self.parameters) :], vectors)
 
-    def _new(self, x: Array, slopes: bool, vectors: Path) -> Seen:
-        seen, keys = Seen(), [each.key for each in self.parameters]
-        for settings, wanted in self.readings.items():
+    def _predict(self, x: Array, slopes: bool, vectors: Path) -> PredictedReadings:
+        prediction, keys = PredictedReadings(), [parameter.key for parameter in self.parameters]
+        for settings, requested in self.readings.items():
             try:
                 scene = self._scene(x, settings, vectors)
                 field = self.field
-                fields = {NAME: (field.first.size, partial(field.by, scene))} if field else None
-                readings = read(scene, wanted, keys, slopes=slopes, fields=fields)
-            except (Lost, CaseError, MeshError) as e:
-                about = [self._row_of(e, settings), ", ".join(settings), str(e)]
-                note = ": ".join(filter(None, about))
-                return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
-            seen.values += [float(v) for v in readings.values]
+                fields = (
+                    {NAME: (field.start_values.size, partial(field.derivatives, scene))}
+                    if field
+                    else None
+                )
+                readings = read(scene, requested, keys, slopes=slopes, fields=fields)
+            except (LostResult, CaseError, MeshError) as e:
+                message_parts = [self._row_of(e, settings), ", ".join(settings), str(e)]
+                note = ": ".join(filter(None, message_parts))
+                return PredictedReadings(
+                    note=note, invalid=not isinstance(e, LostResult) or isinstance(e, Outside)
+                )
+            prediction.values += [float(v) for v in readings.values]
             sizes = [
-                float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters
+                float(parameter.number.gradient(x, None, {parameter.key: 1.0})[0])
+                for parameter in self.parameters
             ]  # type: ignore[arg-type]
             sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
-            seen.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
-            seen.curves = seen.curves or readings.curves
-        return seen
+            prediction.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
+            prediction.curves = prediction.curves or readings.curves
+        return prediction
 
     def _row_of(self, error: Exception, settings: Settings) -> str:
         """Where the place that is not reached stands in the data; empty of another error."""
@@ -136,7 +152,9 @@ class Predictor:
 
     def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
         """A case, this or another one, for a vector of parameters; those of a field are in a file."""
-        source = varied(base, [each.number for each in self.parameters], x[: len(self.parameters)])
+        source = source_with_numbers(
+            base, [parameter.number for parameter in self.parameters], x[: len(self.parameters)]
+        )
         if self.field:
             self.field.put(source.data, vectors)
         return source
@@ -145,10 +163,10 @@ class Predictor:
         source = self.source_at(x, self.source, vectors)
         for setting in settings:
             override(source, setting)
-        return Scene(self.made(source).problem(), self.comm)
+        return Scene(self.make_case(source).problem(), self.comm)
 
 
-def varied(source: Source, numbers: Sequence[Number], x: Array) -> Source:
+def source_with_numbers(source: Source, numbers: Sequence[NumberVariable], x: Array) -> Source:
     """The source of a case with other numbers."""
     data = json.loads(json.dumps(source.data))
     data.pop("identify", None)

@@ -25,24 +25,24 @@ from magshell_fenicsx.problem.columns import extra_columns, sizes_in_units
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.studies.identify_data import Parameter, parameters_of, refuse_twice
-from magshell_fenicsx.studies.identify_drawn import NORMAL, band_of, drawn
+from magshell_fenicsx.studies.identify_drawn import NORMAL, band_of, posterior_samples
 from magshell_fenicsx.studies.identify_field import without_room
 from magshell_fenicsx.studies.identify_picture import draw_programme
 from magshell_fenicsx.studies.identify_predicted import Predictor
 from magshell_fenicsx.studies.identify_sections import IdentifySection, ProgrammeSection
-from magshell_fenicsx.studies.laplace import Fit
+from magshell_fenicsx.studies.laplace import Posterior
 from magshell_fenicsx.studies.points import identity, value_at
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
     FAILED,
     Case,
-    Made,
+    MakeCase,
     Outcome,
     Say,
     compute,
     keep_outcome,
-    kept_outcome,
     outcome_of,
+    stored_outcome_of_case,
 )
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ ALWAYS = ("step", "branch", "mode", "amplitude")
 
 
 @dataclass(frozen=True)
-class Column:
+class PathColumn:
     """A result along a step: its name in the data, its column of path.csv, and the data in the unit
     of that.
     """
@@ -62,7 +62,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Found:
+class Prediction:
     """What is predicted: as in identify.json, in words, the rows of its table, and what is drawn."""
 
     name: str
@@ -97,21 +97,21 @@ class Programme:
     name: str
     source: Source
     samples: int
-    made: Made
+    make_case: MakeCase
     last: int
     place: str
     places: Array | None
     steps: NDArray[np.int64]
-    columns: list[Column]
+    columns: list[PathColumn]
     scalars: list[Scalar]
     keys: list[str] = field(default_factory=list)
 
-    def compute(self, predictor: Predictor, fit: Fit, say: Say) -> None:
+    def compute(self, predictor: Predictor, posterior: Posterior, say: Say) -> None:
         """Run the case at the fit and for drawn parameters; collective, and every rank computes
         runs of its own.
         """
         cases = dict[str, Case]()
-        for number, x in enumerate([fit.x, *drawn(fit, self.samples)]):
+        for number, x in enumerate([posterior.x, *posterior_samples(posterior, self.samples)]):
             vectors = predictor.folder / "points" / f"{self.name}_{number}.csv"
             if predictor.field:
                 predictor.comm.Barrier()
@@ -119,7 +119,9 @@ class Programme:
                     predictor.write(x, vectors)
                 predictor.comm.Barrier()
             try:
-                case = self.made(predictor.source_at(predictor.comm.bcast(x), self.source, vectors))
+                case = self.make_case(
+                    predictor.source_at(predictor.comm.bcast(x), self.source, vectors)
+                )
                 case.problem()
             except CaseError as e:
                 if not number:
@@ -143,7 +145,7 @@ class Programme:
         predictor.count += len(missing)
 
     def _run(self, case: Case) -> Outcome:
-        begun = time.perf_counter()
+        start_time = time.perf_counter()
         try:
             result = run(case.problem(), comm=MPI.COMM_SELF)
             outcome = outcome_of(
@@ -154,23 +156,29 @@ class Programme:
         ) as e:  # whatever it is, the other runs go on, and the table has no band if many fail
             outcome = Outcome.failed(" ".join(f"{FAILED}{type(e).__name__}: {e}".split()))
         curve = [{name: row[name] for name in self._needed if name in row} for row in outcome.curve]
-        return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - begun, 3))
+        return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - start_time, 3))
 
     @property
     def _needed(self) -> dict[str, None]:
-        own = [self.place, *(each.of for each in self.columns)]
-        names = [*ALWAYS, *own, *(name for each in self.scalars for name in (each.column, each.at))]
+        place_and_results = [self.place, *(item.of for item in self.columns)]
+        names = [
+            *ALWAYS,
+            *place_and_results,
+            *(name for item in self.scalars for name in (item.column, item.at)),
+        ]
         return dict.fromkeys(name for name in names if name not in ("", "end"))
 
     def _outcome(self, folder: Path, key: str) -> Outcome | None:
         """What is known of a run; an error may have been of the machine, and is tried again."""
-        outcome = kept_outcome(_file(folder, key))
+        outcome = stored_outcome_of_case(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
             return None
         complete = not outcome.curve or self._needed.keys() <= outcome.curve[0].keys()
         return outcome if complete else None
 
-    def found(self, folder: Path, fit: Fit, noise: Mapping[str, Mapping[str, Any]]) -> Found:
+    def prediction(
+        self, folder: Path, posterior: Posterior, noise: Mapping[str, Mapping[str, Any]]
+    ) -> Prediction:
         """What the runs say.
 
         Raises
@@ -178,15 +186,17 @@ class Programme:
         CaseError
             If the run at the fit fails.
         """
-        outcomes = [kept_outcome(_file(folder, key)) if key else None for key in self.keys]
+        outcomes = [
+            stored_outcome_of_case(_file(folder, key)) if key else None for key in self.keys
+        ]
         first, drawn_ones = outcomes[0], outcomes[1:]
         assert first
         if not first.curve:
             raise CaseError(
                 f"identify.predict.{self.name}: nothing is predicted at the fit: {first.stopped}"
             )
-        runs = [each for each in drawn_ones if each and each.curve]
-        curves = [_Path(each.curve, self.place) for each in (first, *runs)]
+        runs = [item for item in drawn_ones if item and item.curve]
+        curves = [_PathCurve(item.curve, self.place) for item in (first, *runs)]
         places, steps = self.places, self.steps
         if places is None:
             places = np.array(curves[0].of(self.last)[0])
@@ -199,51 +209,55 @@ class Programme:
             )
         ]
         numbers = {
-            each.name: self._number(each, first, runs, len(drawn_ones)) for each in self.scalars
+            item.name: self._number(item, first, runs, len(drawn_ones)) for item in self.scalars
         }
         measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
-        inside = int(
+        count_inside = int(
             sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured)
         )
-        stopped = [each.stopped for each in runs if each.stopped]
-        lost = len(drawn_ones) - len(runs)
+        stopped = [item.stopped for item in runs if item.stopped]
+        lost_count = len(drawn_ones) - len(runs)
         content = {
             "samples": len(drawn_ones),
-            "without_path": lost,
+            "without_path": lost_count,
             "stopped_early": len(stopped),
             "stopped": first.stopped,
             "places": self.place,
             "measured": len(measured),
-            "inside": inside,
+            "inside": count_inside,
             "numbers": numbers,
         }
-        return Found(self.name, content, self._said(content), rows)
+        return Prediction(self.name, content, self._sentences(content), rows)
 
-    def _said(self, content: Mapping[str, Any]) -> list[str]:
-        said = []
+    def _sentences(self, content: Mapping[str, Any]) -> list[str]:
+        sentences = []
         if content["measured"]:
-            said.append(
-                f"{self.name}: {content['inside']} of {content['measured']} data within their predicted bands"
+            sentences.append(
+                f"{self.name}: {content['inside']} of {content['measured']} data within their "
+                "predicted bands"
             )
-        for name, each in content["numbers"].items():
-            value = "nothing" if each["value"] is None else f"{each['value']:.6g}"
+        for name, number in content["numbers"].items():
+            value = "nothing" if number["value"] is None else f"{number['value']:.6g}"
             band = (
-                f", 95 % between {each['low']:.6g} and {each['high']:.6g}"
-                if each["low"] is not None
+                f", 95 % between {number['low']:.6g} and {number['high']:.6g}"
+                if number["low"] is not None
                 else ""
             )
-            said.append(f"{self.name}: {name} = {value} predicted{band}, from {each['runs']} runs")
+            sentences.append(
+                f"{self.name}: {name} = {value} predicted{band}, from {number['runs']} runs"
+            )
         if content["stopped"]:
-            said.append(
+            sentences.append(
                 f"warning: {self.name}: at the fit the run stopped early: {content['stopped']}"
             )
         if count := content["without_path"] + content["stopped_early"]:
-            said.append(
-                f"warning: {self.name}: {count} of {content['samples']} runs are lost or stopped early"
+            sentences.append(
+                f"warning: {self.name}: {count} of {content['samples']} runs are lost or stopped "
+                "early"
             )
-        return said
+        return sentences
 
-    def _noise(self, column: Column, noise: Mapping[str, Mapping[str, Any]]) -> float:
+    def _noise(self, column: PathColumn, noise: Mapping[str, Mapping[str, Any]]) -> float:
         """The standard deviation of such a measurement, where the identification knows it."""
         return next(
             (
@@ -256,10 +270,10 @@ class Programme:
 
     def _rows(
         self,
-        column: Column,
+        column: PathColumn,
         places: Array,
         steps: NDArray[np.int64],
-        curves: "Sequence[_Path]",
+        curves: "Sequence[_PathCurve]",
         noise: float,
         samples: int,
     ) -> Iterator[dict[str, Any]]:
@@ -291,7 +305,9 @@ class Programme:
     def _number(
         scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int
     ) -> dict[str, Any]:
-        values = np.array([np.nan if (v := each.value(scalar)) is None else v for each in runs])
+        values = np.array(
+            [np.nan if (v := outcome.value(scalar)) is None else v for outcome in runs]
+        )
         band = band_of(values, samples)
         low, high = band or (None, None)
         return {
@@ -302,7 +318,7 @@ class Programme:
         }
 
 
-class _Path:
+class _PathCurve:
     """The curve of a run, read step by step."""
 
     def __init__(self, rows: Sequence[Row], place: str) -> None:
@@ -311,13 +327,15 @@ class _Path:
 
     def of(self, step: int, column: str = "") -> tuple[list[float], list[float]]:
         """Places and values of a column in a step, from the point where it begins."""
-        own = [i for i, row in enumerate(self._rows) if row["step"] == step]
-        rows = self._rows[max(own[0] - 1, 0) : own[-1] + 1] if own else []
+        rows_of_step = [i for i, row in enumerate(self._rows) if row["step"] == step]
+        rows = (
+            self._rows[max(rows_of_step[0] - 1, 0) : rows_of_step[-1] + 1] if rows_of_step else []
+        )
         return [float(row[self._place]) for row in rows], [
             float(row[column or self._place]) for row in rows
         ]
 
-    def at(self, column: Column, places: Array, steps: NDArray[np.int64]) -> Array:
+    def at(self, column: PathColumn, places: Array, steps: NDArray[np.int64]) -> Array:
         """A column at places, where the path first passes each in its step; nan where it does not."""
         values = np.full(len(places), np.nan)
         for step in np.unique(steps):
@@ -348,7 +366,7 @@ def programme(
     source: Source,
     parameters: Sequence[Parameter],
     section: ProgrammeSection,
-    made: Made,
+    make_case: MakeCase,
     *,
     with_field: bool = False,
 ) -> Programme:
@@ -360,59 +378,69 @@ def programme(
     CaseError
         If the case or a setting is none, lacks a parameter, or has no such result.
     """
-    where = f"identify.predict.{name}"
+    location = f"identify.predict.{name}"
     base = copy.deepcopy(source)
     try:
         if section.case:
             base = read_source(source.folder / section.case)
         for setting in section.settings:
             override(base, setting)
-        for each in ("identify", "ensemble", "design"):
-            base.data.pop(each, None)
+        for key in ("identify", "ensemble", "design"):
+            base.data.pop(key, None)
         if lacking := next(
             (p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None
         ):
             raise CaseError(f"{section.case or 'the case'} has no {lacking}, which is looked for")
-        if with_field and (strange := without_room(base.data, source.data)):
-            raise CaseError(f"{section.case or 'the case'}: {strange}")
-        problem = made(base).problem()
+        if with_field and (missing_room := without_room(base.data, source.data)):
+            raise CaseError(f"{section.case or 'the case'}: {missing_room}")
+        problem = make_case(base).problem()
     except CaseError as e:
-        raise CaseError(f"{where}: {e}") from None
-    names = _Names(problem)
+        raise CaseError(f"{location}: {e}") from None
+    names = _PathColumnNames(problem)
     last = len(problem.programme)
-    own = names.shown(amplitude(problem.programme[-1].name).column) if last else ""
-    place, columns = own, list[Column]()
+    load_column = names.in_case_units(amplitude(problem.programme[-1].name).column) if last else ""
+    place, columns = load_column, list[PathColumn]()
     places: Array | None = None
     steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     if section.data:
         place, places, steps, columns = _measured(
-            source.folder / section.data, names, last, f"{where}.data"
+            source.folder / section.data, names, last, f"{location}.data"
         )
-    measured = {each.of for each in columns}
-    for of in section.of:
-        if "@" not in of and of in names.all:
-            shown = names.shown(of)
-            columns += [] if shown in measured else [Column(of, shown, np.zeros(0), change=False)]
-    scalars = [_scalar(of, where) for of in section.of if "@" in of or of not in names.all]
+    measured = {key.of for key in columns}
+    for result in section.of:
+        if "@" not in result and result in names.all:
+            column_in_units = names.in_case_units(result)
+            columns += (
+                []
+                if column_in_units in measured
+                else [PathColumn(result, column_in_units, np.zeros(0), change=False)]
+            )
+    scalars = [
+        _scalar(result, location)
+        for result in section.of
+        if "@" in result or result not in names.all
+    ]
     if columns and not place:
         raise CaseError(
-            f"{where}.of: the case has no step, so no column along it: give a number, such as knockdown"
+            f"{location}.of: the case has no step, so no column along it: give a number, such as "
+            "knockdown"
         )
-    predicted = {text for each in columns for text in (each.header, each.of)}
-    if unknown := next((of for of in section.changes if of not in predicted), None):
+    predicted = {text for key in columns for text in (key.header, key.of)}
+    if unknown := next((result for result in section.changes if result not in predicted), None):
         raise CaseError(
-            f"{where}.changes: {unknown}: is no column that is predicted; these are {', '.join(predicted)}"
+            f"{location}.changes: {unknown}: is no column that is predicted; these are "
+            f"{', '.join(predicted)}"
         )
     columns = [
-        replace(each, change=bool({each.header, each.of} & {*section.changes})) for each in columns
+        replace(key, change=bool({key.header, key.of} & {*section.changes})) for key in columns
     ]
     return Programme(
-        name, base, section.samples, made, last, place, places, steps, columns, scalars
+        name, base, section.samples, make_case, last, place, places, steps, columns, scalars
     )
 
 
 def refuse_unfit_programmes(
-    source: Source, case: Case, section: IdentifySection, made: Made
+    source: Source, case: Case, section: IdentifySection, make_case: MakeCase
 ) -> None:
     """See that what is to be predicted is there; collective.
 
@@ -422,18 +450,25 @@ def refuse_unfit_programmes(
         See `programme`.
     """
     parameters = parameters_of(source, case, section) if section.predict else ()
-    for name, each in section.predict.items():
-        programme(name, source, parameters, each, made, with_field=section.remanence is not None)
+    for name, programme_section in section.predict.items():
+        programme(
+            name,
+            source,
+            parameters,
+            programme_section,
+            make_case,
+            with_field=section.remanence is not None,
+        )
 
 
-def _scalar(of: str, where: str) -> Scalar:
+def _scalar(result: str, location: str) -> Scalar:
     try:
-        return parse_scalar(of)
+        return parse_scalar(result)
     except CaseError as e:
-        raise CaseError(f"{where}.of: {str(e).removeprefix('--result ')}") from None
+        raise CaseError(f"{location}.of: {str(e).removeprefix('--result ')}") from None
 
 
-class _Names:
+class _PathColumnNames:
     """The columns of path.csv that a case has."""
 
     def __init__(self, problem: Any) -> None:
@@ -441,12 +476,12 @@ class _Names:
         numbers = (name for name in (*COLUMNS, *extra_columns(problem)) if name not in TEXTS)
         self.all = dict.fromkeys(numbers)
 
-    def shown(self, name: str) -> str:
+    def in_case_units(self, name: str) -> str:
         """The column in units of a column, or itself."""
         in_units = self.sizes.column(name)
         return in_units.name if in_units else name
 
-    def of(self, name: str, unit: str | None, where: str) -> tuple[str, float]:
+    def of(self, name: str, unit: str | None, location: str) -> tuple[str, float]:
         """The column of a name with a unit, and what one of that unit is in it.
 
         Raises
@@ -457,52 +492,55 @@ class _Names:
         in_units = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
         if unit is None:
             if name not in self.all or name in TEXTS:
-                raise CaseError(f"{where}: {name}: is no column of path.csv of this case")
-            if (there := self.shown(name)) != name:
-                raise CaseError(f"{where}: {name}: has no unit: write {name} [{in_units[there]}]")
+                raise CaseError(f"{location}: {name}: is no column of path.csv of this case")
+            if (column_in_units := self.in_case_units(name)) != name:
+                raise CaseError(
+                    f"{location}: {name}: has no unit: write {name} [{in_units[column_in_units]}]"
+                )
             return name, 1.0
-        fitting = [of for of in in_units if of == name or of.startswith(f"{name}_")]
-        for of in sorted(fitting, key=len):
+        fitting = [column for column in in_units if column == name or column.startswith(f"{name}_")]
+        for column in sorted(fitting, key=len):
             try:
-                return of, column_size(name, unit, in_units[of])
+                return column, column_size(name, unit, in_units[column])
             except TableError as e:
-                raise CaseError(f"{where}: {e}") from None
+                raise CaseError(f"{location}: {e}") from None
         raise CaseError(
-            f"{where}: {name}: has the unit {unit}, but no column of this name has one in this case"
+            f"{location}: {name}: has the unit {unit}, but no column of this name has one in this "
+            "case"
         )
 
 
 def _measured(
-    file: Path, names: _Names, last: int, where: str
-) -> tuple[str, Array, NDArray[np.int64], list[Column]]:
+    file: Path, names: _PathColumnNames, last: int, location: str
+) -> tuple[str, Array, NDArray[np.int64], list[PathColumn]]:
     """The place, what it is in each row, the rows' steps, and the columns."""
     try:
         rows = read_rows(file, Files())
     except TableError as e:
-        raise CaseError(f"{where}: {file.name}: {e}") from None
-    columns, units, where = rows.columns, rows.units, f"{where}: {file.name}"
-    given = {header: values for header, values in columns.items() if header != "step"}
-    if len(given) < 2:
+        raise CaseError(f"{location}: {file.name}: {e}") from None
+    columns, units, location = rows.columns, rows.units, f"{location}: {file.name}"
+    values_by_header = {header: values for header, values in columns.items() if header != "step"}
+    if len(values_by_header) < 2:
         raise CaseError(
-            f"{where}: needs two columns or more: the place first, then what was measured there"
+            f"{location}: needs two columns or more: the place first, then what was measured there"
         )
     measured = [
-        (header, *names.of(header, units[header], where), values)
-        for header, values in given.items()
+        (header, *names.of(header, units[header], location), values)
+        for header, values in values_by_header.items()
     ]
-    taken = dict[str, str]()
-    for header, of, _, _ in measured:
-        refuse_twice(header, of, taken, where)
-        taken[of] = header
-    (_, place, factor, at), *others = measured
-    steps = np.asarray(columns.get("step", np.full(at.size, last)))
-    for row in np.flatnonzero(np.isnan(at) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
+    headers_by_result = dict[str, str]()
+    for header, result, _, _ in measured:
+        refuse_twice(header, result, headers_by_result, location)
+        headers_by_result[result] = header
+    (_, place, factor, place_values), *others = measured
+    steps = np.asarray(columns.get("step", np.full(place_values.size, last)))
+    for row in np.flatnonzero(np.isnan(place_values) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
         raise CaseError(
-            f"{where}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}"
+            f"{location}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}"
         )
     return (
         place,
-        at * factor,
+        place_values * factor,
         steps.astype(np.int64),
-        [Column(h, of, v * f, change=False) for h, of, f, v in others],
+        [PathColumn(h, result, v * f, change=False) for h, result, f, v in others],
     )

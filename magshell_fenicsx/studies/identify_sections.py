@@ -24,7 +24,7 @@ class ParameterSection(Section):
     """Its standard deviation, in the unit of the key"""
 
     @model_validator(mode="after")
-    def _both(self) -> Self:
+    def _prior_with_deviation(self) -> Self:
         if (self.prior is None) != (self.deviation is None):
             raise ValueError("prior and deviation belong together")
         return self
@@ -131,9 +131,9 @@ class IdentifySection(Section):
 
     @model_validator(mode="after")
     def _names_are_words(self) -> Self:
-        if strange := next((name for name in self.predict if not re.fullmatch(r"\w+", name)), None):
+        if invalid := next((name for name in self.predict if not re.fullmatch(r"\w+", name)), None):
             raise ValueError(
-                f"predict: {strange}: a name has letters, digits and _ alone, as files have it"
+                f"predict: {invalid}: a name has letters, digits and _ alone, as files have it"
             )
         return self
 

@@ -28,13 +28,15 @@ Model = Callable[
 
 CONVERGED = 1e-3  # a step below this part of a standard deviation is the last one
 HALVINGS = 10
-APART = 1e-6  # a smaller singular value, over the largest, is a combination that data do not see
-NAMED = 0.1  # parts of a direction that are named
-RIGHT = 0.95  # of the bands
-LEAST = 1.0  # degree of freedom
-SAID = 0.5  # of a degree: with less, data do not say their noise
-EXACT = 1e-12  # no estimated noise is less than this part of the data
-ASIDE = 0.05  # differences of logarithms of strengths
+RANK_TOLERANCE = (
+    1e-6  # a smaller singular value, over the largest, is a combination that data do not see
+)
+MIN_NAMED_COMPONENT = 0.1  # parts of a direction that are named
+BAND_PROBABILITY = 0.95  # of the bands
+MIN_FREEDOM = 1.0  # degree of freedom
+MIN_NOISE_FREEDOM = 0.5  # of a degree: with less, data do not say their noise
+MIN_RELATIVE_NOISE = 1e-12  # no estimated noise is less than this part of the data
+LOG_STRENGTH_STEP = 0.05  # differences of logarithms of strengths
 SAMPLES, WIDER, SUREST = (
     64,
     1.3,
@@ -105,7 +107,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Fit:
+class Posterior:
     """The parameters that fit best.
 
     Attributes
@@ -137,7 +139,7 @@ class Fit:
     misfit: float
     steps: int
     ended: str
-    known: Measured
+    measured: Measured
 
     @property
     def deviation(self) -> Array:
@@ -147,10 +149,10 @@ class Fit:
     @property
     def local(self) -> Array:
         """(p, p) covariance for noise and strengths of a field as they are at the fit."""
-        if not self.known.field:
+        if not self.measured.field:
             return self.covariance
         return _covariance(
-            self.known.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation
+            self.measured.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation
         )
 
     @property
@@ -169,15 +171,18 @@ class Fit:
         """
         of_data = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
         columns = np.arange(len(self.noise))
-        parts = np.array([of_data[:, self.group == each].sum(axis=1) for each in columns]).T
-        whole = self.spread(slopes) ** 2
+        parts = np.array([of_data[:, self.group == number].sum(axis=1) for number in columns]).T
+        variance = self.spread(slopes) ** 2
         if column is not None:
-            own = self.noise[column] ** 2
-            parts, whole = parts + own[:, None] * (column[:, None] == columns), whole + own
-        share = parts / np.where(whole > 0, whole, 1.0)[:, None]
+            noise_variance = self.noise[column] ** 2
+            parts, variance = (
+                parts + noise_variance[:, None] * (column[:, None] == columns),
+                variance + noise_variance,
+            )
+        share = parts / np.where(variance > 0, variance, 1.0)[:, None]
         with np.errstate(divide="ignore"):
             freedom = 1 / (share**2 / self.freedom).sum(axis=1)
-        return np.asarray(scipy.stats.t.ppf((1 + RIGHT) / 2, freedom))
+        return np.asarray(scipy.stats.t.ppf((1 + BAND_PROBABILITY) / 2, freedom))
 
     @property
     def band(self) -> tuple[Array, Array]:
@@ -200,23 +205,23 @@ class Fit:
         )
 
 
-def fitted(
+def fit_posterior(
     model: Model,
     measured: Measured,
     start: Array,
     size: Array,
-    most: int,
-    told: Callable[[int, Array, float], None],
-) -> Fit:
+    max_steps: int,
+    report_step: Callable[[int, Array, float], None],
+) -> Posterior:
     """The fit by Gauss-Newton; steps are halved until the misfit falls.
 
     Parameters
     ----------
     start, size
         Where it starts (p,), and what a change of each parameter is small against.
-    most
+    max_steps
         Steps.
-    told
+    report_step
         Called with the number of each step, its parameters and the misfit over the number of data.
 
     Raises
@@ -228,15 +233,15 @@ def fitted(
     """
     first = model(start)
     assert first, "there is a prediction at the start"
-    x, (y, J), given = np.array(start), first, measured
-    measured, noise, freedom = _weighed(given, measured, x, y, J, _guessed(measured, y), size)
-    ended = f"{most} steps"
-    for step in range(most + 1):
+    x, (y, J), initial = np.array(start), first, measured
+    measured, noise, freedom = _weighed(initial, measured, x, y, J, _guessed(measured, y), size)
+    ended = f"{max_steps} steps"
+    for step in range(max_steps + 1):
         rest, A = measured.rows(y, J, x, noise)
         _refuse_unseen(A * size)
         misfit = float(rest @ rest)
-        told(step, x, misfit / len(measured.data))
-        if step == most:
+        report_step(step, x, misfit / len(measured.data))
+        if step == max_steps:
             break
         dx = size * np.linalg.lstsq(A * size, rest, rcond=None)[0]
         covariance = _covariance(A, size)
@@ -246,28 +251,28 @@ def fitted(
             break
         for halved in range(HALVINGS):
             tried = x + dx / 2**halved
-            there = model(tried)
-            if there is not None:
-                after = measured.rows(*there, tried, noise)[0]
-                if after @ after < misfit:
+            prediction = model(tried)
+            if prediction is not None:
+                residuals = measured.rows(*prediction, tried, noise)[0]
+                if residuals @ residuals < misfit:
                     break
         else:
             ended = "no step lowers the misfit"
             break
-        x, (y, J) = tried, there
-        measured, noise, freedom = _weighed(given, measured, x, y, J, noise, size)
-    if (silent := np.flatnonzero(freedom < SAID)).size:
+        x, (y, J) = tried, prediction
+        measured, noise, freedom = _weighed(initial, measured, x, y, J, noise, size)
+    if (silent := np.flatnonzero(freedom < MIN_NOISE_FREEDOM)).size:
         raise NoNoise(int(silent[0]))
     covariance = _covariance(measured.rows(y, J, x, noise)[1], size)
     if measured.field:
-        covariance = _Strength(given, measured, x, y, J, noise, size).covariance()
-    return Fit(
+        covariance = _Strength(initial, measured, x, y, J, noise, size).covariance()
+    return Posterior(
         x,
         y,
         J,
         measured.group,
         noise,
-        np.maximum(freedom, LEAST),
+        np.maximum(freedom, MIN_FREEDOM),
         covariance,
         misfit,
         step,
@@ -288,8 +293,8 @@ def _refuse_unseen(A: Array) -> None:
     if (idle := np.flatnonzero(length == 0)).size:
         raise NotSeen(idle)
     _, s, V = np.linalg.svd(A / length, full_matrices=False)
-    if len(s) < A.shape[1] or s[-1] < APART * s[0]:
-        raise NotSeen(np.flatnonzero(np.abs(V[-1]) > NAMED))
+    if len(s) < A.shape[1] or s[-1] < RANK_TOLERANCE * s[0]:
+        raise NotSeen(np.flatnonzero(np.abs(V[-1]) > MIN_NAMED_COMPONENT))
 
 
 def _guessed(measured: Measured, y: Array) -> Array:
@@ -301,13 +306,13 @@ def _guessed(measured: Measured, y: Array) -> Array:
 
 
 def _weighed(
-    given: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
+    initial: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
     """What is known, with the prior of the field as the data choose it; the noise, and its degrees
     of freedom.
     """
     if measured.field:
-        measured, noise = _Strength(given, measured, x, y, J, noise, size).best()
+        measured, noise = _Strength(initial, measured, x, y, J, noise, size).best()
         return measured, noise, _estimated(measured, y, J, noise, size)[1]
     return measured, *_estimated(measured, y, J, noise, size)
 
@@ -321,8 +326,8 @@ class _Strength:
     `smooth`.
     """
 
-    given: Measured
-    known: Measured
+    initial: Measured
+    measured: Measured
     x: Array
     y: Array
     J: Array
@@ -330,44 +335,53 @@ class _Strength:
     size: Array
 
     @property
-    def own(self) -> tuple[Smooth, Smooth]:
-        assert self.given.field
-        assert self.known.field
-        return self.given.field, self.known.field
+    def fields_of_priors(self) -> tuple[Smooth, Smooth]:
+        assert self.initial.field
+        assert self.measured.field
+        return self.initial.field, self.measured.field
 
     @property
-    def free(self) -> NDArray[np.int64]:
+    def unknown_strengths(self) -> NDArray[np.int64]:
         """Which of deviation and length are not given."""
-        return np.flatnonzero(np.isnan([self.own[0].deviation, self.own[0].length]))
+        return np.flatnonzero(
+            np.isnan([self.fields_of_priors[0].deviation, self.fields_of_priors[0].length])
+        )
 
     @property
     def unknown(self) -> NDArray[np.int64]:
         """Columns whose noise is not given."""
-        return np.flatnonzero(np.isnan(self.given.noise))
+        return np.flatnonzero(np.isnan(self.initial.noise))
 
     def z(self, deviation: float, length: float) -> Array:
         """Of a prior and of the noise that the search begins with."""
-        return np.log([*np.array([deviation, length])[self.free], *self.noise[self.unknown]])
+        return np.log(
+            [*np.array([deviation, length])[self.unknown_strengths], *self.noise[self.unknown]]
+        )
 
     def weighed(self, z: Array) -> tuple[Measured, Array]:
         """What is known then, and the noise."""
-        first, _ = self.own
+        first, _ = self.fields_of_priors
         values, noise = np.array([first.deviation, first.length]), np.array(self.noise)
-        values[self.free], noise[self.unknown] = (
-            np.exp(z[: len(self.free)]),
-            np.exp(z[len(self.free) :]),
+        values[self.unknown_strengths], noise[self.unknown] = (
+            np.exp(z[: len(self.unknown_strengths)]),
+            np.exp(z[len(self.unknown_strengths) :]),
         )
-        return replace(self.known, field=first.with_(float(values[0]), float(values[1]))), noise
+        return replace(
+            self.measured, field=first.with_strength(float(values[0]), float(values[1]))
+        ), noise
 
     def surprise(self, z: Array) -> float:
         """-2 ln p(d)."""
         (measured, noise), (rest, A) = self.weighed(z), self._rows(z)
         assert measured.field
         Q, R = np.linalg.qr(A * self.size)
-        least = rest @ rest - np.sum((Q.T @ rest) ** 2)
+        smallest_misfit = rest @ rest - np.sum((Q.T @ rest) ** 2)
         of_noise = 2 * np.log(noise[measured.group]).sum()
         return float(
-            of_noise - measured.field.determinant + 2 * np.log(np.abs(np.diag(R))).sum() + least
+            of_noise
+            - measured.field.determinant
+            + 2 * np.log(np.abs(np.diag(R))).sum()
+            + smallest_misfit
         )
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
@@ -376,12 +390,12 @@ class _Strength:
 
     def best(self) -> tuple[Measured, Array]:
         """The most likely ones."""
-        first, last = self.own
-        z = min((self.z(*both) for both in last.starts(first)), key=self.surprise)
+        first, last = self.fields_of_priors
+        z = min((self.z(*start) for start in last.starts(first)), key=self.surprise)
         if len(z):
-            bounds = [first.bounds[i] for i in self.free]
-            least = EXACT * float(np.abs(self.known.data).max())
-            bounds += [(least, 1e3 * float(self.noise[i])) for i in self.unknown]
+            bounds = [first.bounds[i] for i in self.unknown_strengths]
+            smallest_noise = MIN_RELATIVE_NOISE * float(np.abs(self.measured.data).max())
+            bounds += [(smallest_noise, 1e3 * float(self.noise[i])) for i in self.unknown]
             limits = np.log(bounds)
             steps = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
             options = {
@@ -398,33 +412,37 @@ class _Strength:
     def covariance(self) -> Array:
         """(p, p) of the posterior, over all strengths and noises as likely as they are (H. Rue, S. Martino and
         N. Chopin, J. R. Stat. Soc. B 71, 319, 2009, section 3): by weighted samples about the best."""
-        _, last = self.own
-        z, count = self.z(last.deviation, last.length), len(self.free) + len(self.unknown)
+        _, last = self.fields_of_priors
+        z, count = (
+            self.z(last.deviation, last.length),
+            len(self.unknown_strengths) + len(self.unknown),
+        )
         if not count:
             return _covariance(self._rows(z)[1], self.size)
 
         def mixed(a: Array, b: Array) -> float:
-            around = [
+            differences = [
                 sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
             ]
-            return sum(around) / (8 * ASIDE**2)
+            return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
 
-        step = ASIDE * np.eye(count)
-        sure, axes = np.linalg.eigh([[mixed(a, b) for b in step] for a in step])
-        wide = axes * WIDER / np.sqrt(np.maximum(sure, SUREST))
-        drawn = scipy.stats.norm.ppf(
+        step = LOG_STRENGTH_STEP * np.eye(count)
+        curvatures, axes = np.linalg.eigh([[mixed(a, b) for b in step] for a in step])
+        scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
+        normal_samples = scipy.stats.norm.ppf(
             scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:]
         )
-        samples = z + drawn @ wide.T
+        samples = z + normal_samples @ scaled_axes.T
         logarithms = (
-            np.array([-self.surprise(each) / 2 for each in samples]) + (drawn**2).sum(axis=1) / 2
+            np.array([-self.surprise(sample) / 2 for sample in samples])
+            + (normal_samples**2).sum(axis=1) / 2
         )
         weights = np.exp(logarithms - logarithms.max())
         total = np.zeros((len(self.x), len(self.x)))
-        for weight, each in zip(weights / weights.sum(), samples, strict=True):
-            rest, A = self._rows(each)
-            away = self.size * np.linalg.lstsq(A * self.size, rest, rcond=None)[0]
-            total += weight * (_covariance(A, self.size) + np.outer(away, away))
+        for weight, sample in zip(weights / weights.sum(), samples, strict=True):
+            rest, A = self._rows(sample)
+            offset = self.size * np.linalg.lstsq(A * self.size, rest, rcond=None)[0]
+            total += weight * (_covariance(A, self.size) + np.outer(offset, offset))
         return total
 
 
@@ -443,16 +461,18 @@ def _estimated(
     C = _covariance(np.vstack([J / s[:, None], measured.prior]), size)
     share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
     for column in np.flatnonzero(np.isnan(measured.noise)):
-        own = measured.group == column
-        freedom[column] = own.sum() - share[own].sum()
+        in_column = measured.group == column
+        freedom[column] = in_column.sum() - share[in_column].sum()
         estimated[column] = max(
-            np.sqrt(((measured.data - y)[own] ** 2).sum() / max(freedom[column], LEAST)),
-            EXACT * np.abs(measured.data).max(),
+            np.sqrt(
+                ((measured.data - y)[in_column] ** 2).sum() / max(freedom[column], MIN_FREEDOM)
+            ),
+            MIN_RELATIVE_NOISE * np.abs(measured.data).max(),
         )
     return estimated, freedom
 
 
-def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:
+def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
     """The largest relative difference of the misfit from its parabola, at the ends of bands along
     the longest axes.
 
@@ -460,19 +480,19 @@ def nonlinearity(model: Model, fit: Fit) -> tuple[float, int]:
     -------
     It, and at how many of these places nothing is predicted.
     """
-    fit = replace(fit, covariance=fit.local)
-    size = fit.deviation
-    spread, axes = np.linalg.eigh(fit.correlation)
-    worst, lost = 0.0, 0
+    posterior = replace(posterior, covariance=posterior.local)
+    size = posterior.deviation
+    spread, axes = np.linalg.eigh(posterior.correlation)
+    worst, lost_count = 0.0, 0
     longest = np.argsort(-spread)[:MOST_AXES]
     spread, axes = spread[longest], axes[:, longest]
-    for s, axis, far in zip(spread, axes.T, fit.quantiles(axes.T / size), strict=True):
-        for way in (-far, far):
-            x = fit.x + way * size * np.sqrt(max(s, 0.0)) * axis
-            there = model(x)
-            if there is None:
-                lost += 1
+    for s, axis, quantile in zip(spread, axes.T, posterior.quantiles(axes.T / size), strict=True):
+        for signed_quantile in (-quantile, quantile):
+            x = posterior.x + signed_quantile * size * np.sqrt(max(s, 0.0)) * axis
+            prediction = model(x)
+            if prediction is None:
+                lost_count += 1
                 continue
-            rest = fit.known.rows(*there, x, fit.noise)[0]
-            worst = max(worst, abs(float(rest @ rest - fit.misfit) / far**2 - 1))
-    return worst, lost
+            rest = posterior.measured.rows(*prediction, x, posterior.noise)[0]
+            worst = max(worst, abs(float(rest @ rest - posterior.misfit) / quantile**2 - 1))
+    return worst, lost_count

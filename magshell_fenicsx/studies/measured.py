@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from magshell_fenicsx.output.store.stored_results import PHASES
 from magshell_fenicsx.output.store.table import read_csv
 from magshell_fenicsx.platform.processes import measure
-from magshell_fenicsx.studies.runner import keep, kept
+from magshell_fenicsx.studies.runner import keep, stored_outcome
 
 TIMES = ("wall_s", "cpu_s", *PHASES, "peak_mb")
 Sample = dict[str, float | None]
@@ -76,7 +76,7 @@ def of_others(file: Path, origin: Origin) -> bool:
 
 
 def _read(file: Path) -> Timings | None:
-    timings = kept(file, TypeAdapter(Timings))
+    timings = stored_outcome(file, TypeAdapter(Timings))
     return (
         timings
         if timings and all(sample.keys() >= set(TIMES) for sample in timings.samples)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown_quantity
-from magshell_fenicsx.studies.points import short
+from magshell_fenicsx.studies.points import short_key
 
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
 NAMES = {  # words and symbol of keys
@@ -28,7 +28,7 @@ def key_words(key: str, unit: str = "") -> str:
     >>> key_words("magnetic.applied.sources.0.position.2"), key_words("shell.polar")
     ('position z', 'polar angle of shell')
     """
-    name = short(key)
+    name = short_key(key)
     if name in NAMES:
         return "  ".join(part for part in NAMES[name] if part)
     if name == "amplitude" and not unit:
@@ -56,21 +56,21 @@ def key_symbol(key: str) -> str:
     >>> key_symbol("magnetic.lambda_m"), key_symbol("mesh.degree")
     ('$\\\\lambda_\\\\mathrm{m}$ = ', 'degree ')
     """
-    symbol = NAMES.get(short(key), ("", ""))[1]
+    symbol = NAMES.get(short_key(key), ("", ""))[1]
     return f"{symbol} = " if symbol else f"{key_words(key)} "
 
 
-def load_said(row: Mapping[str, Any], name: str) -> str:
+def load_text(row: Mapping[str, Any], name: str) -> str:
     """The load of a row of a boundary in words, in the case's units if the row has it in these.
 
     Examples
     --------
-    >>> load_said({"load": 0.5}, "pressure"), load_said({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
+    >>> load_text({"load": 0.5}, "pressure"), load_text({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
     ('p/pc = 0.5', 'p = 61.25 Pa')
     """
-    of = shown_quantity(amplitude(name).column, row)
-    return f"{of.ascii_symbol} = {row.get(of.name, row['load']):.9g}" + (
-        f" {of.si}" if of.name in row else ""
+    load_quantity = shown_quantity(amplitude(name).column, row)
+    return f"{load_quantity.ascii_symbol} = {row.get(load_quantity.name, row['load']):.9g}" + (
+        f" {load_quantity.si}" if load_quantity.name in row else ""
     )
 
 
@@ -103,7 +103,7 @@ def result_words(result: str) -> str:
         return rf"$\omega_{{{number[1]}}}^2 \rho R^2/E$"
     if number := re.fullmatch(r"hertz_(\d+)", result):
         return f"frequency {number[1]}"
-    result = given[0] if (given := split_unit(result)) else result
+    result = name_and_unit[0] if (name_and_unit := split_unit(result)) else result
     if component := re.fullmatch(r"(.+)_([fum])([xyz])", result):
         return f"${component[2]}_{component[3]}$ of {component[1].replace('_', ' ')}"
     return result.replace("_", " ")
@@ -117,11 +117,15 @@ def result_label(result: str) -> str:
     >>> result_label("applied_mT"), result_label("tip_uz_mm"), result_label("hertz_1")
     ('applied field  $B_\\\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
     """
-    for each in QUANTITIES.values():
-        for column in (each, *each.in_units):
+    for column_quantity in QUANTITIES.values():
+        for column in (column_quantity, *column_quantity.in_units):
             if column.name == result:
                 return column.label
     unit = (
-        "Hz" if result.startswith("hertz_") else given[1] if (given := split_unit(result)) else ""
+        "Hz"
+        if result.startswith("hertz_")
+        else name_and_unit[1]
+        if (name_and_unit := split_unit(result))
+        else ""
     )
     return result_words(result) + (f"  ({unit})" if unit else "")

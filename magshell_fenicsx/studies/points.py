@@ -18,7 +18,7 @@ import numpy as np
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
-from magshell_fenicsx.studies.runner import Case, Made
+from magshell_fenicsx.studies.runner import Case, MakeCase
 
 MOST_POINTS = 10_000
 FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
@@ -62,7 +62,7 @@ class Axis:
         return in_unit(value, self.unit)
 
 
-def along(axes: Sequence[Axis]) -> Axis | None:
+def last_numeric_axis(axes: Sequence[Axis]) -> Axis | None:
     """The last axis with numbers; curves are drawn and folds are followed along it."""
     return next((axis for axis in reversed(axes) if axis.numbers), None)
 
@@ -115,7 +115,8 @@ def _range(text: str, values: str) -> tuple[str, ...]:
         start, stop, count = *ends, int(number)
     except ValueError:
         raise CaseError(
-            f"--over {text}: {values} is not start:stop:count (two numbers of one unit and a whole number)"
+            f"--over {text}: {values} is not start:stop:count (two numbers of one unit and a whole "
+            "number)"
         ) from None
     if not (math.isfinite(start) and math.isfinite(stop)):
         raise CaseError(f"--over {text}: start and stop must be finite")
@@ -154,10 +155,10 @@ class SweepPoint:
     @property
     def label(self) -> str:
         """For example `energy=full, remanent.polar=45`."""
-        return ", ".join(f"{short(key)}={value}" for key, value in self.values.items())
+        return ", ".join(f"{short_key(key)}={value}" for key, value in self.values.items())
 
 
-def make_points(source: Source, axes: Sequence[Axis], made: Made) -> list[SweepPoint]:
+def make_points(source: Source, axes: Sequence[Axis], make_case: MakeCase) -> list[SweepPoint]:
     """All points, in the order of the product, the last axis fastest.
 
     Raises
@@ -169,7 +170,7 @@ def make_points(source: Source, axes: Sequence[Axis], made: Made) -> list[SweepP
     if count > MOST_POINTS:
         raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
     return [
-        make_point(source, axes, values, made)
+        make_point(source, axes, values, make_case)
         for values in product(*(axis.values for axis in axes))
     ]
 
@@ -191,23 +192,25 @@ def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> S
 
 
 def make_point(
-    source: Source, axes: Sequence[Axis], values: Sequence[str], made: Made
+    source: Source, axes: Sequence[Axis], values: Sequence[str], make_case: MakeCase
 ) -> SweepPoint:
     """The point with one value for each axis."""
-    varied = copy.deepcopy(source)
-    chosen = {key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys}
-    assignments = [f"{key}={value}" for key, value in chosen.items()]
+    point_source = copy.deepcopy(source)
+    values_by_key = {
+        key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys
+    }
+    assignments = [f"{key}={value}" for key, value in values_by_key.items()]
     try:
         for assignment in assignments:
-            override(varied, assignment)
-        case = made(varied)
+            override(point_source, assignment)
+        case = make_case(point_source)
         refuse_beyond_memory(case.problem())  # raises its errors, such as a missing mirror plane
     except CaseError as e:
         message = str(e)
         for assignment in assignments:
             message = message.replace(f"--set {assignment}", f"--over {assignment}")
         raise CaseError(f"{message}\nin the point {', '.join(assignments)}") from None
-    return SweepPoint(chosen, case, identity(case))
+    return SweepPoint(values_by_key, case, identity(case))
 
 
 def identity(case: Case) -> str:
@@ -224,7 +227,7 @@ def identity(case: Case) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def short(key: str) -> str:
+def short_key(key: str) -> str:
     """The short name of a key: `energy`, `remanent.polar`."""
     words = key.split(".")
     return ".".join(words[-2:] if words[-1] in ("polar", "azimuth") else words[-1:])

@@ -86,13 +86,14 @@ def parse_scalar(text: str) -> Scalar:
     if text in IN_SUMMARY:
         return Scalar(text)
     column, _, place = text.partition("@")
-    at, _, number = place.partition("=")
+    place_column, _, number = place.partition("=")
     if re.fullmatch(r"(omega2|hertz)_\d+", column):
         raise CaseError(
             f"--result {text}: {column} is a natural frequency, which path.csv has not: runs with "
-            "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients take it as a result"
+            "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients "
+            "take it as a result"
         )
-    for name in (column, at) if place != "end" else (column,):
+    for name in (column, place_column) if place != "end" else (column,):
         if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
             raise CaseError(
                 f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}"
@@ -105,18 +106,18 @@ def parse_scalar(text: str) -> Scalar:
         value = math.nan
     if not math.isfinite(value):
         raise CaseError(f"--result {text}: {number or 'nothing'} is no finite number; {FORMS}")
-    return Scalar(text, column, at, value)
+    return Scalar(text, column, place_column, value)
 
 
 def _crossing(
-    path: Sequence[Mapping[str, str]], column: str, at: str, value: float
+    path: Sequence[Mapping[str, str]], column: str, place_column: str, value: float
 ) -> float | None:
-    """A column at the first point where the column `at` has a value, by cubic interpolation.
+    """A column at the first point where the column `place_column` has a value, by cubic interpolation.
 
     The interpolation uses points of one load, because the curve has a corner at the end of the
     field. At a requested point of the path the result is the number in its row.
     """
-    x = [float(row[at]) for row in path]
+    x = [float(row[place_column]) for row in path]
     i = next(
         (
             i
@@ -126,10 +127,10 @@ def _crossing(
         None,
     )
     if i is None:
-        met = bool(x) and math.isclose(
+        target_reached = bool(x) and math.isclose(
             x[-1], value, rel_tol=1e-9
         )  # a target is reached within the solver's tolerance
-        return float(path[-1][column]) if met else None
+        return float(path[-1][column]) if target_reached else None
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
         first -= 1

@@ -39,14 +39,14 @@ from magshell_fenicsx.studies.results import Scalar
 # what the front end makes of a source; `problem()` makes its problem: a study does not know its
 # class
 Case = Any
-Made = Callable[[Source], Case]
+MakeCase = Callable[[Source], Case]
 Say = Callable[[str], None]
-Kept = TypeVar("Kept")
+OutcomeType = TypeVar("OutcomeType")
 Task = TypeVar("Task")
-Found = Literal["path", "fold"]
+OutcomeOrigin = Literal["path", "fold"]
 FAILED = "failed: "  # what `stopped` begins with if an error ended the run
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
-EACH = terminal.STATUS_SECONDS  # s
+SECONDS_BETWEEN_LINES = terminal.STATUS_SECONDS  # s
 
 
 @dataclass(frozen=True)
@@ -82,15 +82,15 @@ class Folder:
 
         def make(folder: Path) -> None:
             refuse_other_tables(folder, self.tables, self.keys, self.what, case)
-            for made in (folder, folder / self.points):
-                made.mkdir(parents=True, exist_ok=True)
+            for directory in (folder, folder / self.points):
+                directory.mkdir(parents=True, exist_ok=True)
             if self.first:
                 (folder / self.first).touch()
 
         return prepare_folder(out, comm, make)
 
     @contextmanager
-    def held(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
+    def locked(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
         """The same for one job alone, which holds it inside `with`; collective."""
         with locked_folder(out, comm, make=True):
             self.prepare(out, comm, case)
@@ -114,7 +114,9 @@ def keep(file: Path, content: Mapping[str, Any]) -> None:
         raise DiskError(f"{file} cannot be written: {e.strerror}") from e
 
 
-def kept(file: Path, kind: TypeAdapter[Kept], key: str = "", **same: Any) -> Kept | None:
+def stored_outcome(
+    file: Path, kind: TypeAdapter[OutcomeType], key: str = "", **same: Any
+) -> OutcomeType | None:
     """The outcome in a file.
 
     None if there is none, it is damaged, or the file has other values than `same`.
@@ -128,7 +130,7 @@ def kept(file: Path, kind: TypeAdapter[Kept], key: str = "", **same: Any) -> Kep
         return None
 
 
-def part_of(part: str | None, count: int, of: str) -> tuple[int, int]:
+def part_of(part: str | None, count: int, items: str) -> tuple[int, int]:
     """The numbers i and n of a part "i/n", one of n jobs.
 
     Examples
@@ -144,7 +146,7 @@ def part_of(part: str | None, count: int, of: str) -> tuple[int, int]:
         and 1 <= int(first) <= int(number) <= count
     ):
         raise CaseError(
-            f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {of}"
+            f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {items}"
         )
     return int(first), int(number)
 
@@ -162,16 +164,20 @@ def compute(
     do
         Computes a task, keeps the outcome of each of its runs, and yields a line of text for it.
     """
-    begun, done = time.perf_counter(), 0
+    start_time, done_count = time.perf_counter(), 0
 
-    def rest() -> str:
-        return _rest(time.perf_counter() - begun, done, len(tasks)) if done else ""
+    def remaining_text() -> str:
+        return (
+            _remaining_by_count(time.perf_counter() - start_time, done_count, len(tasks))
+            if done_count
+            else ""
+        )
 
-    with _together(comm), heard(comm, say, rest) as told:
+    with _wait_for_all(comm), heard(comm, say, remaining_text) as progress:
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
-                done = i + 1
-                told(line + rest())
+                done_count = i + 1
+                progress(line + remaining_text())
 
 
 class Heard:
@@ -183,8 +189,8 @@ class Heard:
         What is added then: the rest of the time in words.
     """
 
-    def __init__(self, say: Say, rest: Callable[[], str] = str) -> None:
-        self._say, self._rest, self._ended = say, rest, threading.Event()
+    def __init__(self, say: Say, remaining_text: Callable[[], str] = str) -> None:
+        self._say, self._rest, self._ended = say, remaining_text, threading.Event()
         self._begun = self._last = time.perf_counter()
 
     def __call__(self, line: str) -> None:
@@ -193,55 +199,57 @@ class Heard:
 
     def remind(self) -> None:
         """Until `end`."""
-        while not self._ended.wait(max(0.01, self._last + EACH - time.perf_counter())):
-            if (now := time.perf_counter()) - self._last >= EACH:
-                self(f"still computing, {clock(now - self._begun)} so far{self._rest()}")
+        while not self._ended.wait(
+            max(0.01, self._last + SECONDS_BETWEEN_LINES - time.perf_counter())
+        ):
+            if (time_now := time.perf_counter()) - self._last >= SECONDS_BETWEEN_LINES:
+                self(f"still computing, {clock(time_now - self._begun)} so far{self._rest()}")
 
     def end(self) -> None:
         self._ended.set()
 
 
 @contextmanager
-def heard(comm: MPI.Comm, say: Say, rest: Callable[[], str] = str) -> Iterator[Say]:
+def heard(comm: MPI.Comm, say: Say, remaining_text: Callable[[], str] = str) -> Iterator[Say]:
     """A `Heard`, whose reminders rank 0 says; what is one already stays the only one."""
     if isinstance(say, Heard) or comm.rank:
         yield say
         return
-    told = Heard(say, rest)
-    thread = threading.Thread(target=told.remind, daemon=True)
+    progress = Heard(say, remaining_text)
+    thread = threading.Thread(target=progress.remind, daemon=True)
     thread.start()
     try:
-        yield told
+        yield progress
     finally:
-        told.end()
+        progress.end()
         thread.join()
 
 
-def rest_said(left: float, about: str = "about ") -> str:
+def remaining_time_text(seconds: float, prefix: str = "about ") -> str:
     """The rest of the time in words; empty if it is short.
 
     Examples
     --------
-    >>> rest_said(600.0), rest_said(8.0), rest_said(30.0, "at most about ")
+    >>> remaining_time_text(600.0), remaining_time_text(8.0), remaining_time_text(30.0, "at most about ")
     (', about 10 min left', '', ', at most about 30 s left')
     """
-    if left < LEAST_LEFT:
+    if seconds < LEAST_LEFT:
         return ""
     size, unit = next(
-        (size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size
+        (size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if seconds >= 1.5 * size
     )
-    return f", {about}{left / size:.0f} {unit} left"
+    return f", {prefix}{seconds / size:.0f} {unit} left"
 
 
-def _rest(seconds: float, done: int, count: int) -> str:
+def _remaining_by_count(seconds: float, done_count: int, count: int) -> str:
     """How long the others take if they go on as those before.
 
     Examples
     --------
-    >>> _rest(60.0, 1, 11), _rest(60.0, 10, 11), _rest(90.0, 4, 5)
+    >>> _remaining_by_count(60.0, 1, 11), _remaining_by_count(60.0, 10, 11), _remaining_by_count(90.0, 4, 5)
     (', about 10 min left', '', ', about 22 s left')
     """
-    return rest_said(seconds * (count / done - 1))
+    return remaining_time_text(seconds * (count / done_count - 1))
 
 
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
@@ -257,10 +265,10 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
     if comm.rank == 0:
         window.tomemory()[:] = counter.tobytes()
     comm.Barrier()
-    one, number = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    increment, number = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     while True:
         window.Lock(0)
-        window.Fetch_and_op(one, number, 0)
+        window.Fetch_and_op(increment, number, 0)
         window.Unlock(0)
         if number[0] >= count:
             break
@@ -269,7 +277,7 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
 
 
 @contextmanager
-def _together(comm: MPI.Intracomm) -> Iterator[None]:
+def _wait_for_all(comm: MPI.Intracomm) -> Iterator[None]:
     """Wait at the end for all ranks; an error on one of several ends all, which would wait for it
     for ever.
     """
@@ -325,7 +333,7 @@ class Outcome:
     dofs: int | None
     wall_s: float
     curve: list[Row]
-    found: Found
+    found: OutcomeOrigin
     factorisations: int
     barrier: float | None = None
     cpu_s: float = 0.0
@@ -353,8 +361,8 @@ class Outcome:
     def serves(self, scalar: Scalar) -> bool:
         """Whether it has what a number needs: of a fold alone only the knockdown is known."""
         needed = {scalar.column, scalar.at} & set(COLUMNS)
-        whole = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
-        return whole or scalar.name == "knockdown"
+        has_path = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
+        return has_path or scalar.name == "knockdown"
 
 
 OUTCOME = TypeAdapter(Outcome)
@@ -362,7 +370,7 @@ OUTCOME = TypeAdapter(Outcome)
 
 def outcome_of(
     result: Result,
-    found: Found,
+    origin: OutcomeOrigin,
     factorisations: int,
     wall_s: float = 0.0,
     columns: Sequence[str] = COLUMNS,
@@ -374,7 +382,7 @@ def outcome_of(
         result.limit_points,
         key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
     )
-    chosen = dict.fromkeys((*columns, *result.scene.extra_columns))
+    kept_columns = dict.fromkeys((*columns, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
         limit=next(iter(limits), None) or _event(result),
@@ -384,16 +392,16 @@ def outcome_of(
         curve=[
             {
                 key: v if isinstance(v := row[key], str | int) else float(v)
-                for key in chosen
+                for key in kept_columns
                 if key in row
             }
             for row in result.rows
         ],
-        found=found,
+        found=origin,
         factorisations=factorisations,
         barrier=result.barrier,
         in_units=in_units(result),
-        snaps=snaps(result.rows) if found == "path" else [],
+        snaps=snaps(result.rows) if origin == "path" else [],
     )
 
 
@@ -419,6 +427,6 @@ def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
     keep(file, {**origin, "outcome": asdict(outcome)})
 
 
-def kept_outcome(file: Path) -> Outcome | None:
-    """The outcome of a case in a file, if these sources have computed it; see `kept`."""
-    return kept(file, OUTCOME, "outcome", sources=code_version())
+def stored_outcome_of_case(file: Path) -> Outcome | None:
+    """The outcome of a case in a file, if these sources have computed it; see `stored_outcome`."""
+    return stored_outcome(file, OUTCOME, "outcome", sources=code_version())

@@ -10,7 +10,7 @@ from magshell_fenicsx.input.chance import NoRoom
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.source import CaseError, Source, override
 from magshell_fenicsx.studies.points import identity, value_at
-from magshell_fenicsx.studies.runner import Case, Made
+from magshell_fenicsx.studies.runner import Case, MakeCase
 from magshell_fenicsx.studies.sections import EnsembleSection
 
 Values = dict[str, Any]
@@ -40,7 +40,7 @@ class Sample:
 
 
 def make_samples(
-    source: Source, seed: int, numbers: Sequence[int], made: Made, deleted: int = 0
+    source: Source, seed: int, numbers: Sequence[int], make_case: MakeCase, deleted: int = 0
 ) -> list[Sample]:
     """Draw samples; each is a valid case.
 
@@ -57,7 +57,7 @@ def make_samples(
         If the case has no section `ensemble`, or a sample is no valid case; nothing has been
         computed then.
     """
-    section = made(source).ensemble
+    section = make_case(source).ensemble
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
     shells = list(source.data.get("shells") or ())
@@ -65,16 +65,18 @@ def make_samples(
         section.refuse_unfit(shells)
     except ValueError as e:
         raise CaseError(str(e)) from None
-    refuse_unknown_keys(source, section, made)
+    refuse_unknown_keys(source, section, make_case)
     samples = []
     for number in numbers:
-        drawn = dict[str, str]()
+        drawn_texts = dict[str, str]()
         try:
-            drawn = section.settings(seed, number, shells)
-            samples.append(_sample(source, number, drawn, made, deleted))
+            drawn_texts = section.settings(seed, number, shells)
+            samples.append(_sample(source, number, drawn_texts, make_case, deleted))
         except (CaseError, NoRoom) as e:
             message = in_the_file(
-                str(e), source, {key: text for key, text in drawn.items() if key in section.keys}
+                str(e),
+                source,
+                {key: text for key, text in drawn_texts.items() if key in section.keys},
             )
             raise CaseError(
                 f"{message}\nin sample {number} of seed {seed}; bounds keep a distribution in"
@@ -83,31 +85,31 @@ def make_samples(
 
 
 def _sample(
-    source: Source, number: int, drawn: Mapping[str, str], made: Made, deleted: int
+    source: Source, number: int, drawn_texts: Mapping[str, str], make_case: MakeCase, deleted: int
 ) -> Sample:
     drawn_source = copy.deepcopy(source)
     del drawn_source.data["ensemble"]
-    for key, text in drawn.items():
+    for key, text in drawn_texts.items():
         override(drawn_source, f"{key}={text}")
     values = {
         path: value
-        for key in drawn
+        for key in drawn_texts
         for path, value in _flat(key, value_at(drawn_source.data, key.split(".")))
     }
-    case = made(drawn_source)
+    case = make_case(drawn_source)
     ranked = _defects(drawn_source.data, case)
     if deleted:
         if len(ranked) <= deleted:
             raise CaseError(
                 f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects"
             )
-        gone = {id(defect) for defect in ranked[:deleted]}
+        deleted_ids = {id(defect) for defect in ranked[:deleted]}
         for shell, _ in _shells(drawn_source.data, case):
             if "imperfections" in shell:
                 shell["imperfections"] = [
-                    item for item in shell["imperfections"] if id(item) not in gone
+                    item for item in shell["imperfections"] if id(item) not in deleted_ids
                 ]
-        case = made(drawn_source)
+        case = make_case(drawn_source)
     case.problem()
     return Sample(
         number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case)
@@ -133,7 +135,7 @@ def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
         listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
         single = getattr(section, "defect", None)
         sections = section.imperfections or ([single] if single else [])
-        sizes = [getattr(each, "amplitude", None) for each in sections]
+        sizes = [getattr(section_of_defect, "amplitude", None) for section_of_defect in sections]
         sized += [
             (abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None
         ]
@@ -143,7 +145,9 @@ def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
 def _shells(data: Any, case: Case) -> list[tuple[dict[str, Any], Any]]:
     """The data and the section of each shell."""
     if case.shells:
-        return [(data["shells"][name]["shell"], each.shell) for name, each in case.shells.items()]
+        return [
+            (data["shells"][name]["shell"], member.shell) for name, member in case.shells.items()
+        ]
     return [(data["shell"], case.shell)]
 
 
@@ -151,7 +155,7 @@ def _shells(data: Any, case: Case) -> list[tuple[dict[str, Any], Any]]:
 OF_KEYS = ("extra_forbidden", "model_type", "model_attributes_type", "list_type", "dict_type")
 
 
-def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) -> None:
+def refuse_unknown_keys(source: Source, section: EnsembleSection, make_case: MakeCase) -> None:
     """Refuse random keys that the case cannot have, whatever their values: before any sample is
     drawn.
 
@@ -161,7 +165,7 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) ->
         One message with every such key.
     """
     middle, refused = (
-        {key: json.dumps(each.quantile(0.5)) for key, each in section.keys.items()},
+        {key: json.dumps(distribution.quantile(0.5)) for key, distribution in section.keys.items()},
         list[str](),
     )
     changed = copy.deepcopy(source)
@@ -172,7 +176,7 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) ->
         except CaseError as e:
             refused.append(str(e))
     try:
-        made(changed)
+        make_case(changed)
     except InvalidCase as e:
         refused += e.lines_of_kinds(*OF_KEYS)
     except CaseError:
@@ -181,9 +185,9 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, made: Made) ->
         raise CaseError(in_the_file("\n".join(refused), source, middle))
 
 
-def in_the_file(message: str, source: Source, drawn: Mapping[str, str]) -> str:
+def in_the_file(message: str, source: Source, drawn_texts: Mapping[str, str]) -> str:
     """A message about settings that were drawn, with the places of their distributions."""
-    for key, text in drawn.items():
+    for key, text in drawn_texts.items():
         place = f"{source.place(('ensemble', 'keys', key))}: ensemble.keys: "
         message = message.replace(f"--set {key}={text}: {key}: ", f"{place}{key}: ")
         message = message.replace(f"--set {key}={text}: ", f"{place}{key}: ")

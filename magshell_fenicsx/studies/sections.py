@@ -41,7 +41,7 @@ class ShapeSection(Section):
         return self
 
 
-WANTED = ("maximise", "minimise", "reach", "shape")
+OBJECTIVE_KEYS = ("maximise", "minimise", "reach", "shape")
 Results = Annotated[
     Annotated[str, Tag("one")] | Annotated[list[str], Tag("several"), Field(min_length=1)],
     Discriminator(lambda data: "several" if isinstance(data, list) else "one"),
@@ -67,10 +67,11 @@ class ObjectiveSection(Section):
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
-        given = [key for key in WANTED if getattr(self, key) is not None]
-        if len(given) != 1:
+        given_keys = [key for key in OBJECTIVE_KEYS if getattr(self, key) is not None]
+        if len(given_keys) != 1:
             raise ValueError(
-                f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}"
+                f"give one of maximise, minimise, reach and shape, here "
+                f"{', '.join(given_keys) or 'none'}"
             )
         if (self.reach is None) != (self.value is None):
             raise ValueError("reach and value belong together")
@@ -186,17 +187,18 @@ class DesignSection(Section):
     def _something_varies(self) -> Self:
         if not self.numbers and self.remanence is None and not self.fields:
             raise ValueError(
-                "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies"
+                "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing "
+                "varies"
             )
         if self.thickness and self.thickness.values[0] <= 0:
             raise ValueError("thickness: values: must be positive")
-        for key, written in self.numbers.items():
+        for key, bounds_text in self.numbers.items():
             try:
-                least, most, _ = self.bounds(key)
+                lower, upper, _ = self.bounds(key)
             except ValueError as e:
                 raise ValueError(f"numbers: {key}: {e}") from None
-            if not least < most:
-                places = ", ".join(map(str, written))
+            if not lower < upper:
+                places = ", ".join(map(str, bounds_text))
                 raise ValueError(
                     f"numbers: {key}: the first bound must be less than the second, here {places}"
                 )
@@ -210,12 +212,14 @@ class DesignSection(Section):
         ValueError
             If one bound is not in that unit.
         """
-        least, most = map(str, self.numbers[key])
-        unit = number_and_unit(least)[1] or number_and_unit(most)[1]
-        for bound in (least, most) if unit else ():
-            if not number_and_unit(bound)[1] and bound not in ("0", "0.0"):
-                raise ValueError(f"{bound.removesuffix('.0')} has no unit: give both bounds one")
-        return in_unit(least, unit), in_unit(most, unit), unit
+        lower, upper = map(str, self.numbers[key])
+        unit = number_and_unit(lower)[1] or number_and_unit(upper)[1]
+        for bound_text in (lower, upper) if unit else ():
+            if not number_and_unit(bound_text)[1] and bound_text not in ("0", "0.0"):
+                raise ValueError(
+                    f"{bound_text.removesuffix('.0')} has no unit: give both bounds one"
+                )
+        return in_unit(lower, unit), in_unit(upper, unit), unit
 
     @property
     def fields(self) -> dict[str, FieldVariables]:
@@ -231,17 +235,19 @@ class DesignSection(Section):
         """The first key below `design` that names a result."""
         if result in self.objective.results:
             return next(
-                f"objective.{key}" for key in WANTED if getattr(self.objective, key) is not None
+                f"objective.{key}"
+                for key in OBJECTIVE_KEYS
+                if getattr(self.objective, key) is not None
             )
-        named = ((f"constraints.{i}", limit) for i, limit in enumerate(self.constraints))
+        named_limits = ((f"constraints.{i}", limit) for i, limit in enumerate(self.constraints))
         return next(
             f"{key}.{'of' if limit.of == result else 'same_as'}"
-            for key, limit in named
+            for key, limit in named_limits
             if result in limit.names
         )
 
     @property
-    def named(self) -> dict[str, str]:
+    def named_results(self) -> dict[str, str]:
         """Results but a wanted shape -> the keys that name them."""
         shape = ["shape"] if self.objective.shape else []
         return {
@@ -290,9 +296,14 @@ class EnsembleSection(Section):
     def _something_is_random(self) -> Self:
         if not self.keys and self.defects is None:
             raise ValueError("needs keys or defects: otherwise nothing is random")
-        taken = tuple(f"shells.{on}.{IMPERFECTIONS}" if on else IMPERFECTIONS for on in self._on)
+        reserved_keys = tuple(
+            f"shells.{shell_name}.{IMPERFECTIONS}" if shell_name else IMPERFECTIONS
+            for shell_name in self._shells_with_defects
+        )
         for key in self.keys:
-            if key.startswith(taken) or (None in self._on and f".{IMPERFECTIONS}" in key):
+            if key.startswith(reserved_keys) or (
+                None in self._shells_with_defects and f".{IMPERFECTIONS}" in key
+            ):
                 raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
         return self
 
@@ -307,12 +318,12 @@ class EnsembleSection(Section):
         )
 
     @property
-    def _on(self) -> list[str | None]:
-        return [each.on for each in self._listed]
+    def _shells_with_defects(self) -> list[str | None]:
+        return [defects.on for defects in self._listed]
 
     def refuse_unfit(self, shells: Collection[str]) -> None:
         """See that the case has the shells that have defects; raises ValueError otherwise."""
-        for name in self._on:
+        for name in self._shells_with_defects:
             if name and not shells:
                 raise ValueError("ensemble.defects.on: names one of several shells: leave it out")
             if name and name not in shells:
@@ -337,20 +348,22 @@ class EnsembleSection(Section):
         NoRoom
             If no places were found for the defects.
         """
-        drawn: dict[str, Value | list[Any]] = {
+        drawn_values: dict[str, Value | list[Any]] = {
             key: distribution.draw(generator(seed, number, key))
             for key, distribution in self.keys.items()
         }
         defects = dict[str, list[Any]]()
-        named = [
-            (each, name)
-            for each in self._listed
-            for name in ([each.on] if each.on else [*shells] or [""])
+        defects_by_shell = [
+            (defect_section, name)
+            for defect_section in self._listed
+            for name in ([defect_section.on] if defect_section.on else [*shells] or [""])
         ]
-        for i, (each, name) in enumerate(named):
+        for i, (defect_section, name) in enumerate(defects_by_shell):
             key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
-            before = sum(other == name for _, other in named[:i])
-            of_its_own = (f"{key}.{before}" if before else key) if i else IMPERFECTIONS
-            defects.setdefault(key, []).extend(each.draw(generator(seed, number, of_its_own)))
-        drawn |= defects
-        return {key: json.dumps(value) for key, value in drawn.items()}
+            count_before = sum(other == name for _, other in defects_by_shell[:i])
+            of_its_own = (f"{key}.{count_before}" if count_before else key) if i else IMPERFECTIONS
+            defects.setdefault(key, []).extend(
+                defect_section.draw(generator(seed, number, of_its_own))
+            )
+        drawn_values |= defects
+        return {key: json.dumps(value) for key, value in drawn_values.items()}

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 JITTER = 1e-8  # of a variance: keeps the matrix of places that are close definite
 WEAKEST, STRONGEST = 1e-3, 1e2  # bounds of s, over the field's unit
 LONGEST = 3.0  # bound of l, over the largest distance
-LOOKED = 4  # values of s and of l that the search starts from
+START_VALUES = 4  # values of s and of l that the search starts from
 EDGE = 1.01  # factor within which a bound is reached
 
 
@@ -65,9 +65,9 @@ class Smooth:
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Least and largest s and l that are looked at; l from the distance of neighbours on."""
-        apart = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
+        distances = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
         return (WEAKEST, STRONGEST), (
-            float(np.median(apart.min(axis=1))),
+            float(np.median(distances.min(axis=1))),
             LONGEST * float(self.distances.max()),
         )
 
@@ -101,19 +101,23 @@ class Smooth:
             if not low * EDGE < value < high / EDGE
         ]
 
-    def with_(self, deviation: float, length: float) -> "Smooth":
+    def with_strength(self, deviation: float, length: float) -> "Smooth":
         """The same prior of another strength."""
         return replace(self, deviation=deviation, length=length)
 
-    def starts(self, given: "Smooth") -> list[tuple[float, float]]:
+    def starts(self, prior: "Smooth") -> list[tuple[float, float]]:
         """Strengths that a search begins with; what is given is kept."""
         if np.isfinite(self.deviation):
             return [(self.deviation, self.length)]
-        (_, _), (near, far) = self.bounds
+        (_, _), (shortest, longest) = self.bounds
         deviations = (
-            np.geomspace(0.03, 3.0, LOOKED) if np.isnan(given.deviation) else [given.deviation]
+            np.geomspace(0.03, 3.0, START_VALUES)
+            if np.isnan(prior.deviation)
+            else [prior.deviation]
         )
         lengths = (
-            np.geomspace(2 * near, far / 2, LOOKED) if np.isnan(given.length) else [given.length]
+            np.geomspace(2 * shortest, longest / 2, START_VALUES)
+            if np.isnan(prior.length)
+            else [prior.length]
         )
         return [(float(s), float(ell)) for s in deviations for ell in lengths]

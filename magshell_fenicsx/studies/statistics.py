@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 RESULT, WITHOUT = "result", "result_without_weakest"
 SEVEREST = "severest."
-FIRST = ("sample", "status", RESULT)
-LAST = ("found", "factorisations", "dofs", "cpu_s", "wall_s", "why", "point")
+FIRST_COLUMNS = ("sample", "status", RESULT)
+LAST_COLUMNS = ("found", "factorisations", "dofs", "cpu_s", "wall_s", "why", "point")
 STATUS = {
     "found": "with a result",
     "stopped": "stopped early",
@@ -37,7 +37,7 @@ STATUS = {
     "missing": "not computed",
 }
 RESAMPLED = 300
-LEAST = 3  # samples for a correlation
+MIN_SAMPLES_FOR_CORRELATION = 3  # samples for a correlation
 LEAST_DIFFERENT = 8  # different values for three parameters
 SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
 GRID, ROUNDS = (
@@ -99,14 +99,18 @@ def severest_keys(rows: Sequence[Row]) -> list[str]:
 
 def drawn_keys(rows: Sequence[Row]) -> list[str]:
     """The columns of drawn values, in the order of the rows."""
-    others = {*FIRST, *LAST, *severest_keys(rows), WITHOUT}
+    others = {*FIRST_COLUMNS, *LAST_COLUMNS, *severest_keys(rows), WITHOUT}
     return list(dict.fromkeys(key for row in rows for key in row if key not in others))
 
 
 def write_samples(rows: Sequence[Row], file: Path) -> None:
     """Write samples.csv."""
-    more = [WITHOUT] if any(WITHOUT in row for row in rows) else []
-    write_csv(rows, (*FIRST, *more, *severest_keys(rows), *drawn_keys(rows), *LAST), file)
+    extra_columns = [WITHOUT] if any(WITHOUT in row for row in rows) else []
+    write_csv(
+        rows,
+        (*FIRST_COLUMNS, *extra_columns, *severest_keys(rows), *drawn_keys(rows), *LAST_COLUMNS),
+        file,
+    )
 
 
 def results(rows: Sequence[Row], column: str = RESULT) -> Array:
@@ -129,7 +133,9 @@ def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         **moments(values),
         "weibull": _weibull(values),
         "level": LEVEL,
-        "intervals": intervals(values, seed, RESAMPLED) if len(values) >= LEAST else {},
+        "intervals": intervals(values, seed, RESAMPLED)
+        if len(values) >= MIN_SAMPLES_FOR_CORRELATION
+        else {},
         "correlations": correlations(rows),
         "without_weakest": _without(rows),
         "cpu_s_per_sample": float(
@@ -161,13 +167,13 @@ def moments(values: Array) -> dict[str, Any]:
 
 
 def _weibull(values: Array) -> dict[str, Any] | None:
-    fitted = fit(values) if len(values) else None
-    if fitted is None:
+    weibull = fit(values) if len(values) else None
+    if weibull is None:
         return None
     return {
-        **asdict(fitted),
-        "quantile_1_percent": fitted.quantile(0.01),
-        "distance": distance(values, fitted),
+        **asdict(weibull),
+        "quantile_1_percent": weibull.quantile(0.01),
+        "distance": distance(values, weibull),
     }
 
 
@@ -183,8 +189,8 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         "shell.imperfections.",
         *(key.removesuffix(place) for key in keys if key.endswith(f".{place}")),
     )
-    drawn = [key for key in keys if not key.startswith(of_defects)]
-    for key in (*severest_keys(rows), *drawn):
+    drawn_keys_only = [key for key in keys if not key.startswith(of_defects)]
+    for key in (*severest_keys(rows), *drawn_keys_only):
         pairs = np.array(
             [
                 (x, y)
@@ -192,7 +198,7 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
                 if isinstance(x := row.get(key), float | int) and (y := row[RESULT]) is not None
             ]
         )
-        if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
+        if len(pairs) < MIN_SAMPLES_FOR_CORRELATION or not np.ptp(pairs, axis=0).all():
             continue
         x, y = pairs.T
         correlated[key] = {
@@ -204,19 +210,19 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
     """The change of the result by deleting the weakest defects, over the samples that have both."""
-    both = [
+    value_pairs = [
         (row[RESULT], row[WITHOUT])
         for row in rows
         if row[RESULT] is not None and row.get(WITHOUT) is not None
     ]
-    if not both:
+    if not value_pairs:
         return None
-    whole, less = np.array(both).T
-    change = less / whole - 1
+    all_values, values_without_weakest = np.array(value_pairs).T
+    change = values_without_weakest / all_values - 1
     return {
-        "samples": len(both),
-        "mean": float(less.mean()),
-        "change_of_mean": float(less.mean() / whole.mean() - 1),
+        "samples": len(value_pairs),
+        "mean": float(values_without_weakest.mean()),
+        "change_of_mean": float(values_without_weakest.mean() / all_values.mean() - 1),
         "largest_change": float(change[np.argmax(np.abs(change))]),
     }
 
@@ -237,7 +243,7 @@ class Weibull:
     scale: float
     bounded: bool
 
-    def below(self, x: Array) -> Array:
+    def probability_below(self, x: Array) -> Array:
         """The probability of a smaller value."""
         return np.asarray(weibull_min.cdf(x, self.shape, self.location, self.scale))
 
@@ -269,21 +275,23 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
         step = tried[1] - tried[0]
         low, high = max(best - step, ends[0]), min(best + step, ends[1])
     location = x[0] - spread * float(np.exp(best))
-    shape, scale = (float(v[0]) for v in _at(x, np.array([location])))
+    shape, scale = (float(v[0]) for v in _best_shape_and_scale(x, np.array([location])))
     return Weibull(shape, float(location), scale, best in ends or shape <= SHAPES[0])
 
 
-def distance(values: Array, fitted: Weibull) -> float:
+def distance(values: Array, weibull: Weibull) -> float:
     """The largest difference between the empirical and the fitted distribution function (Kolmogorov
     and Smirnov).
     """
-    below, n = fitted.below(np.sort(values)), len(values)
-    return float(np.max([np.arange(1, n + 1) / n - below, below - np.arange(n) / n]))
+    probabilities, n = weibull.probability_below(np.sort(values)), len(values)
+    return float(
+        np.max([np.arange(1, n + 1) / n - probabilities, probabilities - np.arange(n) / n])
+    )
 
 
 def _likelihoods(x: Array, locations: Array) -> Array:
     """Mean logarithm of the density, at the best shape and scale of each location."""
-    shapes, scales = _at(x, locations)
+    shapes, scales = _best_shape_and_scale(x, locations)
     logs = np.log((x - locations[:, None]) / scales[:, None])
     powers = np.exp(shapes[:, None] * logs)
     return np.asarray(
@@ -291,7 +299,7 @@ def _likelihoods(x: Array, locations: Array) -> Array:
     )
 
 
-def _at(x: Array, locations: Array) -> tuple[Array, Array]:
+def _best_shape_and_scale(x: Array, locations: Array) -> tuple[Array, Array]:
     """The best shape (m,) and scale (m,) for locations (m,).
 
     The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by
@@ -326,15 +334,22 @@ def intervals(
     x, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
     resampled: dict[str, list[float]] = {}
     for _ in range(count):
-        again = rng.choice(x, len(x))
-        numbers = {"mean": float(again.mean()), "deviation": float(again.std(ddof=1))}
-        if one := fit(again):
-            numbers |= {"shape": one.shape, "location": one.location, "scale": one.scale}
-            numbers["quantile_1_percent"] = one.quantile(0.01)
+        resample = rng.choice(x, len(x))
+        numbers = {"mean": float(resample.mean()), "deviation": float(resample.std(ddof=1))}
+        if weibull := fit(resample):
+            numbers |= {
+                "shape": weibull.shape,
+                "location": weibull.location,
+                "scale": weibull.scale,
+            }
+            numbers["quantile_1_percent"] = weibull.quantile(0.01)
         for name, value in numbers.items():
             resampled.setdefault(name, []).append(value)
     ends = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
-    return {name: tuple(map(float, np.quantile(many, ends))) for name, many in resampled.items()}  # type: ignore[misc]
+    return {
+        name: tuple(map(float, np.quantile(estimates, ends)))
+        for name, estimates in resampled.items()
+    }  # type: ignore[misc]
 
 
 def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") -> str:
@@ -348,14 +363,15 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
         Of the names of its table and its picture, in front of the suffix.
     """
     table = f"samples{ending}.csv"
-    counts, fit = content["counts"], content["weibull"]
+    counts, weibull = content["counts"], content["weibull"]
     counted = ", ".join(
         f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples"
     )
     lines = [
         f"# {content['result']} of {content['case']}: {counts['samples']} random samples",
         "",
-        f"Seed {content['seed']}; {counted}. Mean CPU time of a sample: {content['cpu_s_per_sample']:.3g} s.",
+        f"Seed {content['seed']}; {counted}. Mean CPU time of a sample: "
+        f"{content['cpu_s_per_sample']:.3g} s.",
         "Sample k is drawn from the seed and k alone. Intervals are bootstrap intervals of "
         f"{100 * content['level']:.0f} %, by percentiles. [{table}]({table}) has all samples.",
         "",
@@ -366,13 +382,14 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     ]
     numbers = {key: content[key] for key in ("mean", "deviation", "least", "median", "largest")}
     lines += [_row(key, value, content["intervals"]) for key, value in numbers.items()]
-    if fit:
+    if weibull:
         names = ("shape", "location", "scale", "quantile_1_percent", "distance")
-        lines += [_row(key, fit[key], content["intervals"], "Weibull, ") for key in names]
-        if fit["bounded"]:
+        lines += [_row(key, weibull[key], content["intervals"], "Weibull, ") for key in names]
+        if weibull["bounded"]:
             lines += [
                 "",
-                "The likelihood has no maximum inside the bounds of the search: the three parameters are not",
+                "The likelihood has no maximum inside the bounds of the search: the three "
+                "parameters are not",
             ]
             lines += ["determined by these samples."]
     else:
@@ -387,12 +404,14 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
             f"| {key} | {c['pearson']:.3f} | {c['spearman']:.3f} |"
             for key, c in content["correlations"].items()
         ]
-    if less := content["without_weakest"]:
+    if without_weakest := content["without_weakest"]:
         lines += [
             "",
-            f"Without the {content['deleted']} weakest defects of each sample: mean {less['mean']:.6g}, a change of "
-            f"{100 * less['change_of_mean']:+.2f} %; the largest change of one sample is "
-            f"{100 * less['largest_change']:+.2f} %.",
+            f"Without the {content['deleted']} weakest defects of each sample: mean "
+            f"{without_weakest['mean']:.6g}, a change of "
+            f"{100 * without_weakest['change_of_mean']:+.2f} %; the largest change of one sample "
+            "is "
+            f"{100 * without_weakest['largest_change']:+.2f} %.",
         ]
     without = [row for row in rows if row["status"] != "found"]
     if without:
@@ -413,8 +432,8 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
 
 
 def _row(
-    key: str, value: float | None, intervals: dict[str, tuple[float, float]], of: str = ""
+    key: str, value: float | None, intervals: dict[str, tuple[float, float]], suffix: str = ""
 ) -> str:
     ends = intervals.get(key)
-    shown = "" if value is None else f"{value:.6g}"
-    return f"| {of}{key.replace('_', ' ')} | {shown} | {f'{ends[0]:.5g} to {ends[1]:.5g}' if ends else ''} |"
+    value_text = "" if value is None else f"{value:.6g}"
+    return f"| {suffix}{key.replace('_', ' ')} | {value_text} | {f'{ends[0]:.5g} to {ends[1]:.5g}' if ends else ''} |"

@@ -20,7 +20,7 @@ from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.measured import Timings, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
-from magshell_fenicsx.studies.runner import Folder, Made, Say, compute
+from magshell_fenicsx.studies.runner import Folder, MakeCase, Say, compute
 from magshell_fenicsx.studies.study_report import (
     COLUMNS,
     Reference,
@@ -65,7 +65,7 @@ def study(
     settings: Sequence[str] = (),
     *,
     result: str,
-    made: Made,
+    make_case: MakeCase,
     reference: float | None = None,
     ranks: Sequence[int] = (1,),
     repeat: int = 3,
@@ -83,7 +83,7 @@ def study(
         `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     result
         `knockdown`, `critical_field`, `COLUMN@COLUMN=VALUE` or `COLUMN@end`; see `Scalar`.
-    made
+    make_case
         Makes a case of its source.
     reference
         The exact value for the errors; None takes the finest run and estimates its own error.
@@ -102,9 +102,9 @@ def study(
     """
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
-    points = make_points(swept_source(Path(file), axes, settings), axes, made)
+    points = make_points(swept_source(Path(file), axes, settings), axes, make_case)
     folder, machine = user_folder(out), machine_fingerprint()
-    with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
+    with FOLDER.locked(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
         files = {
@@ -112,9 +112,10 @@ def study(
             for i in range(len(points))
             for n in counts
         }
-        if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
+        if known_count := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
             say(
-                f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx"
+                f"{known_count} of {len(files)} computed again: the folder has results of other "
+                "sources of magshell_fenicsx"
             )
         runs = {
             (i, n): Run(points[i], n, load(kept_in, machine, origins[i]))
@@ -123,27 +124,35 @@ def study(
 
         def point_measured(key: tuple[int, int]) -> Iterator[str]:
             (i, n), run = key, runs[key]
-            chosen = [*settings, *(f"{name}={value}" for name, value in run.point.values.items())]
-            arguments = [str(file), *(word for setting in chosen for word in ("--set", setting))]
+            run_settings = [
+                *settings,
+                *(f"{name}={value}" for name, value in run.point.values.items()),
+            ]
+            arguments = [
+                str(file),
+                *(word for setting in run_settings for word in ("--set", setting)),
+            ]
             complete(run.measured, arguments, n, repeat, files[key], origins[i])
             yield f"{i + 1:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}"
 
         compute([*runs], point_measured, MPI.COMM_SELF, say)
-        rows, against = make_rows([*runs.values()], scalar, reference)
+        rows, reference_value = make_rows([*runs.values()], scalar, reference)
         content = {
             "case": Path(file).name,
             "settings": list(settings),
             "over": list(over),
             "result": result,
-            "reference": asdict(against) if against else None,
-            "reference_said": reference_sentence(against),
+            "reference": asdict(reference_value) if reference_value else None,
+            "reference_said": reference_sentence(reference_value),
             "repeat": repeat,
             "machine": machine,
         }
-        done = Study(rows, against)
-        access_disk(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), content, folder))
-    say(reference_sentence(against))
-    return done
+        study_result = Study(rows, reference_value)
+        access_disk(
+            MPI.COMM_WORLD, lambda: _write(study_result, tuple(points[0].values), content, folder)
+        )
+    say(reference_sentence(reference_value))
+    return study_result
 
 
 def parse_ranks(text: str) -> list[int]:
@@ -173,22 +182,22 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
         raise CaseError(f"--reference {reference}: must be a finite number")
 
 
-def _write(done: Study, keys: Sequence[str], content: dict[str, Any], folder: Path) -> None:
+def _write(study_result: Study, keys: Sequence[str], content: dict[str, Any], folder: Path) -> None:
     write_object(folder / "study.json", content)
-    write_csv(done.rows, (*keys, *COLUMNS), folder / "study.csv")
-    write_table(done.rows, keys, content, folder / "study.md")
+    write_csv(study_result.rows, (*keys, *COLUMNS), folder / "study.csv")
+    write_table(study_result.rows, keys, content, folder / "study.md")
     repeats = repeated(content["repeat"]).lower()
     title = f"{content['result']} of {content['case']}\n{content['machine']['cpu']}, kernels compiled, {repeats}"
-    own_error = done.reference.error if done.reference else None
-    draw_study(done.rows, keys, title, own_error, folder / "study.png")
+    own_error = study_result.reference.error if study_result.reference else None
+    draw_study(study_result.rows, keys, title, own_error, folder / "study.png")
 
 
 def _outcome(measured: Timings, scalar: Scalar) -> str:
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
     value = scalar.of(measured.summary, measured.rows)
-    reached = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
+    result_text = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
     stopped = measured.summary["stopped"]
-    return f"{reached}, {measured.typical('wall_s'):.2f} s" + (
+    return f"{result_text}, {measured.typical('wall_s'):.2f} s" + (
         f", stopped early: {stopped}" if stopped else ""
     )

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from magshell_fenicsx.platform.environment import describe_machine
 from magshell_fenicsx.studies.measured import TIMES, Timings
-from magshell_fenicsx.studies.points import SweepPoint, short
+from magshell_fenicsx.studies.points import SweepPoint, short_key
 from magshell_fenicsx.studies.results import Scalar
 
 ORDERS = 0.05, 30.0  # range of credible observed orders
@@ -122,19 +122,19 @@ class Run:
 
 
 def make_rows(
-    runs: Sequence[Run], scalar: Scalar, given: float | None
+    runs: Sequence[Run], scalar: Scalar, reference_value: float | None
 ) -> tuple[list[Row], Reference | None]:
     """All rows, in the order of the runs, and the reference of their errors.
 
     Parameters
     ----------
-    given
+    reference_value
         The reference; None takes the finest run, with an estimate of its error.
     """
     rows = [_row(run, scalar) for run in runs]
     reference, finest = None, None
-    if given is not None:
-        reference = Reference(given, None, None, "given")
+    if reference_value is not None:
+        reference = Reference(reference_value, None, None, "given")
     elif any(row["result"] is not None for row in rows):
         finest = max(
             (row for row in rows if row["result"] is not None),
@@ -144,11 +144,11 @@ def make_rows(
     for row in rows:
         if reference and row["result"] is not None:
             row["error"] = reference.error if row is finest else reference.error_of(row["result"])
-    spent = clock(rows)
-    comparable = [row for row in rows if row["error"] is not None and row[spent] is not None]
+    cost_column = clock(rows)
+    comparable = [row for row in rows if row["error"] is not None and row[cost_column] is not None]
     for row in rows:
         row["pareto"] = row in comparable and not any(
-            _beats(other, row, spent) for other in comparable
+            _beats(other, row, cost_column) for other in comparable
         )
     return rows, reference
 
@@ -176,13 +176,13 @@ def _row(run: Run, scalar: Scalar) -> Row:
 
 def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Reference:
     """The finest run as reference; its error comes from runs that differ only in the refinement."""
-    same = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
+    fixed_keys = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
     series = {
         run.point.case.mesh.refinement: row["result"]
         for run, row in zip(runs, rows, strict=True)
         if row["result"] is not None
         and row["dofs"] <= finest["dofs"]
-        and all(row[k] == finest[k] for k in same)
+        and all(row[k] == finest[k] for k in fixed_keys)
     }
     refinements = sorted(series)
     error, order = estimated_error([1 / r for r in refinements], [series[r] for r in refinements])
@@ -201,9 +201,9 @@ def clock(rows: Sequence[Row]) -> str:
     return "cpu_s" if alone else "wall_s"
 
 
-def _beats(a: Row, b: Row, spent: str) -> bool:
+def _beats(a: Row, b: Row, cost_column: str) -> bool:
     """Whether a is at least as good as b in both time and error, and better in one."""
-    mine, theirs = (a[spent], a["error"]), (b[spent], b["error"])
+    mine, theirs = (a[cost_column], a["error"]), (b[cost_column], b["error"])
     return mine != theirs and mine[0] <= theirs[0] and mine[1] <= theirs[1]
 
 
@@ -216,7 +216,7 @@ FORMS = {
         ".3g",
     ),
 }
-SHOWN = (
+SHOWN_COLUMNS = (
     *(
         "cells",
         "dofs",
@@ -250,13 +250,13 @@ def write_table(
         The content of study.json.
     """
     head = [
-        *map(short, keys),
+        *map(short_key, keys),
         "ranks",
-        *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN),
+        *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN_COLUMNS),
     ]
     lines = [head, ["---"] * len(head)]
     for row in rows:
-        cells = [_cell(row, key) for key in (*keys, "ranks", *SHOWN)]
+        cells = [_cell(row, key) for key in (*keys, "ranks", *SHOWN_COLUMNS)]
         lines.append([f"**{cell}**" if row["pareto"] and cell else cell for cell in cells])
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     file.write_text(
@@ -307,8 +307,8 @@ def _cell(row: Row, key: str) -> str:
 
 
 CLOCKS = {"wall_s": "wall time of the process (s)", "cpu_s": "CPU time of the process (s)"}
-AGAINST = {"dofs": "unknowns", "peak_mb": "peak memory, all ranks (MB)"}
-PARTS = {
+AXIS_LABELS = {"dofs": "unknowns", "peak_mb": "peak memory, all ranks (MB)"}
+PHASES = {
     "jit_s": "kernels (warm)",
     "setup_s": "set-up",
     "assembly_s": "assembly",
@@ -339,15 +339,15 @@ def draw_study(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    spent = clock(rows)
-    series = _series([row for row in rows if row["error"] and row[spent]], keys)
+    cost_column = clock(rows)
+    series = _series([row for row in rows if row["error"] and row[cost_column]], keys)
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")
     for axes, (quantity, label) in zip(
-        panels.flat, {spent: CLOCKS[spent], **AGAINST}.items(), strict=False
+        panels.flat, {cost_column: CLOCKS[cost_column], **AXIS_LABELS}.items(), strict=False
     ):
         _errors(axes, series, quantity, own_error)
         axes.set(xlabel=label, ylabel="relative error")
-    _parts(panels[1, 1], series)
+    _draw_phase_shares(panels[1, 1], series)
     figure.suptitle(title, fontsize=10)
     for axes, place in ((panels[0, 0], "upper"), (panels[1, 1], "lower")):
         handles, labels = axes.get_legend_handles_labels()
@@ -360,11 +360,11 @@ def draw_study(
 def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     """Series of rows that differ only in the mesh size, by a label of their common values."""
     names = [*(key for key in keys if key != REFINEMENT), "ranks"]
-    shown = [name for name in names if len({row[name] for row in rows}) > 1]
+    varying_names = [name for name in names if len({row[name] for row in rows}) > 1]
     series: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
         series.setdefault(
-            ", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []
+            ", ".join(f"{short_key(name)} {row[name]}" for name in varying_names) or "runs", []
         ).append(row)
     return series
 
@@ -412,14 +412,14 @@ def _errors(
     axes.grid(which="both", color="0.92", linewidth=0.6)
 
 
-def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
+def _draw_phase_shares(axes: Any, series: dict[str, list[Row]]) -> None:
     """Draw the shares of the phases in the wall time, for the runs on the Pareto front."""
     rows = sorted(
         (r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"]
     )
     bottom = [0.0] * len(rows)
     places = range(len(rows))
-    for i, (key, label) in enumerate(PARTS.items()):
+    for i, (key, label) in enumerate(PHASES.items()):
         if all(row[key] is None for row in rows):
             continue
         heights = [(row[key] or 0.0) / row["wall_s"] for row in rows]

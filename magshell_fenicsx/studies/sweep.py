@@ -32,7 +32,7 @@ from magshell_fenicsx.studies.points import (
     MOST_POINTS,
     Axis,
     SweepPoint,
-    along,
+    last_numeric_axis,
     make_point,
     make_points,
     parse_axes,
@@ -43,14 +43,14 @@ from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
     Case,
     Folder,
-    Made,
+    MakeCase,
     Outcome,
     Say,
     compute,
     keep_outcome,
-    kept_outcome,
     outcome_of,
     part_of,
+    stored_outcome_of_case,
 )
 from magshell_fenicsx.studies.sweep_picture import draw_sweep
 
@@ -102,7 +102,7 @@ def sweep(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
     *,
-    made: Made,
+    make_case: MakeCase,
     result: str | None = None,
     full_paths: bool = False,
     part: str | None = None,
@@ -122,7 +122,7 @@ def sweep(
         computed them. Tables and picture have the points of earlier sweeps over the same keys too.
     say
         Called with one line per finished point, on the rank that finished it.
-    made
+    make_case
         Makes a case of its source.
     result
         A number of each point as of `magshell study`, beside those that every sweep has; see
@@ -144,11 +144,11 @@ def sweep(
     axes, scalar = parse_axes(over), parse_scalar(result) if result else None
     full_paths = full_paths or not (scalar is None or scalar.name == "knockdown")
     source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
-    asked = on_first_rank(comm, lambda: make_points(source, axes, made))
-    share = share_of(part, len(asked))
+    requested = on_first_rank(comm, lambda: make_points(source, axes, make_case))
+    share = share_of(part, len(requested))
     folder = FOLDER.prepare(user_folder(out), comm)
-    points = access_disk(comm, lambda: with_earlier(folder, source, axes, asked, made))
-    before = len(points) - len(asked)
+    points = access_disk(comm, lambda: with_earlier(folder, source, axes, requested, make_case))
+    earlier_count = len(points) - len(requested)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     first = {
         point.key: number for number, point in reversed(list(enumerate(points)))
@@ -157,39 +157,51 @@ def sweep(
         comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar))
     )
     if part:
-        missing = [number for number in missing if number - before in share]
+        missing = [number for number in missing if number - earlier_count in share]
     if comm.rank == 0:
-        also = f" and {before} there" if before else ""
+        also = f" and {earlier_count} there" if earlier_count else ""
         say(
-            f"{len(asked)} points{also}, {len(missing)} to compute on {comm.size} rank{'s' * (comm.size > 1)}"
+            f"{len(requested)} points{also}, {len(missing)} to compute on {comm.size} "
+            f"rank{'s' * (comm.size > 1)}"
         )
-        if again := sum(files[number].exists() for number in missing):
+        if known_count := sum(files[number].exists() for number in missing):
             say(
-                f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged"
+                f"{known_count} of these computed again: their files are of other sources of "
+                "magshell_fenicsx, or damaged"
             )
-    shared = Known(columns=COLUMNS if scalar else CURVE)
+    cache = SweepCache(columns=COLUMNS if scalar else CURVE)
 
     def chain_computed(chain: Chain) -> Iterator[str]:
-        for number, outcome in run_chain(chain, shared):
+        for number, outcome in run_chain(chain, cache):
             keep_outcome(outcome, points[number].case, files[number])
             place = f"{missing.index(number) + 1:4d}/{len(missing)}"
             yield f"{place}  {points[number].label}: {_words(outcome, scalar)}, {outcome.wall_s:.1f} s"
 
     compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
-    done = [
+    outcomes_of_points = [
         (point, outcome)
         for point, file in zip(points, files, strict=True)
-        if (outcome := kept_outcome(file))
+        if (outcome := stored_outcome_of_case(file))
     ]
-    assert part or len(done) == len(points)
-    if comm.rank == 0 and len(done) < len(points):
-        say(f"{len(points) - len(done)} of {len(points)} points are left to other parts")
-    if done:
-        access_disk(comm, lambda: _write(axes, done, scalar, folder))
-    mine = {id(point) for i, point in enumerate(asked) if not part or i in share}
-    own = [(point, outcome) for point, outcome in done if id(point) in mine]
-    values = [outcome.value(scalar) for _, outcome in own] if scalar else []
-    return Sweep(axes, [point for point, _ in own], [outcome for _, outcome in own], values)
+    assert part or len(outcomes_of_points) == len(points)
+    if comm.rank == 0 and len(outcomes_of_points) < len(points):
+        say(
+            f"{len(points) - len(outcomes_of_points)} of {len(points)} points are left to other "
+            "parts"
+        )
+    if outcomes_of_points:
+        access_disk(comm, lambda: _write(axes, outcomes_of_points, scalar, folder))
+    mine = {id(point) for i, point in enumerate(requested) if not part or i in share}
+    requested_outcomes = [
+        (point, outcome) for point, outcome in outcomes_of_points if id(point) in mine
+    ]
+    values = [outcome.value(scalar) for _, outcome in requested_outcomes] if scalar else []
+    return Sweep(
+        axes,
+        [point for point, _ in requested_outcomes],
+        [outcome for _, outcome in requested_outcomes],
+        values,
+    )
 
 
 def share_of(part: str | None, count: int) -> range:
@@ -205,24 +217,24 @@ def share_of(part: str | None, count: int) -> range:
 
 
 def _is_known(file: Path, scalar: Scalar | None) -> bool:
-    outcome = kept_outcome(file)
+    outcome = stored_outcome_of_case(file)
     return outcome is not None and (scalar is None or outcome.serves(scalar))
 
 
 def _words(outcome: Outcome, scalar: Scalar | None) -> str:
     """What a point has reached."""
-    reached = "no limit point"
+    result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
         value = outcome.value(scalar)
-        reached = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g}"
+        result_text = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g}"
     elif outcome.knockdown is not None:
         pascals = outcome.in_units.get("buckling_pressure_Pa")
-        reached = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
+        result_text = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
     elif outcome.barrier is not None:
-        reached = f"barrier = {outcome.barrier:.6g} E h R^2"
+        result_text = f"barrier = {outcome.barrier:.6g} E h R^2"
     elif outcome.limit:
-        reached = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
-    return f"{reached}, stopped early: {outcome.stopped}" if outcome.stopped else reached
+        result_text = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
+    return f"{result_text}, stopped early: {outcome.stopped}" if outcome.stopped else result_text
 
 
 @dataclass(frozen=True)
@@ -249,7 +261,7 @@ def make_chains(
     full_paths
         Put each point into a separate chain, as also happens if folds cannot be followed.
     """
-    axis = along(axes)
+    axis = last_numeric_axis(axes)
     if full_paths or axis is None:
         return [[Link(number, 0.0, points[number].case)] for number in missing]
     lines: dict[tuple[str, ...], list[int]] = {}
@@ -267,18 +279,18 @@ def _chains_of(
 ) -> list[Chain]:
     """The missing points along the axis, as one chain if their folds can be followed."""
     key = axis.keys[0]
-    wanted = [
+    links = [
         Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing
     ]
     one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
     followed = all(
-        has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted
+        has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in links
     )
-    if len(wanted) < 2 or not followed:
-        return [[link] for link in wanted]
+    if len(links) < 2 or not followed:
+        return [[link] for link in links]
     common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
     chain = [
-        replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted
+        replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in links
     ]
     return [sorted(chain, key=lambda link: link.at)]
 
@@ -289,7 +301,7 @@ def _symmetry(case: Case) -> str:
 
 
 @dataclass
-class Known:
+class SweepCache:
     """What the chains of one rank share.
 
     Attributes
@@ -306,57 +318,60 @@ class Known:
     first: Continuation | None = None
 
 
-def run_chain(chain: Chain, folds: Known) -> Iterator[tuple[int, Outcome]]:
+def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
     """Compute a chain on this rank; number and outcome of each point."""
     continuation = folds.first if len(chain) > 1 else None
     for link in chain:
-        begun = link is chain[0]
-        start, spent, outcome = time.perf_counter(), 0, None
+        is_first = link is chain[0]
+        start, factorisations, outcome = time.perf_counter(), 0, None
         if continuation:
-            outcome, spent = _by_fold(continuation, link, folds, start, same_mesh=begun)
+            outcome, factorisations = _by_fold(continuation, link, folds, start, same_mesh=is_first)
         if not outcome:
             outcome, continuation = _by_path(
-                link, folds.columns, spent, start, go_on=link is not chain[-1]
+                link, folds.columns, factorisations, start, go_on=link is not chain[-1]
             )
-        if begun:
+        if is_first:
             folds.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
 
 
 def _by_fold(
-    continuation: Continuation, link: Link, folds: Known, start: float, *, same_mesh: bool
+    continuation: Continuation, link: Link, folds: SweepCache, start: float, *, same_mesh: bool
 ) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = folds.scenes.of(link.case)
+        scene = folds.scenes.scene_of(link.case)
     except MeshError:
         return None, 0
     if same_mesh and not continuation.has_mesh_of(scene):
         return None, 0
     factorisation = scene.newton.factorisation
-    before = factorisation.count
+    count_before = factorisation.count
     try:
         fold = continuation.follow(link.at, scene)
     except FoldLost:
-        return None, factorisation.count - before
-    result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
+        return None, factorisation.count - count_before
+    result, work = (
+        Result(scene, fold.state, [fold_row(scene, fold)]),
+        factorisation.count - count_before,
+    )
     return outcome_of(result, "fold", work, time.perf_counter() - start, folds.columns), work
 
 
 def _by_path(
-    link: Link, columns: Sequence[str], spent: int, start: float, *, go_on: bool
+    link: Link, columns: Sequence[str], factorisations: int, start: float, *, go_on: bool
 ) -> tuple[Outcome, Continuation | None]:
     """The outcome of a full path, and the continuation from its fold if there is one."""
     try:
         result = run(link.case.problem(), comm=MPI.COMM_SELF)
     except MeshError as e:
-        return Outcome.failed(str(e), time.perf_counter() - start, spent), None
-    continuation = _begun(link.at, result) if go_on else None
-    work = spent + result.scene.newton.factorisation.count
+        return Outcome.failed(str(e), time.perf_counter() - start, factorisations), None
+    continuation = _continuation_from(link.at, result) if go_on else None
+    work = factorisations + result.scene.newton.factorisation.count
     return outcome_of(result, "path", work, time.perf_counter() - start, columns), continuation
 
 
-def _begun(at: float, result: Result) -> Continuation | None:
+def _continuation_from(parameter: float, result: Result) -> Continuation | None:
     last = result.rows[result.end]
     if (
         last["label"] != "fold"
@@ -365,13 +380,17 @@ def _begun(at: float, result: Result) -> Continuation | None:
     ):
         return None
     try:
-        return Continuation(at, result.scene, result.last)
+        return Continuation(parameter, result.scene, result.last)
     except FoldLost:
         return None
 
 
 def with_earlier(
-    folder: Path, source: Source, axes: Sequence[Axis], points: Sequence[SweepPoint], made: Made
+    folder: Path,
+    source: Source,
+    axes: Sequence[Axis],
+    points: Sequence[SweepPoint],
+    make_case: MakeCase,
 ) -> list[SweepPoint]:
     """The points of the folder's sweep and the new ones among `points`; writes down all.
 
@@ -382,18 +401,18 @@ def with_earlier(
     """
     keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
     earlier = _earlier(folder, keys, base)
-    asked = [[point.values[axis.keys[0]] for axis in axes] for point in points]
-    merged = [
-        Axis(axis.keys, tuple(v[i] for v in (*asked, *earlier))) for i, axis in enumerate(axes)
+    requested = [[point.values[axis.keys[0]] for axis in axes] for point in points]
+    all_axes = [
+        Axis(axis.keys, tuple(v[i] for v in (*requested, *earlier))) for i, axis in enumerate(axes)
     ]
-    places = {_place(values, merged) for values in asked}
-    left = [values for values in earlier if _place(values, merged) not in places]
-    if (count := len(left) + len(asked)) > MOST_POINTS:
+    places = {_place(values, all_axes) for values in requested}
+    earlier_only = [values for values in earlier if _place(values, all_axes) not in places]
+    if (count := len(earlier_only) + len(requested)) > MOST_POINTS:
         raise CaseError(
             f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}"
         )
-    write_object(folder / NAME, asdict(Listed(keys, base, [*left, *asked])))
-    return [*(make_point(source, axes, values, made) for values in left), *points]
+    write_object(folder / NAME, asdict(Listed(keys, base, [*earlier_only, *requested])))
+    return [*(make_point(source, axes, values, make_case) for values in earlier_only), *points]
 
 
 def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
@@ -429,13 +448,15 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
     if listed is None or any(len(values) != len(listed.keys) for values in listed.points):
         raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
     if listed.keys != keys:
-        said = " and ".join("+".join(each) for each in listed.keys)
+        keys_text = " and ".join("+".join(axis_keys) for axis_keys in listed.keys)
         raise CaseError(
-            f"--out {folder}: has a sweep over {said}, which is kept; give another folder for other keys"
+            f"--out {folder}: has a sweep over {keys_text}, which is kept; give another folder for "
+            "other keys"
         )
     if listed.base != base:
         raise CaseError(
-            f"--out {folder}: has a sweep of another case or other --set, which is kept; give another folder"
+            f"--out {folder}: has a sweep of another case or other --set, which is kept; give "
+            "another folder"
         )
     return listed.points
 
@@ -455,7 +476,7 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
 
 def _write(
     axes: Sequence[Axis],
-    done: Sequence[tuple[SweepPoint, Outcome]],
+    outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]],
     scalar: Scalar | None,
     folder: Path,
 ) -> None:
@@ -464,7 +485,10 @@ def _write(
     In sweep.csv values with units are columns of numbers too, and so are the results of a case with
     units.
     """
-    points, outcomes = [point for point, _ in done], [outcome for _, outcome in done]
+    points, outcomes = (
+        [point for point, _ in outcomes_of_points],
+        [outcome for _, outcome in outcomes_of_points],
+    )
     swept = tuple(points[0].values)
     rows = [
         {
@@ -474,7 +498,7 @@ def _write(
             **_numbers(axes, point),
             **_in_units(outcome),
         }
-        for point, outcome in done
+        for point, outcome in outcomes_of_points
     ]
     results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
     rows = (
@@ -497,10 +521,12 @@ def _write(
     write_csv(
         rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE
     )
-    lines = [{**point.values, **row} for point, outcome in done for row in outcome.curve]
+    lines = [
+        {**point.values, **row} for point, outcome in outcomes_of_points for row in outcome.curve
+    ]
     curves = [key for key in CURVE if any(key in line for line in lines)]
-    own = [key for line in lines for key in line if key not in COLUMNS]
-    write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *own))), folder / CURVES)
+    axis_columns = [key for line in lines for key in line if key not in COLUMNS]
+    write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *axis_columns))), folder / CURVES)
     draw_sweep(
         axes,
         points,
@@ -518,7 +544,7 @@ def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:
 
 def _in_units(outcome: Outcome) -> dict[str, Any]:
     """The columns in units of its limit point, and the numbers of the case."""
-    units, limit = tuple(f"_{each}" for each in endings()), outcome.limit or {}
+    units, limit = tuple(f"_{ending}" for ending in endings()), outcome.limit or {}
     return {key: v for key, v in limit.items() if key.endswith(units)} | outcome.in_units
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
 from magshell_fenicsx.studies.naming import key_label, key_symbol, key_words
-from magshell_fenicsx.studies.points import Axis, SweepPoint, along
+from magshell_fenicsx.studies.points import Axis, SweepPoint, last_numeric_axis
 from magshell_fenicsx.studies.runner import Outcome
 
 if TYPE_CHECKING:
@@ -53,14 +53,14 @@ def draw_sweep(
     points: Sequence[SweepPoint],
     outcomes: Sequence[Outcome],
     file: Path,
-    asked: tuple[str, Sequence[float | None]] | None = None,
+    requested: tuple[str, Sequence[float | None]] | None = None,
 ) -> None:
     """Draw one line for each combination of the values that are not on the horizontal axis, or a
     map.
 
     Parameters
     ----------
-    asked
+    requested
         The name of a result and its value at each point; None draws energy barriers, knockdown
         factors or curves.
     """
@@ -74,7 +74,7 @@ def draw_sweep(
         for axis in axes
     ]
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    results, mapped = _results(outcomes, asked), _is_map(axes)
+    results, mapped = _results(outcomes, requested), _is_map(axes)
     if mapped:
         _map(plot, axes, points, results or _ends(outcomes))
     elif results:
@@ -108,13 +108,13 @@ def _is_map(axes: Sequence[Axis]) -> bool:
 
 
 def _results(
-    outcomes: Sequence[Outcome], asked: tuple[str, Sequence[float | None]] | None
+    outcomes: Sequence[Outcome], requested: tuple[str, Sequence[float | None]] | None
 ) -> Results | None:
     """The result that is asked for; else energy barriers or knockdown factors, with a second scale;
     None without.
     """
-    if asked and asked[0] not in ("knockdown", "barrier"):
-        return Results(asked[1], asked[0])
+    if requested and requested[0] not in ("knockdown", "barrier"):
+        return Results(requested[1], requested[0])
     barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
     if any(value is not None for value in barriers):
         return Results(
@@ -137,12 +137,12 @@ def _ends(outcomes: Sequence[Outcome]) -> Results:
     same.
     """
     last = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
-    shown = next((row for row in last if row), {})
-    x, y = axes_of(str(shown.get("amplitude", "")) or "force", shown)
-    drawn = y if np.ptp([y.on_axis(row) for row in last if y.name in row]) > 0 else x
+    last_row = next((row for row in last if row), {})
+    x, y = axes_of(str(last_row.get("amplitude", "")) or "force", last_row)
+    drawn_quantity = y if np.ptp([y.on_axis(row) for row in last if y.name in row]) > 0 else x
     return Results(
-        [drawn.on_axis(row) if drawn.name in row else None for row in last],
-        f"{drawn.label} at the end",
+        [drawn_quantity.on_axis(row) if drawn_quantity.name in row else None for row in last],
+        f"{drawn_quantity.label} at the end",
     )
 
 
@@ -171,12 +171,17 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
         )  # at steps of the colours
         plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
-    for hidden, style in (
+    for is_hidden, style in (
         (False, {"marker": ".", "color": "0.15"}),
         (True, {"marker": "x", "color": "0.5"}),
     ):
         plot.plot(
-            *places[hole == hidden].T, linestyle="", markersize=4, clip_on=False, zorder=5, **style
+            *places[hole == is_hidden].T,
+            linestyle="",
+            markersize=4,
+            clip_on=False,
+            zorder=5,
+            **style,
         )
     bar = plot.figure.colorbar(filled, ax=plot, label=results.label)
     if results.size:
@@ -206,7 +211,7 @@ def _values(
     plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results
 ) -> None:
     """Draw a number of each point over the last axis with numbers; points without it are left out."""
-    axis = along(axes) or axes[-1]
+    axis = last_numeric_axis(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, value in zip(points, results.values, strict=True):
         line = lines.setdefault(_label(point, axis), [])
@@ -214,8 +219,10 @@ def _values(
             x = point.values[axis.keys[0]]
             line.append((axis.number(x) if axis.numbers else x, value))
     for (name, line), style in zip(lines.items(), cycle(STYLES), strict=False):
-        drawn = sorted(line) if axis.numbers else line
-        plot.plot(*zip(*drawn, strict=True), style, marker=".", label=name) if drawn else None
+        sorted_line = sorted(line) if axis.numbers else line
+        plot.plot(
+            *zip(*sorted_line, strict=True), style, marker=".", label=name
+        ) if sorted_line else None
     if axis.numbers:
         plot.locator_params(axis="x", nbins=5)  # long numbers would overlap
     plot.set_xlabel(_axis_label(axis))
@@ -239,7 +246,7 @@ def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outco
     x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         part = loaded(outcome.curve, amplitude)
-        places = ([each.on_axis(row) for row in part] for each in (x, y))
+        places = ([quantity.on_axis(row) for row in part] for quantity in (x, y))
         plot.plot(*places, style, marker=".", label=_label(point, None))
     plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     plot.set(xlabel=x.label, ylabel=y.label)
@@ -257,7 +264,7 @@ def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
 
 
 def _label(point: SweepPoint, without: Axis | None) -> str:
-    hidden = without.keys if without else ()
+    hidden_keys = without.keys if without else ()
     return ", ".join(
-        f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden
+        f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden_keys
     )

@@ -6,7 +6,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.public import Scene
-from magshell_fenicsx.simulate.gradients.results import Expected, refuse_unknown_results
+from magshell_fenicsx.simulate.gradients.results import NamesOnlyScene, refuse_unknown_results
 from magshell_fenicsx.simulate.results import differentiable
 
 CASE = {
@@ -66,5 +66,5 @@ def test_unknown_results_and_parameters(section, said):
 def test_names_of_a_problem_are_those_of_its_scene():
     case = Case.model_validate(CASE | {"reactions": True, "points": {"a": [0, 0, 1]}})
     scene = Scene(case)
-    expected = Expected(scene.problem)
+    expected = NamesOnlyScene(scene.problem)
     assert differentiable(expected, expected.unloaded()) == differentiable(scene, scene.unloaded())

@@ -13,7 +13,7 @@ from command import magshell, read_path
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.public import run
-from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
+from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice
 from magshell_fenicsx.simulate.follow import BEYOND, follow
 
 MESH = {"degree": 3, "refinement": 0.7}
@@ -195,7 +195,7 @@ def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
 
 def test_better_round_than_that_of_the_mesh_that_is_taken() -> None:
     """Of a surface, where a coarser mesh within the tolerance is cheaper: both numbers are there."""
-    rounds = [Round(3, 0.5, 300, 5000, 0.330001, 2e-6), Round(3, 0.4, 200, 3000, 0.3301, 5e-4)]
+    rounds = [AdaptiveRound(3, 0.5, 300, 5000, 0.330001, 2e-6), AdaptiveRound(3, 0.4, 200, 3000, 0.3301, 5e-4)]
     made = Adapted(dimpled(50, 1.0).problem(), Choice(3, 0.4), rounds[1], rounds)
     known = made.account(0.3301)
     assert (known["error_estimate"], known["best"]) == (

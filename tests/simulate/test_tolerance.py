@@ -297,7 +297,7 @@ def test_a_point_in_a_large_cell_beside_small_ones_is_found() -> None:
     values = np.tile(np.arange(101.0)[:, None, None], (1, 3, 1))
     inside, beside = np.array([[4.9, 4.9], [1.0, 1.0]]), np.array([[-0.01, 5.0]])
     found, xi, far = cells.places(inside)
-    assert cells.at(values, found, xi).ravel().tolist() == [0.0, 0.0]
+    assert cells.evaluate(values, found, xi).ravel().tolist() == [0.0, 0.0]
     assert far.tolist() == [0.0, 0.0]
     assert cells.places(beside)[2] == pytest.approx([1e-3])
 

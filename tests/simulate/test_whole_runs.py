@@ -169,7 +169,7 @@ def test_numbers(name: str) -> None:
                 f'{key}="{number!r}{" " * bool(unit)}{unit}"' if quoted else f"{key}={number!r}"
             )
         ran = run(Scene(on_mesh_of(scene, case_of(name, settings).problem()), scene.comm))
-        results[way] = {of: adjoint(ran, of).shown for of in found}
+        results[way] = {of: adjoint(ran, of).value_in_unit for of in found}
     for of, each in found.items():
         total = 0.0
         for key, value in values.items():
@@ -178,7 +178,7 @@ def test_numbers(name: str) -> None:
                 slope = float(slope.within(np.ones(len(slope.forces), dtype=bool))[0])
             total += slope * value * parts[key]
         expected = (results[1][of] - results[-1][of]) / (2 * STEP)
-        assert total == pytest.approx(expected, rel=EXACT[name], abs=1e-6 * abs(each.shown)), of
+        assert total == pytest.approx(expected, rel=EXACT[name], abs=1e-6 * abs(each.value_in_unit)), of
 
 
 @pytest.mark.slow

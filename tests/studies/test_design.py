@@ -24,7 +24,7 @@ from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.standing import Standing
-from magshell_fenicsx.studies.design_evaluation import Evaluation, evaluate
+from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 
 Array = NDArray[np.float64]
 STRIP = """
@@ -116,9 +116,9 @@ def test_fields_between_bounds(strip: Callable[[str], Path], tmp_path: Path) -> 
     case = Case.from_source(source)
     assert case.design
     vary, standing = variables(source, case, case.design), Standing()
-    x, way = vary.first, np.random.default_rng(0).standard_normal(len(vary.first))
+    x, way = vary.start_values, np.random.default_rng(0).standard_normal(len(vary.start_values))
 
-    def at(c: float) -> Evaluation:
+    def at(c: float) -> DesignEvaluation:
         there = vary.case_of(x + c * way, tmp_path / "B.csv")
         return evaluate(there, x, vary, ["tip_uz", "mass"], {}, MPI.COMM_WORLD, standing)
 
@@ -320,10 +320,10 @@ def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
     """
     file = CASES / "designed_shape.yaml"
     vary = variables(source := read_source(file), case := Case.from_source(source), case.design)  # type: ignore[arg-type]
-    way, B = np.random.default_rng(0).random(len(vary.first)), tmp_path / "B.csv"
+    way, B = np.random.default_rng(0).random(len(vary.start_values)), tmp_path / "B.csv"
     back, here, further = (
         evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, MPI.COMM_WORLD, Standing())
-        for x in (vary.first + c * way for c in (0.01, 0.02, 0.03))
+        for x in (vary.start_values + c * way for c in (0.01, 0.02, 0.03))
     )
     slope = (further.values["omega2_1"] - back.values["omega2_1"]) / 0.02
     assert np.array(here.gradients["omega2_1"]) @ way == pytest.approx(

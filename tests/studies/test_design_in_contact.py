@@ -15,7 +15,7 @@ from sheets import Sheet, write
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.simulate.standing import Standing
-from magshell_fenicsx.studies.design_evaluation import Evaluation, evaluate
+from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 from magshell_fenicsx.studies.design_variables import variables
 
 h = 0.02
@@ -102,13 +102,13 @@ def test_fields_of_unlike_shells(
     made = Case.from_source(source)
     assert made.design
     vary, standing = variables(source, made, made.design, Case.from_source), Standing()
-    start = vary.first + change
+    start = vary.start_values + change
     way, results = (
         np.random.default_rng(0).standard_normal(len(start)),
         ["long_tip_uz", "short_tip_uz", "mass"],
     )
 
-    def at(c: float) -> Evaluation:
+    def at(c: float) -> DesignEvaluation:
         there = vary.case_of(start + c * way, tmp_path / "B.csv")
         return evaluate(there, start, vary, results, {}, MPI.COMM_WORLD, standing)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from magshell_fenicsx.studies.design_picture import Reached, draw_design
+from magshell_fenicsx.studies.design_picture import ReachedShape, draw_design
 
 MANY = [
     "buckling_pressure_Pa",
@@ -68,7 +68,7 @@ def test_the_remanence_is_drawn_on_the_edges_of_the_shell(
         blocks={},
     )
     row: dict[str, Any] = {"evaluation": 1, "best": True, "east_fz": 1.0, "west_fz": 2.0}
-    shape = Reached(None, places, places, edges)
+    shape = ReachedShape(None, places, places, edges)
     draw_design([row], ["east_fz", "west_fz"], vary, np.zeros(0), tmp_path / "d.png", shape=shape)
     history, remanence = drawn[0].axes
     assert history.get_ylabel() == "$f_z$"

@@ -125,7 +125,7 @@ def test_a_fold_ahead_is_the_fold_of_the_path(monkeypatch: pytest.MonkeyPatch) -
     (sample,) = drawn(f"ensemble={{{defects}}}", *SMALL, numbers=range(1))
     ahead = solving.solve(sample, KNOCKDOWN, KnownFolds())
     monkeypatch.setattr(solving, "MOST_TRIES", 0)
-    monkeypatch.setattr(KnownFolds, "polished", lost)
+    monkeypatch.setattr(KnownFolds, "refined", lost)
     path = solving.solve(sample, KNOCKDOWN, KnownFolds())
     assert (ahead.found, path.found) == ("fold", "path")
     assert ahead.knockdown == pytest.approx(path.knockdown, rel=1e-7)

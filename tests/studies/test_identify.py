@@ -21,7 +21,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import read_rows
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.readings import Reading, read
-from magshell_fenicsx.studies.laplace import Measured, fitted
+from magshell_fenicsx.studies.laplace import Measured, fit_posterior
 
 Array = NDArray[np.float64]
 LOOKED_FOR = """
@@ -238,7 +238,7 @@ def test_bands_of_200_repeats_and_a_posterior(tmp_path: Path) -> None:
         known = Measured(
             y + NOISE * rng.normal(size=y.size), group, np.full(2, NOISE), TRUTH, np.full(2, np.inf)
         )
-        fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
+        fit = fit_posterior(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
         inside.append((fit.band[0] < TRUTH) & (fit.band[1] > TRUTH))
         fits.append(fit.x)
     cover = np.mean(inside, axis=0)
@@ -269,7 +269,7 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
         np.tile([0, 1], len(FIELDS)),
     )
     known = Measured(data, group, np.full(2, NOISE), TRUTH, np.full(2, np.inf))
-    fit = fitted(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
+    fit = fit_posterior(model, known, np.array([940.0, 78.0]), TRUTH, 20, lambda *_: None)
     logarithm = lambda x: -float(np.sum(((data - model(x)[0]) / NOISE) ** 2)) / 2  # noqa: E731
     np.random.seed(5)  # noqa: NPY002  emcee's own generator
     sampler = emcee.EnsembleSampler(16, 2, logarithm)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.identify_drawn import band_of, drawn
-from magshell_fenicsx.studies.laplace import Fit, Measured, fitted
+from magshell_fenicsx.studies.identify_drawn import band_of, posterior_samples
+from magshell_fenicsx.studies.laplace import Measured, Posterior, fit_posterior
 from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
@@ -15,7 +15,7 @@ X = np.linspace(0.0, 1.0, 25)
 NOISE = 0.01
 
 
-def posterior() -> Fit:
+def posterior() -> Posterior:
     """Of a vector with two components along a line, of which eight moments were measured."""
     J = np.array(
         [
@@ -30,7 +30,7 @@ def posterior() -> Fit:
     smooth = Smooth(0, np.abs(X[:, None] - X), 2, 1.0, 0.3)
     start, free = np.zeros(J.shape[1]), np.full(J.shape[1], np.inf)
     measured = Measured(data, np.zeros(len(J), dtype=int), np.array([NOISE]), start, free, smooth)
-    return fitted(lambda x: (J @ x, J), measured, start, np.ones(J.shape[1]), 20, lambda *_: None)
+    return fit_posterior(lambda x: (J @ x, J), measured, start, np.ones(J.shape[1]), 20, lambda *_: None)
 
 
 @pytest.mark.parametrize(("count", "error"), [(20, 0.13), (40, 0.1)])
@@ -44,7 +44,7 @@ def test_bands_of_a_field(count: int, error: float) -> None:
     waves = np.cos(np.pi * np.outer(np.arange(4), X))
     results = np.einsum("kci,ij->kjc", rng.normal(size=(100, 2, 4)), waves).reshape(100, -1)
     samples = results @ rng.multivariate_normal(fit.x, fit.covariance, 4000, method="eigh").T
-    runs = results @ drawn(fit, count).T
+    runs = results @ posterior_samples(fit, count).T
     ratios = []
     for of_samples, of_runs in zip(samples, runs, strict=True):
         (low, high), band = np.quantile(of_samples, [0.025, 0.975]), band_of(of_runs, count)

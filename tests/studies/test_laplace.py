@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.studies.laplace import (
     NORMAL,
-    Fit,
     Measured,
     NoNoise,
     NotSeen,
-    fitted,
+    Posterior,
+    fit_posterior,
     nonlinearity,
 )
 from magshell_fenicsx.studies.smooth import Smooth
@@ -41,8 +41,8 @@ def measured(seed: int, noise: float = NOISE, deviation: float = np.inf) -> Meas
     )
 
 
-def fit(known: Measured, start: tuple[float, float] = (1.0, 1.0)) -> Fit:
-    return fitted(relaxing, known, np.array(start), np.ones(2), 30, lambda *_: None)
+def fit(known: Measured, start: tuple[float, float] = (1.0, 1.0)) -> Posterior:
+    return fit_posterior(relaxing, known, np.array(start), np.ones(2), 30, lambda *_: None)
 
 
 @pytest.mark.parametrize("noise", [NOISE, np.nan])
@@ -121,7 +121,7 @@ def test_one_more_measurement() -> None:
         there = relaxing(x)
         return there and (np.append(there[0], there[0][k]), np.vstack([there[1], there[1][k]]))
 
-    then = fitted(twice, again, own.x, np.ones(2), 30, lambda *_: None)
+    then = fit_posterior(twice, again, own.x, np.ones(2), 30, lambda *_: None)
     assert own.narrowed(own.slopes[k], NOISE) == pytest.approx(then.deviation, rel=1e-3)
 
 
@@ -135,15 +135,15 @@ def test_what_data_do_not_see_is_named() -> None:
         2 * T, np.zeros(len(T), dtype=np.int64), np.array([0.1]), np.ones(2), np.full(2, np.inf)
     )
     with pytest.raises(NotSeen) as refused:
-        fitted(product, known, np.array([1.0, 1.5]), np.ones(2), 5, lambda *_: None)
+        fit_posterior(product, known, np.array([1.0, 1.5]), np.ones(2), 5, lambda *_: None)
     assert refused.value.numbers == [0, 1]
     one = Measured(known.data, known.group, known.noise, np.ones(2), np.array([0.1, np.inf]))
-    assert fitted(
+    assert fit_posterior(
         product, one, np.array([1.0, 1.5]), np.ones(2), 30, lambda *_: None
     ).x == pytest.approx([1.0, 2.0], rel=1e-6)
 
 
-def mean_of(data: Array, deviation: float, noise: float = np.nan) -> Fit:
+def mean_of(data: Array, deviation: float, noise: float = np.nan) -> Posterior:
     """A number that is measured itself, with the prior 0 +- deviation."""
     known = Measured(
         data,
@@ -153,7 +153,7 @@ def mean_of(data: Array, deviation: float, noise: float = np.nan) -> Fit:
         np.array([float(deviation)]),
     )
     slopes = np.ones((len(data), 1))
-    return fitted(
+    return fit_posterior(
         lambda x: (x[0] + 0 * data, slopes), known, np.zeros(1), np.ones(1), 50, lambda *_: None
     )
 
@@ -197,7 +197,7 @@ def test_bands_that_are_wide_as_data_are_few() -> None:
     known = Measured(
         data, np.zeros(2, dtype=np.int64), np.array([np.nan]), np.ones(1), np.array([np.inf])
     )
-    own = fitted(spring, known, np.ones(1), np.ones(1), 20, lambda *_: None)
+    own = fit_posterior(spring, known, np.ones(1), np.ones(1), 20, lambda *_: None)
     assert own.band[0] < 0.5
     assert nonlinearity(spring, own)[0] > NORMAL
 
@@ -216,12 +216,12 @@ class Blurred:
         r = np.sqrt(3) * np.abs(self.X[:, None] - self.X) / self.LENGTH
         return self.S**2 * ((1 + r) * np.exp(-r) + 1e-8 * np.eye(25))
 
-    def fit(self, truth: Array, seed: int, deviation: float, length: float, noise: float) -> Fit:
+    def fit(self, truth: Array, seed: int, deviation: float, length: float, noise: float) -> Posterior:
         data = self.J @ truth + NOISE * np.random.default_rng(seed).normal(size=40)
         smooth = Smooth(0, np.abs(self.X[:, None] - self.X), 1, deviation, length)
         group = np.zeros(40, dtype=np.int64)
         known = Measured(data, group, np.array([noise]), np.zeros(25), np.full(25, np.inf), smooth)
-        return fitted(
+        return fit_posterior(
             lambda x: (self.J @ x, self.J), known, np.zeros(25), np.ones(25), 20, lambda *_: None
         )
 
@@ -234,7 +234,7 @@ def test_a_smooth_field_of_given_strength() -> None:
     truth = np.linalg.cholesky(own.K) @ rng.normal(size=25)
     fit = own.fit(truth, 3, own.S, own.LENGTH, NOISE)
     gain = own.K @ own.J.T @ np.linalg.inv(own.J @ own.K @ own.J.T + NOISE**2 * np.eye(40))
-    assert fit.x == pytest.approx(gain @ fit.known.data, abs=1e-5)
+    assert fit.x == pytest.approx(gain @ fit.measured.data, abs=1e-5)
     assert fit.covariance == pytest.approx(own.K - gain @ own.J @ own.K, abs=1e-5)
 
 
@@ -247,10 +247,10 @@ def test_the_strength_that_makes_data_most_likely() -> None:
     for seed in range(40):
         truth = np.linalg.cholesky(own.K) @ rng.normal(size=25)
         fit = own.fit(truth, seed, np.nan, np.nan, np.nan)
-        prior = fit.known.field
+        prior = fit.measured.field
         assert prior
 
-        def density(s: float, length: float, noise: float, data: Array = fit.known.data) -> float:
+        def density(s: float, length: float, noise: float, data: Array = fit.measured.data) -> float:
             other = Blurred()
             other.S, other.LENGTH = s, length  # type: ignore[misc]
             covariance = own.J @ other.K @ own.J.T + noise**2 * np.eye(40)
@@ -261,7 +261,7 @@ def test_the_strength_that_makes_data_most_likely() -> None:
             around = [best * (1 + 0.05 * sign * axis) for axis in np.eye(3) for sign in (-1, 1)]
             assert density(*best) > max(density(*each) for each in around)
         inside.append(float(np.mean((fit.band[0] < truth) & (truth < fit.band[1]))))
-        misfits.append(float(np.mean((fit.known.data - fit.y) ** 2) / NOISE**2))
+        misfits.append(float(np.mean((fit.measured.data - fit.y) ** 2) / NOISE**2))
         noises.append(float(fit.noise[0]))
     assert 0.9 < np.mean(inside) < 0.98
     assert np.mean(noises) == pytest.approx(NOISE, rel=0.05)

@@ -37,7 +37,7 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
     case = Case.from_source(source)
     assert case.design
     vary, file = variables(source, case, case.design), tmp_path / "B.csv"
-    known = vary.first + 0.5 * np.sin(np.arange(6.0))
+    known = vary.start_values + 0.5 * np.sin(np.arange(6.0))
 
     def made(x: Array) -> Case:
         vary.write(x, file)
@@ -59,7 +59,7 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
     class Enough(Exception):
         """The misfit is as small as it shall be."""
 
-    best = vary.first
+    best = vary.start_values
 
     def watched(x: Array) -> tuple[float, Array]:
         nonlocal best
@@ -71,13 +71,13 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
 
     with contextlib.suppress(Enough):
         scipy.optimize.minimize(
-            watched, vary.first, jac=True, method="L-BFGS-B", options={"maxiter": 80, "ftol": 0.0}
+            watched, vary.start_values, jac=True, method="L-BFGS-B", options={"maxiter": 80, "ftol": 0.0}
         )
     assert min(misfits) < 1e-6 * misfits[0]
-    along = np.linspace(0, 1, 11)
+    last_numeric_axis = np.linspace(0, 1, 11)
     assert vary.controls
-    weights = vary.controls.weights(np.column_stack([along, 0 * along, 0 * along]))
+    weights = vary.controls.weights(np.column_stack([last_numeric_axis, 0 * last_numeric_axis, 0 * last_numeric_axis]))
     found, wanted = (weights @ vary.vectors(x) for x in (best, known))
     away = np.linalg.norm(found - wanted, axis=1)
-    assert away[along > 0.35].max() < 0.015
+    assert away[last_numeric_axis > 0.35].max() < 0.015
     assert away.max() < 0.05

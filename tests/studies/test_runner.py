@@ -28,9 +28,9 @@ from magshell_fenicsx.studies.runner import (
     compute,
     keep,
     keep_outcome,
-    kept,
-    kept_outcome,
     outcome_of,
+    stored_outcome,
+    stored_outcome_of_case,
 )
 
 PLATE = CASES / "clamped_plate.yaml"
@@ -52,20 +52,20 @@ def test_an_outcome_is_kept_for_these_sources(
 ) -> None:
     """What is missing, cut off, of other types or of other sources is none."""
     file, case = tmp_path / "a.json", Case.load(PLATE)
-    assert kept_outcome(file) is None
+    assert stored_outcome_of_case(file) is None
     keep_outcome(OUTCOME, case, file)
-    assert kept_outcome(file) == OUTCOME
+    assert stored_outcome_of_case(file) == OUTCOME
     assert [each.name for each in tmp_path.iterdir()] == ["a.json"]
     content = json.loads(file.read_text(encoding="utf-8"))
     assert content["case"]["shell"]["geometry"] == "disc"
     for changed in ({"dofs": "many"}, {"curve": 3}, {"found": "guess"}, {"more": 1}):
         keep(file, {**content, "outcome": content["outcome"] | changed})
-        assert (kept_outcome(file) is None) == ("more" not in changed)
+        assert (stored_outcome_of_case(file) is None) == ("more" not in changed)
     file.write_text(json.dumps(content)[:-20], encoding="utf-8")
-    assert kept_outcome(file) is None
+    assert stored_outcome_of_case(file) is None
     keep_outcome(OUTCOME, case, file)
     monkeypatch.setattr(environment, "_RUNNING_VERSION", "0.1.0+anotherhash00000")
-    assert kept_outcome(file) is None
+    assert stored_outcome_of_case(file) is None
 
 
 def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
@@ -76,9 +76,9 @@ def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
 def test_only_what_has_the_same_beside_it(tmp_path: Path) -> None:
     keep(tmp_path / "a.json", {"design": "one", "numbers": [1, 2]})
     numbers = TypeAdapter(list[float])
-    assert kept(tmp_path / "a.json", numbers, "numbers", design="one") == [1, 2]
-    assert kept(tmp_path / "a.json", numbers, "numbers", design="two") is None
-    assert kept(tmp_path / "a.json", numbers, "numbers", other="one") is None
+    assert stored_outcome(tmp_path / "a.json", numbers, "numbers", design="one") == [1, 2]
+    assert stored_outcome(tmp_path / "a.json", numbers, "numbers", design="two") is None
+    assert stored_outcome(tmp_path / "a.json", numbers, "numbers", other="one") is None
 
 
 @pytest.mark.parametrize("part", ["0/2", "3/2", "1", "a/b", "1/9", "1/2/3"])
@@ -131,11 +131,11 @@ def test_a_study_of_ones_own(tmp_path: Path) -> None:
             yield f"{load}"
 
         compute(
-            [load for load in loads if kept_outcome(files[load]) is None],
+            [load for load in loads if stored_outcome_of_case(files[load]) is None],
             load_computed,
             MPI.COMM_WORLD,
         )
-        outcomes = [kept_outcome(file) for file in files.values()]
+        outcomes = [stored_outcome_of_case(file) for file in files.values()]
         values = [outcome.value(scalar) if outcome else None for outcome in outcomes]
         write_csv(
             [{"load": load, "w": w} for load, w in zip(loads, values, strict=True)],
@@ -154,7 +154,7 @@ def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the rest of the time once it is known, and never beside a line that was just said;
     nested, once.
     """
-    monkeypatch.setattr(runner, "EACH", 0.2)
+    monkeypatch.setattr(runner, "SECONDS_BETWEEN_LINES", 0.2)
     said: list[str] = []
 
     def slow(number: int) -> Iterator[str]:
@@ -173,7 +173,7 @@ def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_reminders_have_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner, "EACH", 0.1)
+    monkeypatch.setattr(runner, "SECONDS_BETWEEN_LINES", 0.1)
     said: list[str] = []
     with runner.heard(MPI.COMM_SELF, said.append, lambda: ", about 2 h left"):
         time.sleep(0.35)

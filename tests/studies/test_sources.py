@@ -179,10 +179,10 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     assert len(computed) == 3
     assert again("loading.pressure=1e-5:3e-5:3") == []
     assert computed == []
-    kept = [
+    stored_outcome = [
         json.loads(file.read_text(encoding="utf-8")) for file in (tmp_path / "points").iterdir()
     ]
-    assert [point["sources"] for point in kept] == 3 * [OTHER]
+    assert [point["sources"] for point in stored_outcome] == 3 * [OTHER]
 
 
 SUMMARY = {

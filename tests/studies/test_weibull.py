@@ -101,4 +101,4 @@ def test_distance_and_correlations_are_those_of_scipy() -> None:
     assert found["spearman"] == pytest.approx(stats.spearmanr(x, y)[0])
     law = fit(y)
     assert law
-    assert distance(y, law) == pytest.approx(stats.ks_1samp(y, law.below).statistic)
+    assert distance(y, law) == pytest.approx(stats.ks_1samp(y, law.probability_below).statistic)

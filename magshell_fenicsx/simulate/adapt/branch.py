@@ -12,7 +12,14 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, at_target, near_by
-from magshell_fenicsx.simulate.adapt.tolerance import CHEAP, FIRST, Say, Solved, estimated, rounds
+from magshell_fenicsx.simulate.adapt.tolerance import (
+    FIRST_REFINEMENTS,
+    PATH_DEGREE,
+    Say,
+    Solved,
+    estimated,
+    rounds,
+)
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -35,14 +42,22 @@ def branched(
         If it ends there at no single load, or is lost.
     """
     doing("a mesh for the tolerance on the branch: the path on a coarse one")
-    begun = _first(first, comm)
-    if begun is None:
+    start_on_branch = _coarsest_branch(first, comm)
+    if start_on_branch is None:
         return None
-    choice, coarse = begun
-    return rounds(coarse[0].problem, choice, coarse, _moved, say, doing, of=" on the branch")
+    choice, coarse_solution = start_on_branch
+    return rounds(
+        coarse_solution[0].problem,
+        choice,
+        coarse_solution,
+        _on_finer_mesh,
+        say,
+        doing,
+        suffix=" on the branch",
+    )
 
 
-def branch_error(chosen: Adapted, record: Record) -> float:
+def branch_error(adapted: Adapted, record: Record) -> float:
     """The estimated relative error of the result at the end of a branch on the mesh chosen for it;
     collective.
 
@@ -52,18 +67,18 @@ def branch_error(chosen: Adapted, record: Record) -> float:
         If it has no single load, or is not found with one degree more.
     """
     scene, low = _ended(record)
-    choice = chosen.choice
+    choice = adapted.choice
     finer = Choice(choice.degree + 1, choice.refinement, choice.size)
-    return estimated(low.value, _moved(scene.problem, finer, (scene, low))[1].value)
+    return estimated(low.value, _on_finer_mesh(scene.problem, finer, (scene, low))[1].value)
 
 
-def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
+def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
     """The branch on the coarsest mesh where it has a result; None without a branch."""
-    lost = NoResult("no mesh is fine enough")
+    failure = NoResult("no mesh is fine enough")
     if first.asked.body:
         raise NoResult("of a solid nothing is carried between meshes")
-    for refinement in FIRST:
-        scene, choice = first.choice.scene(first.asked, comm), Choice(CHEAP, refinement)
+    for refinement in FIRST_REFINEMENTS:
+        scene, choice = first.choice.scene(first.asked, comm), Choice(PATH_DEGREE, refinement)
         scene.meshed = choice.applied
         last: Record | None = None
         try:
@@ -73,12 +88,12 @@ def _first(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
                 if record.scene is not scene and record.label not in LOCATED:
                     last = record
         except Stopped as e:
-            lost = NoResult(str(e))
+            failure = NoResult(str(e))
             continue
         if last is None:
             return None
         return choice, _ended(last)
-    raise lost
+    raise failure
 
 
 def _ended(record: Record) -> tuple[Scene, Ending]:
@@ -91,12 +106,12 @@ def _ended(record: Record) -> tuple[Scene, Ending]:
     return record.scene, end
 
 
-def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
+def _on_finer_mesh(problem: Problem, choice: Choice, neighbour: Solved) -> Solved:
     try:
-        scene = choice.scene(problem, near[0].comm)
+        scene = choice.scene(problem, neighbour[0].comm)
     except (CaseError, MeshError) as e:
         raise NoResult(str(e)) from None
-    end = near_by(scene, *near)
+    end = near_by(scene, *neighbour)
     if end is None:
         raise NoResult("the end of the branch is not found on another mesh")
     return scene, end

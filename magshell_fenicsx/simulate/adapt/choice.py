@@ -41,9 +41,9 @@ class Sampled:
     precision: ClassVar[float] = 1e-6
 
     def __call__(self, x: Array) -> float:
-        distance, near = self._tree.query(x, NEIGHBOURS)
+        distance, neighbours = self._tree.query(x, NEIGHBOURS)
         weight = 1 / (distance + 1e-12)
-        return float(np.exp(weight @ np.log(self.sizes[near]) / weight.sum()))
+        return float(np.exp(weight @ np.log(self.sizes[neighbours]) / weight.sum()))
 
     @cached_property
     def _tree(self) -> "scipy.spatial.cKDTree":
@@ -51,7 +51,7 @@ class Sampled:
 
 
 def equidistributed(
-    old: Size, centres: Array, shares: Array, order: float, reduction: float, least: float
+    old: Size, centres: Array, shares: Array, order: float, reduction: float, least_ratio: float
 ) -> tuple[Sampled, float]:
     """Sizes for which all cells have equal shares in the error, and the error falls by a factor.
 
@@ -63,7 +63,7 @@ def equidistributed(
         Power of the size in the error; the share of one cell falls with the power `order` + 2.
     reduction
         Wanted error over the error on the old mesh.
-    least
+    least_ratio
         Smallest size: the thickness, below which only the singularity of a point force remains.
 
     Returns
@@ -72,18 +72,20 @@ def equidistributed(
     """
     wish = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
     change = _smoothed(centres, np.clip(wish, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
-    expected = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
-    change *= np.clip((reduction / expected) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+    expected_ratio = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
+    change *= np.clip(
+        (reduction / expected_ratio) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE
+    )
     change = 2 ** (np.round(STEPS * np.log2(change)) / STEPS)
-    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least)), float(
+    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least_ratio)), float(
         np.mean(change**-2)
     )
 
 
 def _smoothed(centres: Array, wish: Array) -> Array:
     """Geometric mean of a cell and its neighbours."""
-    near = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
-    return np.asarray(np.exp(np.log(wish)[near].mean(axis=1)))
+    neighbours = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
+    return np.asarray(np.exp(np.log(wish)[neighbours].mean(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -99,18 +101,20 @@ class Choice:
     size: Sampled | None = None
     layers: int | None = None
 
-    def applied(self, asked: Problem) -> Problem:
+    def applied(self, requested: Problem) -> Problem:
         """The problem on this mesh."""
         mesh = {"mesh.degree": self.degree, "mesh.refinement": self.refinement}
-        problem = asked.with_values(mesh | ({"solid.layers": self.layers} if self.layers else {}))
+        problem = requested.with_values(
+            mesh | ({"solid.layers": self.layers} if self.layers else {})
+        )
         return replace(problem, size=self.size) if self.size else problem
 
-    def scene(self, asked: Problem, comm: MPI.Comm) -> Scene:
-        return Scene(self.applied(asked), comm)
+    def scene(self, requested: Problem, comm: MPI.Comm) -> Scene:
+        return Scene(self.applied(requested), comm)
 
 
 @dataclass(frozen=True)
-class Round:
+class AdaptiveRound:
     """A mesh that was tried; `estimate` is the estimated relative error of the result."""
 
     degree: int
@@ -142,8 +146,8 @@ class Adapted:
 
     asked: Problem
     choice: Choice
-    best: Round
-    rounds: list[Round]
+    best: AdaptiveRound
+    rounds: list[AdaptiveRound]
     branch: "Adapted | None" = None
 
     def account(self, result: float | None, on_branch: float | None = None) -> dict[str, Any]:
@@ -159,13 +163,15 @@ class Adapted:
         on_branch
             The estimated relative error at the end of the branch, or None.
         """
-        best, least = self.best, min(self.rounds, key=lambda each: each.estimate)
-        apart = max(best.estimate, LOAD_TOLERANCE) * abs(best.result)
-        same = result is not None and abs(result - best.result) <= apart
+        best, best_round = self.best, min(self.rounds, key=lambda each: each.estimate)
+        result_tolerance = max(best.estimate, LOAD_TOLERANCE) * abs(best.result)
+        is_same = result is not None and abs(result - best.result) <= result_tolerance
         return {
             "tolerance": self.asked.mesh.tolerance,
-            "error_estimate": best.estimate if same else None,
-            "best": {"result": least.result, "error_estimate": least.estimate} if same else None,
+            "error_estimate": best.estimate if is_same else None,
+            "best": {"result": best_round.result, "error_estimate": best_round.estimate}
+            if is_same
+            else None,
             "rounds": [asdict(r) for r in self.rounds],
             **({"branch": self.branch.of_branch(on_branch)} if self.branch else {}),
         }
@@ -178,29 +184,33 @@ class Adapted:
         """All except the problem, in full precision, so that a resumed run has the same mesh on any
         number of ranks.
         """
-        return json.dumps(self._plain()).encode()
+        return json.dumps(self._as_data()).encode()
 
-    def _plain(self) -> dict[str, Any]:
+    def _as_data(self) -> dict[str, Any]:
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
-        own = {
+        content = {
             "best": self.rounds.index(self.best),
             "rounds": [asdict(r) for r in self.rounds],
             "size": sizes,
         }
-        return own | ({"branch": self.branch._plain()} if self.branch else {})
+        return content | ({"branch": self.branch._as_data()} if self.branch else {})
 
     @classmethod
-    def from_json(cls, asked: Problem, content: bytes) -> "Adapted":
+    def from_json(cls, requested: Problem, content: bytes) -> "Adapted":
         """Read the content of `to_json` for the same problem."""
-        return cls._of(asked, json.loads(content))
+        return cls._from_data(requested, json.loads(content))
 
     @classmethod
-    def _of(cls, asked: Problem, values: dict[str, Any]) -> "Adapted":
-        rounds = [Round(**r) for r in values["rounds"]]
+    def _from_data(cls, requested: Problem, values: dict[str, Any]) -> "Adapted":
+        rounds = [AdaptiveRound(**r) for r in values["rounds"]]
         best, size = rounds[values["best"]], values["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
-        branch = cls._of(asked, values["branch"]) if values.get("branch") else None
+        branch = cls._from_data(requested, values["branch"]) if values.get("branch") else None
         return cls(
-            asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds, branch
+            requested,
+            Choice(best.degree, best.refinement, sampled, best.layers),
+            best,
+            rounds,
+            branch,
         )

@@ -27,9 +27,11 @@ Array = NDArray[np.float64]
 CANDIDATES = 12  # number of nearest cells that are searched for a point
 WIDER = 8  # factor of that number if none of them contains the point
 NEWTON_STEPS = 4  # for the position in a cell with a curved edge
-INSIDE = 1e-6  # distance from a cell, in cells, below which a point is inside: rounding
-BESIDE = 0.1  # largest distance, in cells; two meshes approximate a curved edge differently
-FAR = 1.0  # distance, in cells, beyond which a cell's map is not inverted
+INSIDE_TOLERANCE = 1e-6  # distance from a cell, in cells, below which a point is inside: rounding
+MAX_DISTANCE_IN_CELLS = (
+    0.1  # largest distance, in cells; two meshes approximate a curved edge differently
+)
+NEAR_CELL_DISTANCE = 1.0  # distance, in cells, beyond which a cell's map is not inverted
 FIELDS = ("lambda_m", "angle")  # amplitudes whose value is prescribed
 MOST_CHANGED = 10  # times that an end gets stiffer penalties or new cuts of shells that touch
 
@@ -51,24 +53,34 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         CellFields.of(source),
         target.comm,
         _chart(target),
-        gathered(source, u),
+        values_of_all_cells(source, u),
     )
     if x.shape[1] > target.model.V.mesh.topology.dim:
         raise NotCarried("a mesh file has no chart")
-    moved, worst = np.zeros((len(x), values.shape[2])), (0.0, list[float]())
-    here = source.model.V.mesh.topology.index_map(source.model.V.mesh.topology.dim).size_local
-    for cells_here, own in zip(cells_of_shells(source), nodes_of_shells(target), strict=True):
-        inside = np.concatenate(source.model.system.comm.allgather(cells_here[:here]))
-        cells, xi, beside = fields.some(inside).places(x[own])
-        moved[own] = fields.at(values, np.flatnonzero(inside)[cells], xi)
-        if own.any():
-            worst = max(worst, (float(beside.max()), x[own][np.argmax(beside)].tolist()))
-    away, place = max(comm.allgather(worst))
-    if away > BESIDE:
-        raise NotCarried(
-            f"the place {place} of the chart is {away:.2g} cells beside the other mesh"
+    transferred, worst = np.zeros((len(x), values.shape[2])), (0.0, list[float]())
+    owned_cells = source.model.V.mesh.topology.index_map(
+        source.model.V.mesh.topology.dim
+    ).size_local
+    for cells_here, nodes_of_shell in zip(
+        cells_of_shells(source), nodes_of_shells(target), strict=True
+    ):
+        is_source_cell = np.concatenate(
+            source.model.system.comm.allgather(cells_here[:owned_cells])
         )
-    return target.model.system.zero_at_supports(moved.ravel())
+        cells, xi, distances = fields.subset(is_source_cell).places(x[nodes_of_shell])
+        transferred[nodes_of_shell] = fields.evaluate(
+            values, np.flatnonzero(is_source_cell)[cells], xi
+        )
+        if nodes_of_shell.any():
+            worst = max(
+                worst, (float(distances.max()), x[nodes_of_shell][np.argmax(distances)].tolist())
+            )
+    largest_distance, place = max(comm.allgather(worst))
+    if largest_distance > MAX_DISTANCE_IN_CELLS:
+        raise NotCarried(
+            f"the place {place} of the chart is {largest_distance:.2g} cells beside the other mesh"
+        )
+    return target.model.system.zero_at_supports(transferred.ravel())
 
 
 def _chart(scene: Scene) -> Array:
@@ -76,7 +88,7 @@ def _chart(scene: Scene) -> Array:
     return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 
-def gathered(scene: Scene, u: Vector) -> Array:
+def values_of_all_cells(scene: Scene, u: Vector) -> Array:
     """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank;
     collective.
     """
@@ -112,12 +124,12 @@ class CellFields:
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             x = chart(scene)
-            nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[
-                ..., : x.shape[1]
-            ]
+            nodes = values_of_all_cells(
+                scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel()
+            )[..., : x.shape[1]]
         return cls(nodes, scene.model.V.element.basix_element)
 
-    def some(self, cells: NDArray[np.bool_]) -> "CellFields":
+    def subset(self, cells: NDArray[np.bool_]) -> "CellFields":
         """Some of the cells alone."""
         return self if cells.all() else CellFields(self.nodes[cells], self._element)
 
@@ -126,8 +138,8 @@ class CellFields:
         """(cells, 1 or 2)."""
         return np.asarray(self._corners.mean(axis=1))
 
-    def at(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
-        """The values (n, components) of a `gathered` field at positions found by `places`."""
+    def evaluate(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
+        """The values (n, components) of a `values_of_all_cells` field at positions found by `places`."""
         return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
 
     def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -140,44 +152,52 @@ class CellFields:
         """
         count = min(CANDIDATES, len(self.nodes))
         candidates = self._near.query(x, count)[1].reshape(len(x), count)
-        straight = np.stack([_beside(self._as_if_straight(x, cells)) for cells in candidates.T])
+        straight = np.stack(
+            [_distance_to_cell(self._as_if_straight(x, cells)) for cells in candidates.T]
+        )
         cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
-        xi, beside = self._in_cells(x, cells)
-        enough = INSIDE
-        while len(far := np.flatnonzero(beside > enough)):  # a large cell may have a distant centre
-            candidates = self._near.query(x[far], count)[1].reshape(len(far), count)
+        xi, distances = self._in_cells(x, cells)
+        enough = INSIDE_TOLERANCE
+        while len(
+            far_points := np.flatnonzero(distances > enough)
+        ):  # a large cell may have a distant centre
+            candidates = self._near.query(x[far_points], count)[1].reshape(len(far_points), count)
             for tried in candidates.T:
-                xi_tried, off = self._in_cells(x[far], tried)
-                better = far[off < beside[far]]
-                cells[better], xi[better], beside[better] = (
-                    a[off < beside[far]] for a in (tried, xi_tried, off)
+                xi_tried, off = self._in_cells(x[far_points], tried)
+                better = far_points[off < distances[far_points]]
+                cells[better], xi[better], distances[better] = (
+                    a[off < distances[far_points]] for a in (tried, xi_tried, off)
                 )
             if count == len(self.nodes):
                 break
-            enough = INSIDE if count <= CANDIDATES else BESIDE
+            enough = INSIDE_TOLERANCE if count <= CANDIDATES else MAX_DISTANCE_IN_CELLS
             count = min(WIDER * count, len(self.nodes))
-        return cells, xi, np.where(beside > INSIDE, beside, 0.0)
+        return cells, xi, np.where(distances > INSIDE_TOLERANCE, distances, 0.0)
 
     def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
         """Positions of points in the reference cells of given cells, and distances; inf if Newton's
         method fails.
         """
         xi = self._as_if_straight(x, cells)
-        beside = np.full(len(x), np.inf)
-        near = np.flatnonzero(_beside(xi) < FAR)
-        if not len(near):
-            return xi, beside
-        x, nodes, inside = x[near], self.nodes[cells[near]], xi[near]
+        distances = np.full(len(x), np.inf)
+        near_cells = np.flatnonzero(_distance_to_cell(xi) < NEAR_CELL_DISTANCE)
+        if not len(near_cells):
+            return xi, distances
+        x, nodes, reference_points = x[near_cells], self.nodes[cells[near_cells]], xi[near_cells]
         for _ in range(NEWTON_STEPS):
-            table = self.table(1, inside)
+            table = self.table(1, reference_points)
             rest = x - np.einsum("np,npd->nd", table[0], nodes)
             step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), rest)
-            inside = inside + step
-        xi[near], beside[near] = (
-            inside,
-            np.where(np.abs(step).max(axis=1) < INSIDE, _beside(inside), np.inf),
+            reference_points = reference_points + step
+        xi[near_cells], distances[near_cells] = (
+            reference_points,
+            np.where(
+                np.abs(step).max(axis=1) < INSIDE_TOLERANCE,
+                _distance_to_cell(reference_points),
+                np.inf,
+            ),
         )
-        return xi, beside
+        return xi, distances
 
     def table(self, derivatives: int, xi: Array) -> Array:
         """Shape functions and derivatives (derivative, n, nodes) at points of the reference cell."""
@@ -193,7 +213,7 @@ class CellFields:
         return _solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), x - corners[:, 0])
 
 
-def _beside(xi: Array) -> Array:
+def _distance_to_cell(xi: Array) -> Array:
     """Distance of positions (n, 1 or 2) from the reference cell; negative inside."""
     return np.asarray(np.maximum(-xi.min(axis=1), xi.sum(axis=1) - 1))
 
@@ -289,10 +309,10 @@ class History:
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
         if not self.located:
-            none = (
+            no_instability = (
                 "there is no instability up to the target" if steps and steps[-1].load.bound else ""
             )
-            raise NoResult(stopped or none or "the case has neither a load nor a field")
+            raise NoResult(stopped or no_instability or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]
         departures = [
             record for record in self._departures(scene) if record.step == in_last[0].step
@@ -343,7 +363,7 @@ def by_path(scene: Scene) -> Ending:
     return history.ending(scene, stopped)
 
 
-def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
+def from_near(scene: Scene, source: Scene, neighbour: Ending) -> Ending:
     """The end of a scene by Newton's method from the end on another mesh; if this fails, by the
     path.
 
@@ -352,30 +372,30 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
     NoResult
         See `History.ending`.
     """
-    return near_by(scene, source, near) or by_path(scene)
+    return near_by(scene, source, neighbour) or by_path(scene)
 
 
-def near_by(scene: Scene, source: Scene, near: Ending) -> Ending | None:
+def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
     """The end of a scene by Newton's method from the end on another mesh; None if it fails, or
     needs a path.
     """
-    if near.kind in ("held", "instability"):
+    if neighbour.kind in ("held", "instability"):
         return None
     try:
-        u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
+        u, tangent = (carry(source, scene, v) for v in (neighbour.state.u, neighbour.tangent))
     except NotCarried:
         return None
-    guess = with_cuts_here(scene, State(u, dict(near.state.mu)))
+    guess = with_cuts_here(scene, State(u, dict(neighbour.state.mu)))
     for _ in range(MOST_CHANGED):
-        is_fold = near.kind == "fold"
+        is_fold = neighbour.kind == "fold"
         end = (
-            _fold(scene, FoldGuess(guess, tangent), near.name)
+            _fold(scene, FoldGuess(guess, tangent), neighbour.name)
             if is_fold
-            else _equilibrium(scene, guess, near)
+            else _equilibrium(scene, guess, neighbour)
         )
-        if end is None or (own := of_its_own(scene, end.state)) is None:
+        if end is None or (own_result := of_its_own(scene, end.state)) is None:
             return end
-        guess, tangent = own, end.tangent
+        guess, tangent = own_result, end.tangent
     return None
 
 
@@ -387,17 +407,26 @@ def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
     return None if fold.unstable else Ending("fold", name, fold.value, fold.state, fold.phi)
 
 
-def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
-    newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
+def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None:
+    newton, system, name, held_value = (
+        scene.newton,
+        scene.newton.system,
+        neighbour.name,
+        neighbour.held,
+    )
     row: ConstraintRow = (
-        PrescribedLoad(name, guess.mu[name]) if held is None else PrescribedConjugate(system, name, held)
+        PrescribedLoad(name, guess.mu[name])
+        if held_value is None
+        else PrescribedConjugate(system, name, held_value)
     )
     outcome = newton.solve(guess, name, row)
     if not outcome.converged:
         return None
     state = outcome.state
     tangent = newton.response(state, name, row, exact=True).du
-    return Ending("target", name, _value(system, state, name, held), state, tangent, held)
+    return Ending(
+        "target", name, _value(system, state, name, held_value), state, tangent, held_value
+    )
 
 
 def at_target(scene: Scene, record: Record) -> Ending:
@@ -410,7 +439,7 @@ def at_target(scene: Scene, record: Record) -> Ending:
     target = step.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
-    held = (
+    held_value = (
         -system.potential(state.u, state.mu, name)
         if by_conjugate and record.amplitude not in FIELDS
         else None
@@ -418,8 +447,10 @@ def at_target(scene: Scene, record: Record) -> Ending:
     kind: Literal["target", "held"] = (
         "held" if any(how != "load" for how in step.hold.values()) else "target"
     )
-    return Ending(kind, name, _value(system, state, name, held), state, record.point.du, held)
+    return Ending(
+        kind, name, _value(system, state, name, held_value), state, record.point.du, held_value
+    )
 
 
-def _value(system: System, state: State, name: str, held: float | None) -> float:
-    return state.mu[name] if held is not None else -system.potential(state.u, state.mu, name)
+def _value(system: System, state: State, name: str, held_value: float | None) -> float:
+    return state.mu[name] if held_value is not None else -system.potential(state.u, state.mu, name)

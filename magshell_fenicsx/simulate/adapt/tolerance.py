@@ -32,7 +32,7 @@ from magshell_fenicsx.models.shell.law import work
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.mesh_sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round, equidistributed
+from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice, equidistributed
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
     Ending,
@@ -40,16 +40,20 @@ from magshell_fenicsx.simulate.adapt.ending import (
     by_path,
     carry,
     from_near,
-    gathered,
+    values_of_all_cells,
 )
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 STEP = 1e-30  # along the imaginary axis: the derivative is exact
-FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
+FIRST_REFINEMENTS = (
+    0.5,
+    1.0,
+    2.0,
+)  # refinements of the first mesh, tried until the path has a result
 FINER = 1.5  # factor of the refinement that is compared with
 SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
-PART = 0.4  # each part of the estimated error over the tolerance
+ERROR_SHARE = 0.4  # each part of the estimated error over the tolerance
 MOST_ROUNDS = 6
 MOST_LAYERS = 9
 Say = Callable[[str], None]
@@ -58,16 +62,18 @@ DEGREES = (
     (2e-4, 4),
     (0.0, 5),
 )  # the fastest degree for tolerances down to the first number
-CHEAP = 3  # degree of the path
+PATH_DEGREE = 3  # degree of the path
 SAFETY = 1.25  # factor of the estimate for the error of the finer solution
-AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
+AIM, MIN_REDUCTION = 0.55, 1 / 5  # estimated error over the tolerance
 COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
 LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
-FEW = 50  # a surface with at most so many cells is not coarsened
+MIN_CELLS_TO_COARSEN = 50  # a surface with at most so many cells is not coarsened
 Solved = tuple[Scene, Ending]
 
 
-def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
+def indicators(
+    coarse_solution: tuple[Scene, Ending], fine_solution: tuple[Scene, Ending]
+) -> tuple[Array, Array]:
     """Share of each cell in the error of the result, up to a common factor; collective.
 
     The result J of a run is an amplitude on a path of stationary points, or its conjugate
@@ -79,14 +85,14 @@ def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tupl
 
     Parameters
     ----------
-    coarse, fine
+    coarse_solution, fine_solution
         Scenes on one mesh with their ends; the second has a higher degree.
 
     Returns
     -------
     Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and shares (n,).
     """
-    (scene, low), (richer, high) = coarse, fine
+    (scene, low), (richer, high) = coarse_solution, fine_solution
     cells, comm = CellFields.of(richer), richer.newton.system.comm
     u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
     scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no scale
@@ -114,16 +120,20 @@ class _TangentEnergy:
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._a, self._raise, self._strain = first, np.linalg.inv(metric0), (metric - metric0) / 2
         places = np.einsum(
-            "qp,npc->nqc", self._table[0], gathered(scene, model.r0.x.array[: model.system.size])
+            "qp,npc->nqc",
+            self._table[0],
+            values_of_all_cells(scene, model.r0.x.array[: model.system.size]),
         )
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
-        own = None
+        material_directions = None
         if (made_of := getattr(model, "made_of", None)) is not None:
             rows = made_of.x.array.reshape(-1, 4)[
                 : made_of.function_space.dofmap.index_map.size_local
             ]
-            own = np.concatenate(scene.comm.allgather(rows))
-        self._law = scene.problem.material.law_in(own).at(places, a1, a2, np.cross(a1, a2))
+            material_directions = np.concatenate(scene.comm.allgather(rows))
+        self._law = scene.problem.material.law_in(material_directions).at(
+            places, a1, a2, np.cross(a1, a2)
+        )
         self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
         self._area = np.sqrt(np.linalg.det(metric0))
 
@@ -132,8 +142,8 @@ class _TangentEnergy:
         law = self._law
         first, second = self._derivatives(v)
         E = np.einsum("...ic,...jc->...ij", self._a, first)
-        turned = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
-        K = np.einsum("...c,...ijc->...ij", self._normal, turned)
+        covariant_derivative = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
+        K = np.einsum("...c,...ijc->...ij", self._normal, covariant_derivative)
         E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
         slope = work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
         bent = (
@@ -144,7 +154,7 @@ class _TangentEnergy:
 
     def _derivatives(self, v: Vector) -> tuple[Array, Array]:
         """First (cells, points, i, 3) and second (cells, points, i, j, 3) in the reference cell."""
-        d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
+        d = np.einsum("jqp,npc->jnqc", self._table, values_of_all_cells(self._scene, v))
         second = np.stack(
             [np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3
         )
@@ -153,47 +163,54 @@ class _TangentEnergy:
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
     """Find the mesh of a solid; see `adapted`."""
-    tolerance, tried = problem.mesh.tolerance, list[tuple[Round, Choice]]()
+    tolerance, tried = problem.mesh.tolerance, list[tuple[AdaptiveRound, Choice]]()
     assert tolerance is not None
-    refinement, layers = FIRST[0], (problem.context.of(SolidSection) or SolidSection()).layers
+    refinement, layers = (
+        FIRST_REFINEMENTS[0],
+        (problem.context.of(SolidSection) or SolidSection()).layers,
+    )
     while len(tried) < MOST_ROUNDS:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")
         try:
-            judged, plane, through = _round(problem, comm, refinement, layers)
+            judged, plane, thickness_error = _round(problem, comm, refinement, layers)
         except NoResult:
-            if tried or refinement == FIRST[-1]:
+            if tried or refinement == FIRST_REFINEMENTS[-1]:
                 raise
-            refinement = FIRST[FIRST.index(refinement) + 1]
+            refinement = FIRST_REFINEMENTS[FIRST_REFINEMENTS.index(refinement) + 1]
             continue
         except CaseError:  # too large
             break
         tried.append((judged, Choice(SOLID_DEGREE, refinement, layers=layers)))
         say(
-            f"tolerance {tolerance:g}: refinement {refinement:g}, layers {layers}, {judged.dofs} unknowns: "
-            f"result {judged.result:.9g}, estimated error {plane:.1e} by the size and {through:.1e} by the layers"
+            f"tolerance {tolerance:g}: refinement {refinement:g}, layers {layers}, {judged.dofs} "
+            "unknowns: "
+            f"result {judged.result:.9g}, estimated error {plane:.1e} by the size and "
+            f"{thickness_error:.1e} by the layers"
         )
         if judged.estimate <= tolerance or refinement >= FINEST:
             break
-        if plane > PART * tolerance:
+        if plane > ERROR_SHARE * tolerance:
             refinement = round(
-                refinement * float(np.clip((plane / (PART * tolerance)) ** 0.5, SLOWEST, FASTEST)),
+                refinement
+                * float(np.clip((plane / (ERROR_SHARE * tolerance)) ** 0.5, SLOWEST, FASTEST)),
                 3,
             )
             refinement = min(refinement, FINEST)
-        layers += through > PART * tolerance and layers < MOST_LAYERS
+        layers += thickness_error > ERROR_SHARE * tolerance and layers < MOST_LAYERS
     if not tried:
         raise NoResult("the first mesh is too large")
     best, choice = min(tried, key=lambda t: t[0].estimate)
     if best.estimate > tolerance:
         say(
-            f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}"
+            f"warning: no mesh was found for the tolerance; the least estimated error is "
+            f"{best.estimate:.1e}"
         )
     return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
 def _round(
     problem: Problem, comm: MPI.Comm, refinement: float, layers: int
-) -> tuple[Round, float, float]:
+) -> tuple[AdaptiveRound, float, float]:
     """The result on one mesh, and the relative errors by the size of its elements and by its
     layers.
     """
@@ -209,11 +226,13 @@ def _round(
     )
     scale = max(abs(finer), np.finfo(float).tiny)
     plane = abs(finer - value) / scale / (1 - FINER**-2)
-    through = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
+    thickness_error = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
     return (
-        Round(SOLID_DEGREE, refinement, cells, dofs, value, plane + through, layers),
+        AdaptiveRound(
+            SOLID_DEGREE, refinement, cells, dofs, value, plane + thickness_error, layers
+        ),
         plane,
-        through,
+        thickness_error,
     )
 
 
@@ -242,93 +261,103 @@ def adapted(
     if problem.body:
         return adapted_solid(problem, comm, say, doing)
     doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
-    choice, coarse = _first(problem, comm)
-    return rounds(problem, choice, coarse, _moved, say, doing)
+    choice, coarse_solution = _coarsest_path(problem, comm)
+    return rounds(problem, choice, coarse_solution, _on_other_mesh, say, doing)
 
 
 def rounds(
     problem: Problem,
     choice: Choice,
-    coarse: Solved,
-    moved: "Callable[[Problem, Choice, Solved], Solved]",
+    coarse_solution: Solved,
+    transferred: "Callable[[Problem, Choice, Solved], Solved]",
     say: Say,
     doing: Say,
-    of: str = "",
+    suffix: str = "",
 ) -> Adapted:
     """Rounds from a coarse mesh and the end there; collective.
 
     Parameters
     ----------
-    moved
+    transferred
         Computes the end on another mesh from one near by.
-    of
+    suffix
         Of what, in the lines of the rounds.
     """
     tolerance = problem.mesh.tolerance
     assert tolerance is not None
-    for degree in range(CHEAP + 1, _degree(tolerance) + 1):
+    for degree in range(PATH_DEGREE + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
-        coarse = moved(problem, choice, coarse)
-    tried: list[tuple[Round, Choice]] = []
+        coarse_solution = transferred(problem, choice, coarse_solution)
+    tried: list[tuple[AdaptiveRound, Choice]] = []
     while True:
         doing(
-            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating"
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree "
+            f"{choice.degree}, estimating"
         )
-        fine = moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
-        judged = _judged(choice, coarse, fine)
+        fine_solution = transferred(
+            problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse_solution
+        )
+        judged = _judged(choice, coarse_solution, fine_solution)
         tried.append((judged, choice))
         say(
-            f"tolerance {tolerance:g}{of}: degree {judged.degree}, {judged.cells} cells, {judged.dofs} unknowns: "
+            f"tolerance {tolerance:g}{suffix}: degree {judged.degree}, {judged.cells} cells, "
+            f"{judged.dofs} unknowns: "
             f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
         )
-        least = (
-            0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance
+        least_ratio = (
+            0.0 if coarse_solution[0].problem.axisymmetric else MIN_REDUCTION * tolerance
         )  # what is cheap is not made worse
-        if least <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
+        if least_ratio <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
             break
-        another = _remeshed(choice, coarse, fine, AIM * tolerance / judged.estimate)
+        another = _remeshed(
+            choice, coarse_solution, fine_solution, AIM * tolerance / judged.estimate
+        )
         if another is None:
             break
         doing(
-            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving"
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree "
+            f"{another.degree}, solving"
         )
-        choice, coarse = another, moved(problem, another, fine)
-    within = [t for t in tried if t[0].estimate <= tolerance]
+        choice, coarse_solution = another, transferred(problem, another, fine_solution)
+    rounds_within = [t for t in tried if t[0].estimate <= tolerance]
     best, choice = (
-        min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
+        min(rounds_within, key=lambda t: t[0].dofs)
+        if rounds_within
+        else min(tried, key=lambda t: t[0].estimate)
     )
-    if not within:
+    if not rounds_within:
         say(
-            f"warning: no mesh was found for the tolerance{of}; the least estimated error is {best.estimate:.1e}"
+            f"warning: no mesh was found for the tolerance{suffix}; the least estimated error is "
+            f"{best.estimate:.1e}"
         )
     return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
 def _degree(tolerance: float) -> int:
-    return next(degree for least, degree in DEGREES if tolerance >= least)
+    return next(degree for least_tolerance, degree in DEGREES if tolerance >= least_tolerance)
 
 
-def _first(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
+def _coarsest_path(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
     """The whole path on the coarsest mesh where it has a result."""
-    for refinement in FIRST:
-        choice = Choice(CHEAP, refinement)
+    for refinement in FIRST_REFINEMENTS:
+        choice = Choice(PATH_DEGREE, refinement)
         scene = choice.scene(problem, comm)
         try:
             return choice, (scene, by_path(scene))
         except NoResult as e:
-            lost = e
-    raise lost
+            failure = e
+    raise failure
 
 
-def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
-    scene = choice.scene(problem, near[0].comm)
-    return scene, from_near(scene, *near)
+def _on_other_mesh(problem: Problem, choice: Choice, neighbour: Solved) -> Solved:
+    scene = choice.scene(problem, neighbour[0].comm)
+    return scene, from_near(scene, *neighbour)
 
 
-def _judged(choice: Choice, coarse: Solved, fine: Solved) -> Round:
-    (scene, low), (_, high) = coarse, fine
+def _judged(choice: Choice, coarse_solution: Solved, fine_solution: Solved) -> AdaptiveRound:
+    (scene, low), (_, high) = coarse_solution, fine_solution
     estimate = estimated(low.value, high.value)
-    return Round(
+    return AdaptiveRound(
         choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate
     )
 
@@ -338,28 +367,36 @@ def estimated(low: float, high: float) -> float:
     return SAFETY * abs(high - low) / max(abs(high), np.finfo(float).tiny)
 
 
-def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) -> Choice | None:
+def _remeshed(
+    choice: Choice, coarse_solution: Solved, fine_solution: Solved, reduction: float
+) -> Choice | None:
     """The same degree on another mesh, with the error times `reduction`; None if no other mesh is
     possible.
     """
-    scene, degree = coarse[0], choice.degree
+    scene, degree = coarse_solution[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
-    if scene.problem.axisymmetric or scene.problem.mesh_file or isinstance(scene.problem.shape, Grid):
+    if (
+        scene.problem.axisymmetric
+        or scene.problem.mesh_file
+        or isinstance(scene.problem.shape, Grid)
+    ):
         change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
             change = max(change, LINES)
         finer = np.clip(choice.refinement * change, COARSEST, FINEST)
         refinement = round(float(finer), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
-    if reduction > 1 and scene.cells <= FEW:
+    if reduction > 1 and scene.cells <= MIN_CELLS_TO_COARSEN:
         return None
-    centres, shares = indicators(coarse, fine)
-    size, more = equidistributed(
+    centres, shares = indicators(coarse_solution, fine_solution)
+    size, expected_ratio = equidistributed(
         scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
     )
-    if not _fits(fine[0], 2 * fine[0].model.system.dofs * more):  # twice, since this is an estimate
+    if not _fits(
+        fine_solution[0], 2 * fine_solution[0].model.system.dofs * expected_ratio
+    ):  # twice, since this is an estimate
         return None
-    return Choice(degree, round(choice.refinement * more**0.5, 3), size)
+    return Choice(degree, round(choice.refinement * expected_ratio**0.5, 3), size)
 
 
 def _fits(scene: Scene, unknowns: float) -> bool:

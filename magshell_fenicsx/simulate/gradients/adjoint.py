@@ -10,7 +10,7 @@ its second variation, and
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 
-The equations of vibrations and of energy barriers are contracted at several displacements: `Place`.
+The equations of vibrations and of energy barriers are contracted at several displacements: `AdjointState`.
 So are those of states under a conjugate q that a step holds: it is q = -Pi_mu of the state where
 the step began, which p changes too. So are loads that a step leaves and was not controlled by, as a
 force at a depth.
@@ -46,14 +46,16 @@ from magshell_fenicsx.simulate.touch import refuse_meeting
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
-SAME = 1e-5  # a conjugate is still the one that was held, relative to the larger of it and its unit
+CONJUGATE_TOLERANCE = (
+    1e-5  # a conjugate is still the one that was held, relative to the larger of it and its unit
+)
 
 Begins: TypeAlias = Mapping[int, Record]  # number of a step -> the last record before it
-NONE: Begins = MappingProxyType({})
+NO_BEGINS: Begins = MappingProxyType({})
 
 
 @dataclass(frozen=True)
-class Place:
+class AdjointState:
     """A state at which w . R + c Pi + sum_i c_i dPi/dmu_i, functions of (u, mu; p), are
     differentiated by p.
 
@@ -84,7 +86,7 @@ class Place:
     potentials: Mapping[str, float] = field(default_factory=dict)
     follows: frozenset[str] = frozenset()
     steps: int | None = None
-    driven: frozenset[str] = frozenset()
+    driven_amplitudes: frozenset[str] = frozenset()
     gas: bool = False
 
     @property
@@ -95,7 +97,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Direction:
+class EnergyDirection:
     """A vector phi whose energies at the first place are differentiated by p, times factors.
 
     Attributes
@@ -151,19 +153,19 @@ class Adjoint:
     """
 
     scene: Scene
-    places: Sequence[Place]
+    places: Sequence[AdjointState]
     by_mu: Mapping[str, float] = field(default_factory=dict)
     by_itself: Callable[[Scene, State], float] | None = None
-    directions: Sequence[Direction] = ()
+    directions: Sequence[EnergyDirection] = ()
     value: float = 0.0
     gas: bool = False
-    free: str = ""
+    free_amplitude: str = ""
     scale: str = ""
-    left: frozenset[str] = frozenset()
+    left_loads: frozenset[str] = frozenset()
     slope: Slope | None = None
     forms: Sequence[tuple[FormTerm, float]] = ()
     deflections: Mapping[str, float] = field(default_factory=dict)
-    about: State | None = None
+    contact_state: State | None = None
 
     @property
     def size(self) -> float:
@@ -171,7 +173,7 @@ class Adjoint:
         return self.scene.sizes.by_unit[self.scale] if self.scale else 1.0
 
     @property
-    def shown(self) -> float:
+    def value_in_unit(self) -> float:
         """J in its unit."""
         return self.value * self.size
 
@@ -181,7 +183,7 @@ class Adjoint:
 
 
 def adjoint_of_instability(
-    scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NONE
+    scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NO_BEGINS
 ) -> Adjoint:
     """The adjoint of the amplitude where a fold or a neutral wave is.
 
@@ -203,14 +205,16 @@ def adjoint_of_instability(
     fold = fold or fold_at(scene, record)
     stage = stage_at(scene, record)
     system = stage.newton.system
-    pull = dot(system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name))
-    left = np.asarray(-fold.left_null_vector / pull)
-    rows = stage.device.rates(left) if stage.device else {}
-    w = stage.device.displacement(left) if stage.device else left
-    place = Place(stage.leave(fold.state), np.array(w), rows)
+    pull = dot(
+        system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
+    )
+    left_null_vector = np.asarray(-fold.left_null_vector / pull)
+    rows = stage.device.rates(left_null_vector) if stage.device else {}
+    w = stage.device.displacement(left_null_vector) if stage.device else left_null_vector
+    place = AdjointState(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
     return with_begins(
-        Adjoint(scene, [place], value=fold.value, gas=gas, free=fold.name), record, begins
+        Adjoint(scene, [place], value=fold.value, gas=gas, free_amplitude=fold.name), record, begins
     )
 
 
@@ -223,7 +227,11 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         raise CaseError(
             f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half"
         )
-    system, waves, state = model.system, model.waves, model.system.with_moved_supports(record.point.state)
+    system, waves, state = (
+        model.system,
+        model.waves,
+        model.system.with_moved_supports(record.point.state),
+    )
     refuse_meeting(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
@@ -232,13 +240,13 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     value = (
         state.mu[record.amplitude] - Q.value / rate
     )  # what locating it has left, to second order
-    along = Direction(phi, m, stiffness=float(-1 / rate))
+    direction = EnergyDirection(phi, m, stiffness=float(-1 / rate))
     return Adjoint(
         scene,
-        [Place(state, -w / rate)],
-        directions=[along],
+        [AdjointState(state, -w / rate)],
+        directions=[direction],
         value=float(value),
-        free=record.amplitude,
+        free_amplitude=record.amplitude,
     )
 
 
@@ -255,7 +263,8 @@ def variation(
             term.add_residual(by_u, factor_of(term.amplitude, mu))
         value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
         by_mu = {
-            name: sum((c * term.energy() for term, c in each), 0.0) for name, each in rates.items()
+            name: sum((c * term.energy() for term, c in weighted_terms), 0.0)
+            for name, weighted_terms in rates.items()
         }
         return Functional(value, system.zero_at_supports(by_u), by_mu)
 
@@ -288,7 +297,7 @@ def adjoint(
     record: Record,
     of: str | Target,
     hold: Mapping[str, str] | None = None,
-    begins: Begins = NONE,
+    begins: Begins = NO_BEGINS,
 ) -> Adjoint:
     """The adjoint of a result at a regular state; one factorisation and one solve, and these of a
     step's begin again.
@@ -301,31 +310,33 @@ def adjoint(
     state = scene.model.system.with_moved_supports(record.point.state)
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     result = functional(scene, state, column)
-    held = held_at(scene, record, state, hold)
-    if free := [name for name in result.by_mu if name not in held and not result.slope]:
+    held_conjugates = held_at(scene, record, state, hold)
+    if free_amplitudes := [
+        name for name in result.by_mu if name not in held_conjugates and not result.slope
+    ]:
         raise CaseError(
-            f"{free[0]}: is a load here, which no parameter changes: hold its conjugate"
+            f"{free_amplitudes[0]}: is a load here, which no parameter changes: hold its conjugate"
         )
-    w, rows = solved(scene, state, result, held)
+    w, rows = solved(scene, state, result, held_conjugates)
     by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
     if result.reaction is not None:
         unit = force_unit(scene)
         by_itself = lambda there, _: result.value * force_unit(there) / unit  # noqa: E731
         w = w + result.reaction
-    place = Place(state, w, rows, result.energy, result.potentials)
-    made = Adjoint(
+    place = AdjointState(state, w, rows, result.energy, result.potentials)
+    result_adjoint = Adjoint(
         scene,
         [place],
         result.by_mu,
         by_itself,
         value=result.value,
-        gas=with_gas(held),
+        gas=with_gas(held_conjugates),
         scale=scale,
         slope=result.slope,
         forms=result.forms,
         deflections=result.deflections,
     )
-    return with_begins(made, record, begins) if hold is None else made
+    return with_begins(result_adjoint, record, begins) if hold is None else result_adjoint
 
 
 def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
@@ -340,10 +351,10 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     CaseError
         If it is not known where a step began.
     """
-    scene, places, left = adjoint.scene, list(adjoint.places), set[str]()
+    scene, places, left_loads = adjoint.scene, list(adjoint.places), set[str]()
     part: Adjoint | None = adjoint
-    at = 0  # of the place at the record
-    loads, driven = (
+    place_number = 0  # of the place at the record
+    loads, driven_amplitudes = (
         dict[str, float](),
         set[str](),
     )  # dJ/dmu of loads as earlier steps have left them
@@ -354,72 +365,84 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             scene.model.system,
         )
         earlier = scene.problem.programme[: record.step - 1]
-        driven |= _driven(step, record.point.state.mu)
-        held = (
+        driven_amplitudes |= _driven_amplitudes(step, record.point.state.mu)
+        held_conjugates = (
             {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
             if place
             else {}
         )
         if record.step not in begins:
-            if held:
+            if held_conjugates:
                 raise CaseError(
-                    f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step"
+                    f"{step.key}.hold: {', '.join(held_conjugates)}: give begin, the record before "
+                    "this step"
                 )
             break
         begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
         if begin.scene and begin.scene is not scene:
-            if held or loads:
-                names = ", ".join({*held, *loads})
+            if held_conjugates or loads:
+                names = ", ".join({*held_conjugates, *loads})
                 raise CaseError(
                     f"{names}: as they were before {step.key}, in another model: no gradient"
                 )
             break
-        before = system.with_moved_supports(begin.point.state)
-        held_before = held_at(scene, begin, before)
+        state_before = system.with_moved_supports(begin.point.state)
+        held_before = held_at(scene, begin, state_before)
         if part and place:
-            drawn = {
-                name for each in earlier for name in (each.name, *held_by_step(each))
+            reused_amplitudes = {
+                name
+                for step_of_programme in earlier
+                for name in (step_of_programme.name, *held_by_step(step_of_programme))
             } & place.state.mu.keys()
-            for name in drawn - place.rows.keys() - driven:
+            for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
                 loads[name] = loads.get(name, 0.0) + by_load(part, name)
-        for name, row in held.items():
+        for name, row in held_conjugates.items():
             assert place
             law = step.load.hold[name]
             if isinstance(law, Gas):
-                share, slope = enclosed(scene, law.gas, before).by_begin(place.state.mu[name])
+                share, slope = enclosed(scene, law.gas, state_before).by_begin(place.state.mu[name])
                 c[name], by_mu[name] = -row * share, row * slope
                 continue
-            now, then = (
-                system.potential(state.u, state.mu, name) for state in (place.state, before)
+            potential_now, potential_before = (
+                system.potential(state.u, state.mu, name) for state in (place.state, state_before)
             )
-            if abs(now - then) > SAME * max(abs(now), abs(scene.conjugate_unit(name))):
+            if abs(potential_now - potential_before) > CONJUGATE_TOLERANCE * max(
+                abs(potential_now), abs(scene.conjugate_unit(name))
+            ):
                 raise CaseError(
-                    f"{step.key}.hold.{name}: no gradient, as it is not held from the last point before the step"
+                    f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
+                    "before the step"
                 )
             c[name] = -row
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
-            left.add(name)
-        if place and held:
-            places[at] = replace(place, follows=frozenset(held))
+            left_loads.add(name)
+        if place and held_conjugates:
+            places[place_number] = replace(place, follows=frozenset(held_conjugates))
         part = None
         if c or any(by_mu.values()):
             slope_u = np.zeros(system.size)
             for name, c_i in c.items():
-                slope_u += c_i * system.load(before.u, before.mu, name)
-            w, rows = solved(scene, before, Functional(0.0, slope_u, by_mu, c), held_before)
+                slope_u += c_i * system.load(state_before.u, state_before.mu, name)
+            w, rows = solved(scene, state_before, Functional(0.0, slope_u, by_mu, c), held_before)
             gas = with_gas(held_before)
-            own = Place(
-                before, w, rows, potentials=c, steps=begin.step, driven=frozenset(driven), gas=gas
+            place_at_begin = AdjointState(
+                state_before,
+                w,
+                rows,
+                potentials=c,
+                steps=begin.step,
+                driven_amplitudes=frozenset(driven_amplitudes),
+                gas=gas,
             )
-            at = len(places)
-            places.append(own)
-            part = Adjoint(scene, [own])
+            place_number = len(places)
+            places.append(place_at_begin)
+            part = Adjoint(scene, [place_at_begin])
         record = begin
-    return replace(adjoint, places=places, left=frozenset(left))
+    return replace(adjoint, places=places, left_loads=frozenset(left_loads))
 
 
-def _driven(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
+def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
     """The amplitudes that a step changes as it is given."""
     return step.load.changes(step.name, mu)
 
@@ -428,7 +451,7 @@ def by_load(adjoint: Adjoint, name: str) -> float:
     """dJ/dmu of an amplitude that is given at all places where it is the same."""
     scene, system, total = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
     for place in adjoint.places:
-        if name in place.rows or name in place.driven:
+        if name in place.rows or name in place.driven_amplitudes:
             continue
         u, mu = place.state.u, place.state.mu
         total += dot(system.comm, place.w, system.load(u, mu, name, constrained=False))
@@ -438,11 +461,13 @@ def by_load(adjoint: Adjoint, name: str) -> float:
         mu = adjoint.state.mu
         terms = [
             (slope, c * factor)
-            for term, c in along(scene, adjoint)
+            for term, c in energies_along(scene, adjoint)
             for slope, factor in by_amplitude(scene.model, [term], name, mu)
         ]
-        own = system.at_state(adjoint.state).evaluate(lambda: sum(c * term.energy() for term, c in terms))
-        total += system.comm.allreduce(own)
+        energy_rate = system.at_state(adjoint.state).evaluate(
+            lambda: sum(c * term.energy() for term, c in terms)
+        )
+        total += system.comm.allreduce(energy_rate)
     return float(total)
 
 
@@ -454,61 +479,77 @@ def held_by_step(step: ProgrammeStep) -> list[str]:
 Held: TypeAlias = Mapping[str, float | Conjugate]  # amplitude -> its conjugate
 
 
-def with_gas(held: Held) -> bool:
+def with_gas(held_conjugates: Held) -> bool:
     """Whether a conjugate is that of a gas."""
-    return any(callable(q) for q in held.values())
+    return any(callable(q) for q in held_conjugates.values())
 
 
 def solved(
-    scene: Scene, state: State, of: Functional, held: Held
+    scene: Scene, state: State, functional: Functional, held_conjugates: Held
 ) -> tuple[Vector, dict[str, float]]:
     """w of a number, and of the rows of the device; one factorisation and one solve."""
     system: System = scene.model.system
-    device = Device(system, held, dict.fromkeys(held, system.length)) if held else None
-    whole = device.enter(state) if device else state
-    factors = (scene.newton.for_system(device) if device else scene.newton).factor_at(whole)
-    slope = of.by_u
+    device = (
+        Device(system, held_conjugates, dict.fromkeys(held_conjugates, system.length))
+        if held_conjugates
+        else None
+    )
+    extended_state = device.enter(state) if device else state
+    factors = (scene.newton.for_system(device) if device else scene.newton).factor_at(
+        extended_state
+    )
+    slope = functional.by_u
     if device:
         slope = device.gradient(
-            of.by_u,
-            {name: of.by_mu.get(name, 0.0) + mixed(scene, state, of, name) for name in held},
+            functional.by_u,
+            {
+                name: functional.by_mu.get(name, 0.0) + mixed(scene, state, functional, name)
+                for name in held_conjugates
+            },
         )
     w = factors.solve_transposed(-slope) if factors.skewed else factors.solve(-slope)
     return np.array(device.displacement(w) if device else w), device.rates(w) if device else {}
 
 
-def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
+def mixed(scene: Scene, state: State, functional: Functional, name: str) -> float:
     """What the potentials and the reaction in J change by with an amplitude."""
     system = scene.model.system
     changes = sum(
-        c * system.curvature(state.u, state.mu, i, name) for i, c in of.potentials.items()
+        c * system.curvature(state.u, state.mu, i, name) for i, c in functional.potentials.items()
     )
-    if of.reaction is not None:
-        changes += dot(system.comm, of.reaction, system.load(state.u, state.mu, name, constrained=False))
-    return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
+    if functional.reaction is not None:
+        changes += dot(
+            system.comm,
+            functional.reaction,
+            system.load(state.u, state.mu, name, constrained=False),
+        )
+    return float(
+        changes
+        + (functional.energy and functional.energy * system.potential(state.u, state.mu, name))
+    )
 
 
 def held_at(
     scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None = None
 ) -> dict[str, float | Conjugate]:
     """Amplitude -> its conjugate, of those that are unknown."""
-    held = dict[str, float | Conjugate]()
+    held_conjugates = dict[str, float | Conjugate]()
     step = scene.problem.programme[record.step - 1] if record.step else None
     if hold is None and step:
-        held |= held_by(scene, step, state)
+        held_conjugates |= held_by(scene, step, state)
         if step.load.by_conjugate(at_target=record.label == "target"):
-            held[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
+            held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, how in (hold or {}).items():
         if name not in state.mu or how not in ("load", "conjugate"):
             raise CaseError(
                 f"hold: {name}: {how}: allowed are load and conjugate of {', '.join(state.mu)}"
             )
         if how == "conjugate":
-            held[name] = -scene.model.system.potential(state.u, state.mu, name)
-    return held
+            held_conjugates[name] = -scene.model.system.potential(state.u, state.mu, name)
+    return held_conjugates
 
 
-def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
+def energies_along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
     """The energies of the directions, and their factors."""
     model, energies = scene.model, list[tuple[FormTerm, float]]()
     for d in adjoint.directions:

@@ -30,9 +30,9 @@ from magshell_fenicsx.models.shell.residual import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState, energies_along
 from magshell_fenicsx.simulate.gradients.shape import (
-    following,
+    fields_of_placement,
     of_measures,
     of_normals,
     of_widths,
@@ -85,12 +85,13 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     scene = adjoint.scene
     other = _with_field(adjoint, name)
     if other is not scene:
-        return by_field(_carried(adjoint, other), name, adjoint)
+        return by_field(_transferred(adjoint, other), name, adjoint)
     model, kind = scene.model, FIELDS[name]
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
         raise CaseError(
-            f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, magnitude"
+            f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
+            "magnitude"
         )
     knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
     if name == "deviation" and (
@@ -100,54 +101,68 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             "deviation: no gradient beside bodies, or in a field that is known at points of space"
         )
 
-    def part(
-        number: int, place: Place, chosen: str | OfPlacement
+    def at_place(
+        number: int, place: AdjointState, coefficient_or_name: str | OfPlacement
     ) -> tuple[fem.Function, list[Array]]:
         """The field, of a name or itself, and what a place gives, whose state is set."""
         if origin:
             touch_as_in(origin.scene, scene, origin.places[number].state)
         shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
-        coefficient = chosen if isinstance(chosen, str) else chosen.name
+        coefficient = (
+            coefficient_or_name
+            if isinstance(coefficient_or_name, str)
+            else coefficient_or_name.name
+        )
         f = next(
             (
                 c
                 for s in shares
                 for c in s.term.form.coefficients()
-                if c is chosen or c.name == chosen
+                if c is coefficient_or_name or c.name == coefficient_or_name
             ),
             None,
         )
-        known = [of for term in knowing if (of := _known(term, place, w, coefficient))]
-        f = f or next((of for of, _ in known), None)
+        known_gradients = [
+            field_and_gradient
+            for term in knowing
+            if (field_and_gradient := _known_gradient(term, place, w, coefficient))
+        ]
+        f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
         if f is None and slope and slope.field is not None and coefficient == slope.field.name:
             f = slope.field
         if f is None or (not model.thin and coefficient != "Br"):
             raise CaseError(f"{name}: the case has no such field: no result depends on it")
-        if model.thin and chosen == "r0":
+        if model.thin and coefficient_or_name == "r0":
             shares += of_measures(model, shares, w)
-        forces = [each for _, each in known] + [summed(shares, f, model.u, w, model.kernels)]
+        forces = [gradient_at_points for _, gradient_at_points in known_gradients] + [
+            summed(shares, f, model.u, w, model.kernels)
+        ]
         if slope and slope.by_field is not None and slope.field is not None and not number:
             forces += [slope.by_field] if coefficient == slope.field.name else []
         if (
             model.thin
-            and chosen == "r0"
+            and coefficient_or_name == "r0"
             and (by_vertices := of_widths(model, shares, w)) is not None
         ):
             forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
-        if chosen == "r0":
+        if coefficient_or_name == "r0":
             forces[-1] += of_normals(adjoint, place, first=not number)
         if name == "thickness" and scene.problem.loads.contacts:
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces
 
-    def of(chosen: str | OfPlacement) -> tuple[fem.Function, Array]:
+    def over_all_places(coefficient_or_name: str | OfPlacement) -> tuple[fem.Function, Array]:
         parts = [
-            model.system.at_state(place.state).evaluate(partial(part, number, place, chosen))
+            model.system.at_state(place.state).evaluate(
+                partial(at_place, number, place, coefficient_or_name)
+            )
             for number, place in enumerate(adjoint.places)
         ]
-        return parts[-1][0], np.sum([each for _, of_place in parts for each in of_place], axis=0)
+        return parts[-1][0], np.sum(
+            [gradient_at_place for _, of_place in parts for gradient_at_place in of_place], axis=0
+        )
 
-    f, forces = of(kind.coefficient)
+    f, forces = over_all_places(kind.coefficient)
     places, normals = (v[: len(forces)] for v in places_of(scene, f))
     if name == "deviation":
         places, normals = _perfect(scene, places, normals)
@@ -159,17 +174,17 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             for i, place in enumerate(adjoint.places)
             for share in _shares(adjoint, i, place, name)
         ]
-        for field in following([share.term for share in shares]):
+        for field in fields_of_placement([share.term for share in shares]):
             if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
-                _, by_rate = of(field)
-                each = (
+                _, by_rate = over_all_places(field)
+                contracted = (
                     np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
                 )
-                forces = forces + np.stack(list(each), axis=1)[..., None]
+                forces = forces + np.stack(list(contracted), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
 
 
-def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[WeightedTerm]:
+def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> list[WeightedTerm]:
     """What the terms give at a place."""
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
@@ -179,25 +194,25 @@ def _shares(adjoint: Adjoint, number: int, place: Place, name: str) -> list[Weig
         for t, m in of_terms
     ]
     shares += _of_parameters(scene, place, name)
-    for held in (
+    for held_amplitude in (
         place.rows.keys() & scene.model.load_sizes.keys() - place.follows
     ):  # as many of its unit
         share = (
-            -c[held]
-            * scene.model.system.potential(place.state.u, mu, held)
-            / scene.model.load_size[held]
+            -c[held_amplitude]
+            * scene.model.system.potential(place.state.u, mu, held_amplitude)
+            / scene.model.load_size[held_amplitude]
         )
-        shares += [WeightedTerm(t, share, 0.0) for t in scene.model.size_terms(held)]
+        shares += [WeightedTerm(t, share, 0.0) for t in scene.model.size_terms(held_amplitude)]
     if not number:
         shares += [
             WeightedTerm(t, c * factor_of(t.amplitude, mu), 0.0)
-            for t, c in (*along(scene, adjoint), *adjoint.forms)
+            for t, c in (*energies_along(scene, adjoint), *adjoint.forms)
         ]
     return shares
 
 
-def _known(
-    term: FieldDifferentiable, place: Place, w: fem.Function, name: str
+def _known_gradient(
+    term: FieldDifferentiable, place: AdjointState, w: fem.Function, name: str
 ) -> tuple[fem.Function, Array] | None:
     """What a term gives that knows its derivatives by a field itself."""
     mu = factor_of(term.amplitude, place.state.mu)
@@ -206,7 +221,7 @@ def _known(
     )
 
 
-def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
+def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
     """The same in another scene on the same mesh."""
     mu = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
     places = []
@@ -220,16 +235,20 @@ def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
     return replace(adjoint, scene=other, places=places, directions=directions)
 
 
-def _of_parameters(scene: Scene, place: Place, name: str) -> list[WeightedTerm]:
+def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[WeightedTerm]:
     """The shares of the conjugates of free parameters of terms."""
     system, c, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
-    for each in c.keys() & system.parameters.keys():
-        for slope in system.parameters[each].slopes:
+    for parameter in c.keys() & system.parameters.keys():
+        for slope in system.parameters[parameter].slopes:
             if isinstance(slope, Slope) and not slope.density.on_edges:
                 slope = _as_form(scene, slope)
             if not isinstance(slope, FormTerm):
-                raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
-            shares.append(WeightedTerm(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
+                raise CaseError(
+                    f"{name}: the conjugate of {parameter} has no gradient by this field"
+                )
+            shares.append(
+                WeightedTerm(slope, c[parameter] * factor_of(slope.amplitude, place.state.mu), 0.0)
+            )
     return shares
 
 
@@ -241,7 +260,9 @@ def _as_form(scene: Scene, slope: Slope) -> FormTerm:
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
 
-def _of_starts(scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function) -> Array:
+def _of_starts(
+    scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function
+) -> Array:
     """By the thickness at the places where bodies start from the shell's face, which lifts them;
     collective.
 
@@ -287,17 +308,21 @@ def _basis_at(
     cells = model.V.dofmap.list[: topology.index_map(topology.dim).size_local, corners]
     first, *others = np.moveaxis(model.r0.x.array.reshape(-1, len(x))[cells], 1, 0)
     sides = np.stack([other - first for other in others], axis=-1)  # (cells, components, dimension)
-    at = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - first)
-    beyond = np.maximum(0.0, np.maximum(-at.min(axis=1), at.sum(axis=1) - 1))
-    far = beyond + np.linalg.norm(np.einsum("cid,cd->ci", sides, at) - (x - first), axis=1)
-    least = comm.allgather(float(far.min(initial=np.inf)))
-    if comm.rank != int(np.argmin(least)):
+    barycentric = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - first)
+    distance_outside = np.maximum(
+        0.0, np.maximum(-barycentric.min(axis=1), barycentric.sum(axis=1) - 1)
+    )
+    distances = distance_outside + np.linalg.norm(
+        np.einsum("cid,cd->ci", sides, barycentric) - (x - first), axis=1
+    )
+    least_of_ranks = comm.allgather(float(distances.min(initial=np.inf)))
+    if comm.rank != int(np.argmin(least_of_ranks)):
         return None
-    nearest = int(far.argmin())
-    return nearest, element.tabulate(0, at[nearest][None])[0, 0, :, 0]
+    nearest = int(distances.argmin())
+    return nearest, element.tabulate(0, barycentric[nearest][None])[0, 0, :, 0]
 
 
-def _contracted(scene: Scene, place: Place) -> fem.Function:
+def _contracted(scene: Scene, place: AdjointState) -> fem.Function:
     """The vector along which residuals are taken, with what the supports that move add."""
     model, system = scene.model, scene.model.system
     direction = fem.Function(model.V)
@@ -332,8 +357,8 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         and magnetic
         and not callable(magnetic.remanent)
     ):
-        even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
-        return Scene(replace(problem, loads=replace(loads, magnetic=even)), scene.comm)
+        uniform = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+        return Scene(replace(problem, loads=replace(loads, magnetic=uniform)), scene.comm)
     return scene
 
 
@@ -345,7 +370,7 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
         (term.forms if isinstance(term, LinearTerm) else (term,))
         for term in scene.model.system.terms
     )
-    terms: list[Term] = [part for each in parts for part in each]
+    terms: list[Term] = [term for terms_of_part in parts for term in terms_of_part]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         terms = list(
@@ -392,11 +417,11 @@ def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]
     """
     model, outward = scene.model, scene.problem.outward
     assert model.thin
-    drawn = model.meridian.embedding if model.axisymmetric else scene.problem.embedding
+    coordinates = model.meridian.embedding if model.axisymmetric else scene.problem.embedding
     if outward:
-        known = model.at_nodes(outward)[: len(normals)]
-        normals = np.where(np.isfinite(known), known, normals)
-    w0 = getattr(drawn, "w0", None)
+        normals_at_nodes = model.at_nodes(outward)[: len(normals)]
+        normals = np.where(np.isfinite(normals_at_nodes), normals_at_nodes, normals)
+    w0 = getattr(coordinates, "w0", None)
     return places if w0 is None else places - model.at_nodes(w0)[
         : len(places), :, None
     ] * normals, normals
@@ -415,31 +440,35 @@ def mass(scene: Scene) -> Adjoint:
     """The mass over that of the same shell with the thickness h."""
     state = scene.unloaded()
 
-    def of(there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
-        t, over, log, u = (
-            there.model.thickness,
-            there.model.over_area(),
-            there.model.kernels,
-            there.model.u,
+    def thickness_ratio(scene_there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
+        t, thickness_integral, log, u = (
+            scene_there.model.thickness,
+            scene_there.model.over_area(),
+            scene_there.model.kernels,
+            scene_there.model.u,
         )
         if t is None:
             return 1.0, []
         rho = (
             fem.Constant(t.function_space.mesh, 1.0)
-            if there.model.made_of is None
-            else there.model.made_of[2]
+            if scene_there.model.made_of is None
+            else scene_there.model.made_of[2]
         )
         terms = (
-            FormTerm("mass", over(rho * t[0]), u, log),
-            FormTerm("area", over(rho * 1.0), u, log),
+            FormTerm("mass", thickness_integral(rho * t[0]), u, log),
+            FormTerm("area", thickness_integral(rho * 1.0), u, log),
         )
         value, area = (scene.comm.allreduce(term.energy()) for term in terms)
         return value / area, [(terms[0], 1 / area), (terms[1], -value / area**2)]
 
-    value, forms = of(scene)
-    still = Place(state, 0.0 * state.u)
+    value, forms = thickness_ratio(scene)
+    undisplaced = AdjointState(state, 0.0 * state.u)
     return Adjoint(
-        scene, [still], by_itself=lambda there, _: of(there)[0], value=value, forms=forms
+        scene,
+        [undisplaced],
+        by_itself=lambda there, _: thickness_ratio(there)[0],
+        value=value,
+        forms=forms,
     )
 
 

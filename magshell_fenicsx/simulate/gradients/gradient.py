@@ -16,10 +16,10 @@ from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import (
     Adjoint,
-    Place,
+    AdjointState,
     adjoint_of_instability,
-    along,
     by_load,
+    energies_along,
 )
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
@@ -42,10 +42,10 @@ Gradient: TypeAlias = float | FieldGradient
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
     if name in adjoint.places[0].follows or all(
-        name in {*place.rows, *place.driven} for place in adjoint.places
+        name in {*place.rows, *place.driven_amplitudes} for place in adjoint.places
     ):
         raise CaseError(f"{name}: is unknown here, as its conjugate is held")
-    if name in adjoint.left:
+    if name in adjoint.left_loads:
         raise CaseError(
             f"{name}: is a load here as an earlier step has left it, which was not controlled by it"
         )
@@ -69,7 +69,8 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         and key.startswith("shell.")
     ):
         raise CaseError(
-            f"{key}: has no derivative where a conjugate is held beside a body: the first contact shifts it"
+            f"{key}: has no derivative where a conjugate is held beside a body: the first contact "
+            "shifts it"
         )
 
     def contracted(p: float) -> float:
@@ -78,18 +79,32 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         other = scene if p == value else others[p]
         first, total = adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
-            own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
-            state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
+            own_amplitudes = {
+                *place.rows,
+                *adjoint.left_loads,
+                *([adjoint.free_amplitude] if place.steps is None else []),
+            }
+            state = carried(
+                scene,
+                other,
+                _transferred_state(scene, other, place.state),
+                own_amplitudes,
+                place.steps,
+            )
             state = other.model.system.with_moved_supports(state)
             if other is not scene:
                 expand(scene, other, place.state)
-            total += _at(scene, other, place, state) + (
-                0.0 if adjoint.by_itself and place is first else _own(other, place, state)
+            total += _residual_at(scene, other, place, state) + (
+                0.0 if adjoint.by_itself and place is first else _own_value(other, place, state)
             )
         if adjoint.by_itself:
             total += adjoint.by_itself(other, state)
-        terms = [(c * factor_of(t.amplitude, state.mu), t) for t, c in along(other, adjoint)]
-        energies = other.model.system.at_state(state).evaluate(lambda: sum(c * t.energy() for c, t in terms))
+        terms = [
+            (c * factor_of(t.amplitude, state.mu), t) for t, c in energies_along(other, adjoint)
+        ]
+        energies = other.model.system.at_state(state).evaluate(
+            lambda: sum(c * t.energy() for c, t in terms)
+        )
         return float(total + other.model.system.comm.allreduce(energies))
 
     return _slope(contracted, value, size_of(scene.problem.context, key))
@@ -104,17 +119,17 @@ def _slope(f: Callable[[float], float], value: float, size: float) -> float:
     be 1e-4 of that. A difference of second order then has the third derivative in it. Where the
     values are not straight over a step, it is one of fourth order.
     """
-    step, refused, at = STEP * size, list[CaseError](), cache(f)
+    step, refused, value_at = STEP * size, list[CaseError](), cache(f)
 
     def difference(nodes: Sequence[int]) -> float:
-        values = [at(value + i * step) for i in nodes]
+        values = [value_at(value + i * step) for i in nodes]
         powers = np.vander(np.array(nodes, dtype=float), increasing=True).T
         weights = np.linalg.solve(powers, np.eye(len(nodes))[1])  # exact of polynomials
         return float(weights @ values) / step
 
     try:
-        low, high = (at(value + i * step) for i in BOTH)
-        if abs(low - 2 * at(value) + high) <= STRAIGHT * abs(high - low):
+        low, high = (value_at(value + i * step) for i in BOTH)
+        if abs(low - 2 * value_at(value) + high) <= STRAIGHT * abs(high - low):
             return difference(BOTH)
     except CaseError:
         pass
@@ -133,15 +148,17 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     problem = adjoint.scene.problem
     value, size = number_of(problem.context, key), size_of(problem.context, key)
     return _slope(
-        lambda p: sizes_of(problem.with_values({key: p}).context).by_unit[adjoint.scale], value, size
+        lambda p: sizes_of(problem.with_values({key: p}).context).by_unit[adjoint.scale],
+        value,
+        size,
     )
 
 
-def _moved(scene: Scene, other: Scene, state: State) -> State:
+def _transferred_state(scene: Scene, other: Scene, state: State) -> State:
     return State(transfer(scene, other, state.u), state.mu)
 
 
-def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
+def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) -> float:
     """The residual and the rows of a place in another scene; what is held stays the same number of
     its unit.
     """
@@ -149,14 +166,14 @@ def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
     change = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
     targets = goals(scene, other, "conjugate", place.steps)
     for name, c in place.rows.items():
-        held = -scene.model.system.potential(own_state.u, own_state.mu, name)
+        held_value = -scene.model.system.potential(own_state.u, own_state.mu, name)
         unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
-        same = 1.0 if name in place.follows else unit
-        change += c * (system.potential(state.u, state.mu, name) + same * held)
+        unit_ratio = 1.0 if name in place.follows else unit
+        change += c * (system.potential(state.u, state.mu, name) + unit_ratio * held_value)
     return float(change)
 
 
-def _own(other: Scene, place: Place, state: State) -> float:
+def _own_value(other: Scene, place: AdjointState, state: State) -> float:
     """What J itself contains of a place."""
     system = other.model.system
     value = sum(
@@ -231,7 +248,7 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
     for `others`.
     """
     size = adjoint.size
-    with pressed_as_at(adjoint.scene, adjoint.about):
+    with pressed_as_at(adjoint.scene, adjoint.contact_state):
         if by in FIELDS:
             of_field = by_field(adjoint, by)
             return replace(of_field, forces=size * of_field.forces)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities import registry as quantities
 from magshell_fenicsx.simulate.gradients.adjoint import (
-    NONE,
+    NO_BEGINS,
     Adjoint,
     Begins,
     adjoint_of_instability,
@@ -23,11 +23,11 @@ FOLDS = {
     "critical_field_mT": "lambda_m",
 }  # result -> the amplitude of its fold
 SCALES = {"buckling_pressure_Pa": "p_c", "critical_field_mT": "λ_m"}  # of those in units
-BESIDE = 1.15  # instabilities up to this multiple of the lowest are looked at
-MOST = 5  # and at most so many
+MAX_LOAD_RATIO = 1.15  # instabilities up to this multiple of the lowest are looked at
+MAX_INSTABILITIES = 5  # and at most so many
 
 
-class Lost(RuntimeError):
+class LostResult(RuntimeError):
     """The path of a case has no such result."""
 
 
@@ -56,7 +56,7 @@ def load(record: Record, amplitude: str) -> float:
     return abs(record.point.state.mu[amplitude])
 
 
-def refuse_unitless(scene: Scene, of: str) -> None:
+def refuse_unitless(scene: Scene, result: str) -> None:
     """See that a case has the units of one of `FOLDS`.
 
     Raises
@@ -65,14 +65,14 @@ def refuse_unitless(scene: Scene, of: str) -> None:
         If it has none.
     """
     sizes = scene.sizes
-    if of in SCALES and (
-        SCALES[of] not in sizes.by_unit or (of.endswith("_mT") and sizes.field != "mT")
+    if result in SCALES and (
+        SCALES[result] not in sizes.by_unit or (result.endswith("_mT") and sizes.field != "mT")
     ):
-        bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[of])
-        raise CaseError(f"{of}: the case has no such unit; {bare} has none")
+        bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[result])
+        raise CaseError(f"{result}: the case has no such unit; {bare} has none")
 
 
-def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
+def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
     """See that a result is not of a point which moves along the path with what varies.
 
     Raises
@@ -80,7 +80,7 @@ def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
     Lost
         If the path ends at an instability: there the amplitude alone has a gradient.
     """
-    column = in_units(scene, end.point.state, of)[0] if isinstance(of, str) else ""
+    column = in_units(scene, end.point.state, result)[0] if isinstance(result, str) else ""
     load = end.amplitude in FOLDS.values() and column in (
         end.amplitude,
         quantities.amplitude(end.amplitude).column,
@@ -90,28 +90,33 @@ def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
             ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude)
             or "none"
         )
-        raise Lost(
-            f"the path ends at a {end.label}, which moves with what varies: only its load has a gradient ({allowed})"
+        raise LostResult(
+            f"the path ends at a {end.label}, which moves with what varies: only its load has a "
+            f"gradient ({allowed})"
         )
 
 
-def as_asked(adjoint: Adjoint, of: object) -> Adjoint:
+def as_asked(adjoint: Adjoint, result: object) -> Adjoint:
     """With the unit of the result."""
-    if of not in SCALES:
+    if result not in SCALES:
         return adjoint
-    refuse_unitless(adjoint.scene, str(of))
-    return replace(adjoint, scale=SCALES[str(of)])
+    refuse_unitless(adjoint.scene, str(result))
+    return replace(adjoint, scale=SCALES[str(result)])
 
 
 def instabilities(
-    scene: Scene, records: Sequence[Record], of: str, most: int = MOST, begins: Begins = NONE
+    scene: Scene,
+    records: Sequence[Record],
+    result: str,
+    max_count: int = MAX_INSTABILITIES,
+    begins: Begins = NO_BEGINS,
 ) -> list[tuple[str, Adjoint]]:
     """The instabilities of a path by name, the lowest first, and what their derivatives are
     contracted with.
 
     Parameters
     ----------
-    of
+    result
         One of `FOLDS`.
     begins
         Number of a step -> the last record before it, where steps hold conjugates.
@@ -121,22 +126,22 @@ def instabilities(
     Lost, FoldLost
         If there is none, or the lowest one has no gradient.
     """
-    amplitude = FOLDS[of]
+    amplitude = FOLDS[result]
     ascending = sorted(
         located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude)
     )
     by_name = list[tuple[str, Adjoint]]()
     for record in [
-        r for r in ascending if load(r, amplitude) <= BESIDE * load(ascending[0], amplitude)
-    ][:most]:
+        r for r in ascending if load(r, amplitude) <= MAX_LOAD_RATIO * load(ascending[0], amplitude)
+    ][:max_count]:
         name = record.mode or record.label
         try:
             by_name.append(
-                (name, as_asked(adjoint_of_instability(scene, record, begins=begins), of))
+                (name, as_asked(adjoint_of_instability(scene, record, begins=begins), result))
             )
         except CaseError as e:
             if not by_name:
-                raise Lost(str(e)) from None
+                raise LostResult(str(e)) from None
     if not by_name:
-        raise Lost(f"the path has no instability in {amplitude}")
+        raise LostResult(f"the path has no instability in {amplitude}")
     return sorted(by_name, key=lambda each: abs(each[1].value))

@@ -17,10 +17,10 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import (
-    NONE,
+    NO_BEGINS,
     Adjoint,
+    AdjointState,
     Begins,
-    Place,
     adjoint,
     held_at,
     solved,
@@ -29,7 +29,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import (
 from magshell_fenicsx.simulate.gradients.fields import MASS
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, refuse_unitless
 from magshell_fenicsx.simulate.gradients.vibration import (
-    FIRST,
+    FIRST_FREQUENCIES,
     NAMES,
     adjoints_of_vibrations,
     frequency,
@@ -58,7 +58,7 @@ def refuse_no_barrier(problem: Problem) -> None:
 
 
 def adjoint_of_barrier(
-    scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE
+    scene: Scene, begin: Record | None, end: Record, begins: Begins = NO_BEGINS
 ) -> Adjoint:
     """The adjoint of the barrier between the begin and the end of the last step.
 
@@ -77,36 +77,54 @@ def adjoint_of_barrier(
     refuse_no_barrier(scene.problem)
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
-    system, step, whole = scene.model.system, scene.problem.programme[-1], scene.model.multiplicity
-    before, after = (system.with_moved_supports(record.point.state) for record in (begin, end))
-    held, change = held_at(scene, end, after), dict[str, float]()
-    for name, conjugate in held.items():
+    system, step, multiplicity = (
+        scene.model.system,
+        scene.problem.programme[-1],
+        scene.model.multiplicity,
+    )
+    state_before, state_after = (
+        system.with_moved_supports(record.point.state) for record in (begin, end)
+    )
+    held_conjugates, change = held_at(scene, end, state_after), dict[str, float]()
+    for name, conjugate in held_conjugates.items():
         if callable(conjugate):
             raise CaseError(f"barrier: {name}: no gradient while a gas is held")
-        change[name] = whole * (after.mu[name] - before.mu[name])
+        change[name] = multiplicity * (state_after.mu[name] - state_before.mu[name])
     slope = -np.sum(
-        [c * system.load(before.u, before.mu, name) for name, c in change.items()], axis=0
+        [c * system.load(state_before.u, state_before.mu, name) for name, c in change.items()],
+        axis=0,
     )
     q = {name: -c for name, c in change.items()}
-    w, rows = 0.0 * before.u, dict[str, float]()
+    w, rows = 0.0 * state_before.u, dict[str, float]()
     if change:
         w, rows = solved(
-            scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before)
+            scene,
+            state_before,
+            Functional(0.0, slope, potentials=q),
+            held_at(scene, begin, state_before),
         )
-    at_begin = Place(before, w, rows, -whole, q, steps=begin.step)
+    at_begin = AdjointState(state_before, w, rows, -multiplicity, q, steps=begin.step)
     earlier = with_begins(Adjoint(scene, [at_begin]), begin, begins)
-    still, unknown = 0.0 * after.u, dict.fromkeys(held, 0.0)
-    ends = [Place(after, still, unknown, whole), Place(before, still, unknown, -whole)]
-    left = with_begins(Adjoint(scene, ends), end, begins)  # loads as earlier steps have left them
-    places = [ends[0], *earlier.places, *left.places[2:]]
-    value, names = barrier(scene, step, before, after), earlier.left | left.left
-    return Adjoint(scene, places, value=value, left=names)
+    zero_vector, unknown = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
+    ends = [
+        AdjointState(state_after, zero_vector, unknown, multiplicity),
+        AdjointState(state_before, zero_vector, unknown, -multiplicity),
+    ]
+    adjoint_with_begins = with_begins(
+        Adjoint(scene, ends), end, begins
+    )  # loads as earlier steps have left them
+    places = [ends[0], *earlier.places, *adjoint_with_begins.places[2:]]
+    value, names = (
+        barrier(scene, step, state_before, state_after),
+        earlier.left_loads | adjoint_with_begins.left_loads,
+    )
+    return Adjoint(scene, places, value=value, left_loads=names)
 
 
 def refuse_no_result(
-    scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()
+    scene: Scene, results: Iterable[str], key: str, *, extra_results: Sequence[str] = ()
 ) -> None:
-    """See before a history that the results at a key have gradients; `more` are allowed there too.
+    """See before a history that the results at a key have gradients; `extra_results` are allowed there too.
 
     Raises
     ------
@@ -115,22 +133,22 @@ def refuse_no_result(
     """
     start = scene.unloaded()
     columns = differentiable(scene, start)
-    for of in results:
+    for result in results:
         try:
-            refuse_unitless(scene, of)
-            if of == BARRIER:
+            refuse_unitless(scene, result)
+            if result == BARRIER:
                 refuse_no_barrier(scene.problem)
-            elif NAMES.fullmatch(of):
-                refuse_no_vibration(scene.problem, of)
-            elif of not in FOLDS and of not in columns and of not in start.mu:
-                allowed = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
-                raise CaseError(f"{of}: has no gradient here; allowed are {allowed}")
+            elif NAMES.fullmatch(result):
+                refuse_no_vibration(scene.problem, result)
+            elif result not in FOLDS and result not in columns and result not in start.mu:
+                allowed = ", ".join((*FOLDS, *columns, BARRIER, *FIRST_FREQUENCIES, *extra_results))
+                raise CaseError(f"{result}: has no gradient here; allowed are {allowed}")
         except CaseError as e:
             raise CaseError(f"{key}: {e}") from None
 
 
 def adjoint_at_end(
-    scene: Scene, history: History, of: str | Target, hold: Mapping[str, str] | None = None
+    scene: Scene, history: History, result: str | Target, hold: Mapping[str, str] | None = None
 ) -> tuple[str, Adjoint]:
     """The kind of a result ("" of most) at the last point of a history, and its adjoint;
     collective.
@@ -142,14 +160,14 @@ def adjoint_at_end(
     """
     assert history.end
     scene = history.end.scene or scene
-    if of == BARRIER:
+    if result == BARRIER:
         return "", adjoint_of_barrier(scene, history.begin, history.end, history.begins)
-    if isinstance(of, str) and NAMES.fullmatch(of):
-        return adjoints_of_vibrations(scene, history.end, of, hold, begins=history.begins)[0]
-    return "", adjoint(scene, history.end, of, hold, history.begins)
+    if isinstance(result, str) and NAMES.fullmatch(result):
+        return adjoints_of_vibrations(scene, history.end, result, hold, begins=history.begins)[0]
+    return "", adjoint(scene, history.end, result, hold, history.begins)
 
 
-def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
+def vibration_at_end(scene: Scene, history: History, result: str) -> float | None:
     """The frequency of a name; None of another result; collective.
 
     Raises
@@ -157,15 +175,15 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
     Lost
         If it cannot be computed.
     """
-    if not NAMES.fullmatch(of):
+    if not NAMES.fullmatch(result):
         return None
     assert history.end
     scene = history.end.scene or scene
     state = rigid(scene, scene.model.system.with_moved_supports(history.end.point.state))
-    return frequency(scene.problem, of, vibration(scene, state, of).value)
+    return frequency(scene.problem, result, vibration(scene, state, result).value)
 
 
-class Expected(Scene):
+class NamesOnlyScene(Scene):
     """A scene as far as names go."""
 
     def __init__(self, problem: Problem) -> None:
@@ -186,11 +204,13 @@ class Expected(Scene):
         """The amplitudes, of no displacement."""
         loads = self.problem.loads
         field = loads.magnetic
-        across = TRANSVERSE_AMPLITUDES[: len(field.across)] if field else ()
-        driven = ("lambda_m", *across, *(motion.name for motion in field.turns)) if field else ()
+        components = TRANSVERSE_AMPLITUDES[: len(field.across)] if field else ()
+        field_amplitudes = (
+            ("lambda_m", *components, *(motion.name for motion in field.turns)) if field else ()
+        )
         names = [
             *(["pressure"] if loads.pressure else []),
-            *driven,
+            *field_amplitudes,
             *loads.forces,
             *loads.dead,
             *self._own_amplitudes,
@@ -219,10 +239,10 @@ def refuse_unknown_results(problem: Problem, designed: Mapping[str, str]) -> Non
     """
     if not (problem.gradients or designed):
         return
-    scene = Expected(problem)
-    if asked := problem.gradients:
-        refuse_no_result(scene, asked.of, "gradients.of")
-        refuse_unknown_parameters(problem.context, asked.by, scene.unloaded())
+    scene = NamesOnlyScene(problem)
+    if requested := problem.gradients:
+        refuse_no_result(scene, requested.of, "gradients.of")
+        refuse_unknown_parameters(problem.context, requested.by, scene.unloaded())
     for result, key in designed.items():
         if result != MASS:
-            refuse_no_result(scene, [result], key, more=[MASS])
+            refuse_no_result(scene, [result], key, extra_results=[MASS])

@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.patterns import OfPlacement
 from magshell_fenicsx.parts.forces.dead_load import by_vertex_normal
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState
 
 Array = NDArray[np.float64]
 STEP = 1e-4  # of h: of a node
@@ -41,12 +41,15 @@ def of_measures(
         if share.term.over is None:
             continue
         v.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
-        along = model.kernels.compile(
+        numerator = model.kernels.compile(
             f"{share.term.name} along", ufl.replace(share.term.form, {model.u: v})
         )
-        over = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
-        value, size = (comm.allreduce(each) for each in (fem.assemble_scalar(along), over.energy()))
-        added.append(WeightedTerm(over, -value / size, 0.0))
+        measure = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
+        value, size = (
+            comm.allreduce(integral)
+            for integral in (fem.assemble_scalar(numerator), measure.energy())
+        )
+        added.append(WeightedTerm(measure, -value / size, 0.0))
     return added
 
 
@@ -63,47 +66,53 @@ def of_widths(
     x.interpolate(lambda places: places)
     jet, (volume, side) = kin.jet(x, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
     length = kin.conormal(jet, kin.facet_covector(domain))[2]
-    moved = {volume: volume * kin.area_ratio(jet), side: side * length}
-    wide = list[WeightedTerm]()
+    moved_measures = {volume: volume * kin.area_ratio(jet), side: side * length}
+    widened_terms = list[WeightedTerm]()
     for share in shares:
         form = share.term.form
-        on_edges = any(each.integral_type() != "cell" for each in form.integrals())
-        if on_edges and (other := ufl.replace(form, moved)) != form:
-            wide.append(
+        on_edges = any(integral.integral_type() != "cell" for integral in form.integrals())
+        if on_edges and (other := ufl.replace(form, moved_measures)) != form:
+            widened_terms.append(
                 WeightedTerm(
                     FormTerm(share.term.name, other, model.u, model.kernels),
                     share.energy,
                     share.work,
                 )
             )
-    return summed(wide, x, model.u, w, model.kernels) if wide else None
+    return summed(widened_terms, x, model.u, w, model.kernels) if widened_terms else None
 
 
-def of_normals(adjoint: Adjoint, place: Place, *, first: bool) -> Array | float:
+def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array | float:
     """The derivatives (own cells, nodes, 3) by normals at points, along which forces and
     deflections are.
     """
     model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
     if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
-    along = [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
+    deflected_points = (
+        [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
+    )
     for name, force in model.loads.forces.items():
         energy = place.energy * mu[name] + c.get(name, 0.0)
-        along.append((force.point, model.force_unit * energy, model.force_unit * mu[name]))
+        deflected_points.append(
+            (force.point, model.force_unit * energy, model.force_unit * mu[name])
+        )
     total: Array | float = 0.0
-    for point, of_u, of_w in along:
+    for point, of_u, of_w in deflected_points:
         v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(
             place.w, point
         )
-        at = model.midsurface.points[point], v, model.midsurface.cells_of_point(point)
-        total = total + by_vertex_normal(model.r0, *at)
+        location = model.midsurface.points[point], v, model.midsurface.cells_of_point(point)
+        total = total + by_vertex_normal(model.r0, *location)
     return total
 
 
-def following(terms: Sequence[FormTerm]) -> list[OfPlacement]:
+def fields_of_placement(terms: Sequence[FormTerm]) -> list[OfPlacement]:
     """The fields in terms that follow from the placement."""
-    found = (c for term in terms for c in term.form.coefficients() if isinstance(c, OfPlacement))
-    return list(dict.fromkeys(found))
+    coefficients = (
+        c for term in terms for c in term.form.coefficients() if isinstance(c, OfPlacement)
+    )
+    return list(dict.fromkeys(coefficients))
 
 
 def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array) -> Iterator[Array]:
@@ -115,13 +124,13 @@ def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array)
     V, step = model.V, STEP * model.material.h
     r = fem.Function(broken_space(V))
     nodes = r.x.array.reshape(-1, V.dofmap.bs)
-    drawn = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
-    at, dofs = r.function_space.dofmap.list, field.function_space.dofmap.list[: len(normals)]
-    for k in range(drawn.shape[1]):
+    coordinates = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
+    node_dofs, dofs = r.function_space.dofmap.list, field.function_space.dofmap.list[: len(normals)]
+    for k in range(coordinates.shape[1]):
         values = list[Array]()
-        for way in (1, -1):
-            moved = drawn.copy()
-            moved[: len(normals), k] += way * step * normals[:, k][:, model.axes]
-            nodes[at] = moved
+        for sign in (1, -1):
+            moved_coordinates = coordinates.copy()
+            moved_coordinates[: len(normals), k] += sign * step * normals[:, k][:, model.axes]
+            nodes[node_dofs] = moved_coordinates
             values.append(field.again(r).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs])
         yield np.asarray((values[0] - values[1]) / (2 * step))

@@ -1,5 +1,5 @@
 """The lowest of several values raised: by linear programs of all planes that were seen
-(studies/raised.py).
+(studies/max_min.py).
 """
 
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.design_evaluation import Evaluation
-from magshell_fenicsx.studies.raised import raise_lowest
+from magshell_fenicsx.studies.design_evaluation import DesignEvaluation
+from magshell_fenicsx.studies.max_min import raise_lowest
 
 Array = NDArray[np.float64]
 SEEN = 3  # of the values the lowest ones
@@ -26,34 +26,34 @@ class Eigenvalues:
     A: Array
     most: float
 
-    def lowest_values(self, evaluation: Evaluation) -> Array:
+    def lowest_values(self, evaluation: DesignEvaluation) -> Array:
         return np.array([value for value, _ in evaluation.beside["all"]])
 
-    def lowest_slopes(self, evaluation: Evaluation) -> Array:
+    def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
         return np.array([slope for _, slope in evaluation.beside["all"]])
 
-    def constraints(self, evaluation: Evaluation) -> Array:
+    def constraints(self, evaluation: DesignEvaluation) -> Array:
         return np.array([evaluation.values["left"]])
 
-    def constraint_slopes(self, evaluation: Evaluation) -> Array:
+    def constraint_slopes(self, evaluation: DesignEvaluation) -> Array:
         return -np.ones((1, len(self.A) - 1))
 
     def of(self, x: Array) -> Array:
         return np.asarray(np.tensordot(np.concatenate([[1.0], x]), self.A, 1))
 
-    def evaluated(self, tried: list[Array]) -> Callable[[Array], Evaluation]:
+    def evaluated(self, tried: list[Array]) -> Callable[[Array], DesignEvaluation]:
         """An evaluation; the second one is lost."""
 
-        def evaluate(x: Array) -> Evaluation:
+        def evaluate(x: Array) -> DesignEvaluation:
             tried.append(x)
             if len(tried) == 2:
-                return Evaluation()
+                return DesignEvaluation()
             values, vectors = np.linalg.eigh(self.of(x))
             slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:SEEN]]
             beside = [
                 (float(value), slope) for value, slope in zip(values[:SEEN], slopes, strict=True)
             ]
-            return Evaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
+            return DesignEvaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
 
         return evaluate
 
@@ -93,21 +93,21 @@ class Slight:
 
     b: float
 
-    def lowest_values(self, evaluation: Evaluation) -> Array:
+    def lowest_values(self, evaluation: DesignEvaluation) -> Array:
         return np.array([evaluation.values["raised"]])
 
-    def lowest_slopes(self, evaluation: Evaluation) -> Array:
+    def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
         return np.array([evaluation.gradients["raised"]])
 
-    def constraints(self, evaluation: Evaluation) -> Array:
+    def constraints(self, evaluation: DesignEvaluation) -> Array:
         return np.array([evaluation.values["kept"]])
 
-    def constraint_slopes(self, evaluation: Evaluation) -> Array:
+    def constraint_slopes(self, evaluation: DesignEvaluation) -> Array:
         return np.array([[-self.b, 0.0]])
 
-    def evaluated(self, x: Array) -> Evaluation:
+    def evaluated(self, x: Array) -> DesignEvaluation:
         values = {"raised": 1 + x[0] - 0.1 * x[1] ** 2, "kept": self.b * (0.1 - x[0])}
-        return Evaluation(values, {"raised": [1.0, -0.2 * x[1]]})
+        return DesignEvaluation(values, {"raised": [1.0, -0.2 * x[1]]})
 
 
 @pytest.mark.parametrize("b", [0.2, 0.01])
@@ -115,7 +115,7 @@ def test_a_constraint_that_hardly_depends_on_the_variables(b: float) -> None:
     """The highest place is (0.1, 0), however small the slope of the constraint is."""
     goal, tried = Slight(b), list[Array]()
 
-    def evaluate(x: Array) -> Evaluation:
+    def evaluate(x: Array) -> DesignEvaluation:
         tried.append(x)
         return goal.evaluated(x)
 
