@@ -54,7 +54,7 @@ class RandomSection(ImperfectionSection):
             raise ValueError("give amplitude and length of a random field, or dimples")
         if self.dimples:
             self._sizes = sizes_noted(info)
-            _ = self.drawn  # refuses what has no room
+            _ = self.random_dimples  # refuses what has no room
         return self
 
     def account(self) -> str:
@@ -62,13 +62,13 @@ class RandomSection(ImperfectionSection):
 
     def listed(self) -> Mapping[str, ImperfectionSection]:
         return (
-            {f".{key}": dimple for key, dimple in self.drawn.items()}
+            {f".{key}": dimple for key, dimple in self.random_dimples.items()}
             if self.dimples
             else {"": self}
         )
 
     @cached_property
-    def drawn(self) -> Mapping[str, DimpleSection | GaussianSection]:
+    def random_dimples(self) -> Mapping[str, DimpleSection | GaussianSection]:
         """The random dimples by their keys below the section."""
         if self.dimples is None:
             return {}

@@ -100,11 +100,11 @@ def is_anisotropic(context: Context) -> bool:
         v for value in values for v in (value.values() if isinstance(value, dict) else [value])
     ]
     return any(isinstance(v, list) for v in patch_values) or any(
-        field.size > 1 for field in section.given
+        field.size > 1 for field in section.user_fields
     )
 
 
-def askew(context: Context, outline: Outline) -> str | None:
+def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     """Return why the natural shape is not axisymmetric about e3; None if it is."""
     section = context.of(NaturalSection)
     assert section
@@ -127,7 +127,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     """Return whether a plane mirrors the natural shape; patches are mapped onto themselves."""
     section = context.of(NaturalSection)
     assert section
-    if section.given:
+    if section.user_fields:
         return False
     x, R, direction = outline.sample(), context.shell.reference, along(context)
 
@@ -208,7 +208,9 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     vectors = [unit(np.array(direction, dtype=float))] if fixed else []
     return [
         SymmetryConstraint(
-            askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror)
+            not_axisymmetric_because(context, outline),
+            vectors,
+            lambda mirror: mirrored(context, outline, mirror),
         )
     ]
 

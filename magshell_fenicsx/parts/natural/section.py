@@ -130,7 +130,7 @@ class NaturalSection(Section, Ability):
         return self
 
     @property
-    def given(self) -> list[UserField]:
+    def user_fields(self) -> list[UserField]:
         """Curvature and stretch that are functions of a program."""
         return [value for value in (self.curvature, self.stretch) if isinstance(value, UserField)]
 
@@ -146,7 +146,7 @@ class NaturalSection(Section, Ability):
 
     def refuse_unfit(self, context: Context) -> None:
         """Refuse functions of a program in a solid: they are functions on the mid-surface."""
-        if self.given:
+        if self.user_fields:
             context.needs("natural", "a mid-surface", hint="of a solid give numbers and formulas")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
