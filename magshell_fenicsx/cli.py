@@ -206,7 +206,7 @@ def sweep(
             over,
             set_ or [],
             folder,
-            made=_made,
+            make_case=_made,
             result=result,
             full_paths=full_paths,
             part=part,
@@ -253,7 +253,7 @@ def boundary(
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = boundary_map(case, over, set_ or [], folder, made=_made, start=from_)
+        done = boundary_map(case, over, set_ or [], folder, make_case=_made, start=from_)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)
@@ -290,7 +290,7 @@ def study(
             over,
             set_ or [],
             result=result,
-            made=_made,
+            make_case=_made,
             reference=reference,
             ranks=parse_ranks(ranks),
             repeat=repeat,
@@ -350,7 +350,7 @@ def ensemble(
             set_ or [],
             samples=samples,
             seed=seed,
-            made=_made,
+            make_case=_made,
             result=result,
             out=folder,
             part=part,
@@ -386,7 +386,7 @@ def design(
 
     folder = chosen_folder(out, f"{case.stem}_design")
     with exit_codes(stopped=(DiskError, Missed)):
-        run_design(case, set_ or [], folder, made=_shared, resume=resume, say=print_line)
+        run_design(case, set_ or [], folder, make_case=_shared, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
 
 
@@ -408,7 +408,7 @@ def identify(
 
     folder = chosen_folder(out, f"{case.stem}_identify")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = identify_parameters(case, data, set_ or [], folder, made=_shared, say=print_line)
+        done = identify_parameters(case, data, set_ or [], folder, make_case=_shared, say=print_line)
     print_line(f"results in {folder}/")
     if done.fit.ended != "converged":
         raise failure(f"stopped early: {done.fit.ended}", STOPPED)
@@ -446,7 +446,7 @@ def compare(
             set_ or [],
             refinements=refinements,
             out=folder,
-            made=_made,
+            make_case=_made,
             result=result,
             say=print_line,
         )

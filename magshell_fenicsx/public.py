@@ -142,7 +142,7 @@ def boundary(
     from magshell_fenicsx.studies.boundary_map import boundary_map
 
     overs = [over] if isinstance(over, str) else over
-    return boundary_map(file, overs, settings, out, comm, say, made=Case.from_source, start=start)
+    return boundary_map(file, overs, settings, out, comm, say, make_case=Case.from_source, start=start)
 
 
 def identify(
@@ -163,7 +163,7 @@ def identify(
         out,
         comm,
         say,
-        made=lambda source: with_same_files(Case.from_source(source), comm),
+        make_case=lambda source: with_same_files(Case.from_source(source), comm),
     )
 
 

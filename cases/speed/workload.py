@@ -109,7 +109,7 @@ def path(scene: Scene, results: list[str]) -> Report:
         "back_solve_wall_s": newton.factorisation.solving.seconds,
         "factorisations": newton.factorisation.count,
         "iterations": newton.iterations,
-        "values": {name: parse_scalar(name).of(found, rows) for name in results},
+        "values": {name: parse_scalar(name).value_in(found, rows) for name in results},
         "stopped": result.stopped,
     }
 

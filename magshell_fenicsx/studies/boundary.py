@@ -85,7 +85,7 @@ class Range:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """In rising order."""
+        """The least and the largest value, in rising order."""
         return min(self.first, self.last), max(self.first, self.last)
 
     def text(self, value: float) -> str:
@@ -253,8 +253,8 @@ def boundary(
 
 
 def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: bool) -> float:
-    """Where the boundary starts: the case's own value, or where that may be outside, the end that
-    is nearest to it.
+    """Return the key's value at which the boundary starts: the case's own value, or where that may
+    be outside the range, the nearest end.
     """
     words = span.key.split(".")
     raw = value_at(source.data, words)
@@ -446,7 +446,7 @@ def _put_together(
     name: str,
     settings: Sequence[str],
 ) -> StabilityBoundary:
-    """Both directions as one curve, and what it says."""
+    """Join both directions of the boundary into one curve; return it with its description."""
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]

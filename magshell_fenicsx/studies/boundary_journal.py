@@ -1,4 +1,4 @@
-"""What a boundary keeps of its solves, so that an interrupted one goes on."""
+"""Journal of the solves of a boundary, from which an interrupted one goes on."""
 
 import base64
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Journal:
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """What the part has found; empty until it is finished."""
+        """The finished result of the part; empty until it is finished."""
         return self._stored_outcome(self._name) or {}
 
     def finish(self, outcome: dict[str, Any]) -> None:

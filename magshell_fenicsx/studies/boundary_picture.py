@@ -226,7 +226,7 @@ def _regions(
 def _regions_of_mode(
     rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
 ) -> list[tuple[Any, ...]]:
-    """The same of a boundary with one mode."""
+    """Places and names of the regions beside a boundary of one mode."""
     instability_words = (
         "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     )

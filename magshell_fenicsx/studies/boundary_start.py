@@ -1,4 +1,4 @@
-"""Where a boundary starts: at the end of its case, or at a located point of another run of it."""
+"""The start of a boundary: the end of its case, or a located point of another run of it."""
 
 import re
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ FORM = "write it as DIR:POINT, with the folder of a run and the number of a fold
 
 @dataclass(frozen=True)
 class Start:
-    """Which instability of a history is followed.
+    """The instability of a history at which a boundary starts.
 
     Attributes
     ----------
@@ -63,7 +63,9 @@ class Start:
         return min(candidates, key=lambda r: abs(_load(r) - self.load))
 
     def anywhere(self) -> "Start":
-        """The same instability in a history of other points, as that of the whole shell is."""
+        """Return the same instability for a history with other points, such as that of the whole
+        shell.
+        """
         return replace(self, point=-1)
 
 

@@ -72,7 +72,7 @@ class NothingLeft(RuntimeError):
 
 @dataclass(frozen=True)
 class Used:
-    """What usage.json says of a run: what was asked for, and the times of the process."""
+    """The content of usage.json of a run: the request, and the times of the process."""
 
     asked: dict[str, Any]
     cpu_s: float
@@ -226,7 +226,7 @@ def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
 
 def load_at(run: ModelRun, w: float) -> float | None:
     """The load at a displacement; None if the run does not reach it."""
-    return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
+    return Scalar("", amplitude(amplitude_of(run)).column, W, w).value_in(run.summary, loaded(run))
 
 
 def judge(
@@ -239,7 +239,7 @@ def judge(
     if scalar is None and all(run.summary["knockdown"] is not None for run in runs):
         scalar = parse_scalar("knockdown")
     if scalar:
-        return scalar.name, lambda run: scalar.of(run.summary, run.rows)
+        return scalar.name, lambda run: scalar.value_in(run.summary, run.rows)
     if judged_place is None:
         return "nothing", lambda run: None
     return (

@@ -133,7 +133,7 @@ class Design:
 
     @cached_property
     def _identity(self) -> dict[str, str]:
-        """What the evaluations of this design have in their files: a hash of what is designed, and
+        """Header of every stored evaluation of this design: a hash of the design and the version of
         the sources.
         """
         section_text = self.goal.section.model_dump_json(exclude={"iterations", "verify"})

@@ -1,4 +1,4 @@
-"""What may vary in a design: numbers of the case, vectors of the remanence, scalar fields."""
+"""Blocks of design variables: numbers of the case, vectors of the remanence, scalar fields."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ class Bounded:
 
     @property
     def limits(self) -> list[Limits]:
-        """Their bounds."""
+        """Bounds of the variables; all lie between 0 and 1."""
         return [(0.0, 1.0)] * self.start.size
 
     def values(self, x: Array) -> Array:
@@ -140,7 +140,7 @@ class Vectors:
         )
 
     def vectors(self, x: Array) -> Array:
-        """At the points, (n, 3) or (n, 2)."""
+        """The vectors at the control points, (n, 3) or (n, 2), for variables x."""
         return self._polar(x)[0]
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
@@ -251,8 +251,8 @@ class ControlPointField(Bounded):
         return Controls(points_of_shell, self.controls.width / place.scale), ratio
 
     def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:
-        """What the thickness over h changes by (nodes of cells, 1) with the factor of each one's
-        own shell.
+        """Derivative (nodes of cells, 1) of the thickness over h by the factor of the thickness of
+        each point's own shell.
         """
         surface = scene.model.meridian if scene.model.axisymmetric else scene.model.midsurface
         assert surface
@@ -262,7 +262,9 @@ class ControlPointField(Bounded):
         return ratios.reshape(-1, 1)
 
     def _formula(self, values: Array, controls: Controls, R: float = 1.0) -> str:
-        """Of places, over R but for a curvature."""
+        """Formula of the field for values at the control points, with lengths over R except for a
+        curvature.
+        """
         if np.ptp(values) == 0:
             return repr(float(values[0] / R))
         squared_width = repr(float(controls.width * R) ** 2)

@@ -174,7 +174,7 @@ def _draw_history(
 
 
 def _common(words: Sequence[str]) -> str:
-    """What results of several points are, before the points' names.
+    """Common words of results of several points, which stand before the points' names.
 
     Examples
     --------
@@ -196,7 +196,7 @@ def _draw_shape(axes: Any, shape: ReachedShape, target_points: Array) -> None:
 
 
 def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | None) -> None:
-    """The vectors at their places on the undeformed shell and its edges, with room for the longest."""
+    """Draw the vectors at their places on the undeformed shell and its edges."""
     assert vary.controls
     places, vectors = vary.controls.places, vary.vectors(x)
     names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
@@ -251,7 +251,7 @@ def _unit(result: str) -> str:
 
 
 def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
-    """The values at the points: along a meridian or a strip as lines, else as colours from above."""
+    """Draw values at the points: along a meridian or strip as lines, else as colours from above."""
     places, title = field.controls.places, TITLES[field.name]
     if field.controls.around or not places[:, 1:].any():
         arc_length = np.concatenate(

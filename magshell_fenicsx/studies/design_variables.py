@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Variables:
-    """What varies, as one vector: numbers, then the remanence, then scalar fields.
+    """All design variables as one vector: numbers, then the remanence, then scalar fields.
 
     Every part has a name, its variables at the start (`first`) and their bounds (`limits`); it
     takes its gradient from those of `simulate.gradients` (`gradient`) and gives plain data of the
@@ -67,18 +67,18 @@ class Variables:
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """What varies -> its variables."""
+        """Name of a block -> slice of its variables in the vector."""
         ends = np.cumsum([0, *(part.start_values.size for part in self.parts)])
         return {part.name: slice(*ends[i : i + 2]) for i, part in enumerate(self.parts)}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What results are differentiated by."""
+        """Names of the numbers and fields by which results are differentiated."""
         return tuple(part.name for part in self.parts)
 
     @property
     def controls(self) -> Controls | None:
-        """Of the remanence, if that varies."""
+        """Control points of the remanence; None if it does not vary."""
         return self.remanence.controls if self.remanence else None
 
     @property
@@ -154,7 +154,7 @@ class Variables:
 
 
 def variables(source: Source, case: Case, design: DesignSection, make_case: MakeCase) -> Variables:
-    """What a design varies.
+    """Build the design variables of a case.
 
     Raises
     ------

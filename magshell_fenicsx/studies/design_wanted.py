@@ -1,5 +1,5 @@
-"""What a design wants: an objective that is least, constraints that are not negative; and SciPy's
-optimisers.
+"""The goal of a design: an objective to be minimised, constraints that must not be negative; and
+its search by SciPy's optimisers.
 """
 
 import itertools
@@ -59,7 +59,9 @@ class Limit:
 
 
 def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
-    """Those of a section of a case; `scale` has the sizes of results at the start."""
+    """Return the inequality constraints of a section; `scale` has the sizes of results at the
+    start.
+    """
     sides = ((section.least, 1.0), (section.most, -1.0))
     limits = [
         Limit(section.of, sign, bound_value)
@@ -99,8 +101,8 @@ def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
 
 
 class Curve:
-    """The spline through points, of length one; the strip's places keep their distance to its
-    middle line along y.
+    """Spline through points, of length one, as the target of a strip: its places keep their
+    distance to the middle line along y.
     """
 
     def __init__(self, points: Array, bent: float = 1.0) -> None:
@@ -144,7 +146,7 @@ def _with_part_of_curvature(points: Array, part: float) -> Array:
 
 @dataclass
 class DesignGoal:
-    """What is wanted; results are scaled with their values at the start.
+    """Objective and constraints of a design; results are scaled with their values at the start.
 
     Attributes
     ----------
@@ -174,7 +176,7 @@ class DesignGoal:
         return self._objective(evaluation)[0]
 
     def slope(self, evaluation: DesignEvaluation) -> Array:
-        """Its gradient."""
+        """Gradient of the objective."""
         return self._objective(evaluation)[1] * np.array(
             evaluation.gradients[self.section.objective.result]
         )
@@ -214,7 +216,9 @@ class DesignGoal:
         return self.lowest and any(result in LOWEST for result in self.section.objective.results)
 
     def lowest_values(self, evaluation: DesignEvaluation) -> Array:
-        """All of them over the scale, always as many: where fewer are near, what is surely above."""
+        """Values to be raised over the scale, always equally many: missing ones are replaced by an
+        upper bound.
+        """
         groups = [
             _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
             for result in self.section.objective.results
@@ -252,7 +256,7 @@ class DesignGoal:
 
     @property
     def _limits(self) -> list[Limit]:
-        """Of all constraints."""
+        """The inequalities of all constraints."""
         return [
             limit
             for section in self.section.constraints
@@ -267,11 +271,13 @@ class DesignGoal:
         )
 
     def violation(self, evaluation: DesignEvaluation) -> float:
-        """By how much the constraints are not kept, relative."""
+        """Return the largest relative violation of the constraints; zero if all are satisfied."""
         return float(max([0.0, *(-self.constraints(evaluation))]))
 
     def merit(self, evaluation: DesignEvaluation) -> tuple[float, float]:
-        """By what evaluations are compared: least is best."""
+        """Return the pair by which evaluations are compared: violation, then objective; the least
+        is best.
+        """
         violation = self.violation(evaluation)
         return (violation if violation > CONSTRAINT_TOLERANCE else 0.0, self.objective(evaluation))
 
@@ -282,7 +288,7 @@ class DesignGoal:
         )
 
     def missed(self, evaluation: DesignEvaluation) -> str:
-        """What is not as wanted; empty if all is."""
+        """Describe the targets and constraints that an evaluation misses; empty if it misses none."""
         objective, sentences = self.section.objective, list[str]()
         if objective.value is not None and objective.reach:
             value = evaluation.values[objective.reach]
@@ -313,7 +319,7 @@ def _value_and_close_ones(
 
 
 def design_goal_of(case: Case, section: DesignSection) -> DesignGoal:
-    """What the section of a case wants."""
+    """Build the goal from the section of a case."""
     shape = section.objective.shape
     if shape is None:
         return DesignGoal(section, {})
@@ -414,7 +420,7 @@ def _raise_lowest_smooth(
 def _last_known(
     evaluated: Callable[[Array], DesignEvaluation],
 ) -> Callable[[Array], tuple[DesignEvaluation, bool]]:
-    """What evaluates a vector; of a lost path the last one that is known, and False."""
+    """Wrap an evaluation so that a lost path gives the last known evaluation, and False."""
     last: list[DesignEvaluation] = []
 
     def evaluate_or_last(x: Array) -> tuple[DesignEvaluation, bool]:

@@ -216,8 +216,8 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
 
 
 def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge: bool) -> None:
-    """See that each place has a sample of this ensemble; one that was killed before its first
-    sample begins again.
+    """Refuse a folder with samples of another ensemble; an ensemble that was killed before its
+    first sample begins again.
     """
     for place in places:
         points = place / "points"

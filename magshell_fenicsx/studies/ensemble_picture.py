@@ -59,7 +59,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
 
 
 def _places(values: Array, weibull: Weibull) -> Array:
-    """Where a fitted curve is drawn: from its lowest value that is likely."""
+    """Return the values at which a fitted curve is drawn, from the lowest likely value on."""
     smallest_value = float(values.min())
     low = max(weibull.quantile(TAIL), smallest_value - np.ptp(values))
     return np.linspace(min(low, smallest_value), values.max() + 0.1 * np.ptp(values), 400)
@@ -133,7 +133,8 @@ def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> N
 
 
 def correlation(x: Array, y: Array) -> tuple[float, float]:
-    """Spearman's correlation, and how likely one as large is by chance: of few samples from permutations.
+    """Return Spearman's correlation, and its probability by chance: for few samples from
+    permutations.
 
     Examples
     --------

@@ -260,7 +260,9 @@ class Scenes:
 
 
 def _apart_from_strength(case: Case) -> str:
-    """What determines all of a scene but the size of lambda_m, which is an amplitude."""
+    """Return a key of all that determines a scene, except the size of lambda_m, which is a load
+    amplitude.
+    """
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
         has_both = (

@@ -84,8 +84,8 @@ class Identified:
 
     @property
     def remanence(self) -> dict[str, Any] | None:
-        """Of the field that was looked for: places over R, values over |B^r|, deviations and bands,
-        and its prior.
+        """The identified remanence field: places over R, values over |B^r|, deviations, bands and
+        its prior; None if no field was identified.
         """
         field: dict[str, Any] | None = self.content["remanence"]
         return field
@@ -182,7 +182,7 @@ def _without_predictions(source: Source) -> Source:
 
 
 def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
-    """See that there are data enough.
+    """Check that there are enough data for the parameters.
 
     Raises
     ------
@@ -211,8 +211,7 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
 
 
 def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: MakeCase) -> None:
-    """See that a case may have the mean of each prior: its keys have bounds, and so have
-    parameters.
+    """Check that the mean of each prior makes a valid case: keys of the case have bounds.
 
     Raises
     ------
@@ -315,7 +314,7 @@ def _parameters_text(parameters: Sequence[Parameter], x: Array) -> str:
 def _refuse_idle(
     slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]
 ) -> None:
-    """See that every parameter changes something.
+    """Check that every parameter has an influence on the data.
 
     Raises
     ------
@@ -337,7 +336,7 @@ def _refuse_idle(
 
 
 def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -> dict[str, Any]:
-    """What is found, as plain data."""
+    """Return the identified parameters, noise and predictions as plain data."""
     measured = posterior.measured
     low, high = posterior.band
     quantiles = posterior.quantiles(np.eye(len(posterior.x)))

@@ -1,5 +1,5 @@
-"""What `magshell identify` is given: measured columns as readings of a case, and numbers of it with
-their priors.
+"""Input of `magshell identify`: measured columns as readings of a case, and parameters with their
+priors.
 """
 
 import re
@@ -86,7 +86,7 @@ class MeasuredColumn:
 
 @dataclass(frozen=True)
 class MeasuredTable:
-    """What was measured.
+    """Measured data, as readings of a case.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class ResultNames:
         except CaseError:
             self.places = None
 
-    def of(self, name: str, unit: str | None, location: str) -> tuple[str, str, float]:
+    def result_of(self, name: str, unit: str | None, location: str) -> tuple[str, str, float]:
         """The result of a name with a unit, the case's unit, and what one of that unit is in it.
 
         Raises
@@ -194,7 +194,7 @@ class ResultNames:
         ]
 
     def refuse_strange(self, name: str, location: str) -> None:
-        """See that a column of data may have a name, with or without its unit.
+        """Check that a column of data names a result of the case, with or without its unit.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class ResultNames:
         """
         number, unit = number_and_unit(str(amount))
         _, case_unit, factor = (
-            self.of(result, None, location) if not unit else self._of_unit(result, unit, location)
+            self.result_of(result, None, location) if not unit else self._of_unit(result, unit, location)
         )
         if case_unit and not unit and float(number):
             raise CaseError(
@@ -233,7 +233,7 @@ class ResultNames:
         return float(number) * factor
 
     def _of_unit(self, result_name: str, unit: str, location: str) -> tuple[str, str, float]:
-        result, case_unit, _ = self.of(result_name, None, location)
+        result, case_unit, _ = self.result_of(result_name, None, location)
         if not case_unit:
             raise CaseError(
                 f"{location}: {result_name} has no unit, so this number has none: {unit}"
@@ -249,7 +249,7 @@ def _text(amount: Amount) -> str:
 
 
 def refuse_size(deviation: float, text: Amount, location: str) -> None:
-    """See that a standard deviation is one, whose square is a number.
+    """Check that a standard deviation is positive and that its square is a floating-point number.
 
     Raises
     ------
@@ -363,7 +363,7 @@ def _rows_of(file: Path) -> TableRows:
 
 
 def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: str) -> None:
-    """See that a column that says what a row is of has a number in each."""
+    """Check that a column with places or keys has a number in every row."""
     for row in np.flatnonzero(np.isnan(values))[:1]:
         raise CaseError(f"{location}: line {lines[row]}: {name}: has a row without a number")
 
@@ -371,7 +371,7 @@ def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: st
 def refuse_twice(
     header: str, result: str, earlier_headers: Mapping[str, str], location: str
 ) -> None:
-    """See that a column is of another result, or key, than those before it: headers by these.
+    """Check that a column is of another result, or key, than all earlier ones (result -> header).
 
     Raises
     ------
@@ -423,7 +423,7 @@ def table_of(
         if rows and name in SHAPE:
             continue
         is_displacement = bool(rows) and name in MOVED
-        result, case_unit, factor = names.of(
+        result, case_unit, factor = names.result_of(
             f"{rows[0]}_{name}" if is_displacement else name, unit, location
         )
         refuse_twice(header, result, headers_by_result, location)
@@ -540,8 +540,7 @@ def _listed(
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:
-    """See what can be seen of a section without data: that parameters are numbers and that results
-    are there.
+    """Check all of a section that needs no data: parameters are numbers, and results exist.
 
     Raises
     ------
@@ -567,7 +566,7 @@ def candidate(
     CaseError
         If it is none.
     """
-    result, unit, _ = names.of(section.of, None, f"{key}.of")
+    result, unit, _ = names.result_of(section.of, None, f"{key}.of")
     noise = names.amount(section.noise, result, f"{key}.noise")
     refuse_size(noise, section.noise, f"{key}.noise")
     if section.at is None:

@@ -76,7 +76,7 @@ class RemanenceField:
         data["magnetic"]["remanent"]["file"] = str(file.absolute())
 
     def summary(self, posterior: Posterior, flux_scale: tuple[float, str]) -> dict[str, Any]:
-        """What is known of the field, as plain data; `flux_scale` is |B^r| and its unit."""
+        """Return the identified field as plain data; `flux_scale` is |B^r| and its unit."""
         block, prior = self.smooth.block, posterior.measured.field
         assert prior
         shape = (len(self.start), len(self.free_components))
@@ -174,7 +174,7 @@ def flux_density(case: Case) -> tuple[float, str]:
 
 
 def words(field: Mapping[str, Any]) -> list[str]:
-    """What is found of the field."""
+    """Describe the identified field in words."""
     flux_scale, prior = field["over"], field["prior"]
     unit = f" {flux_scale['unit']}" if flux_scale["unit"] else " |B^r|"
     deviation = flux_scale["value"] * np.array(field["deviation"])

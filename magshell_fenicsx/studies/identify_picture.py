@@ -69,7 +69,7 @@ def draw_identified(
 
 
 def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:
-    """Where the places of a shape are, in the two directions in which most of them move."""
+    """Draw measured places of a shape in the two directions in which most of them move."""
     largest_by_axis = dict[str, float]()
     for row in rows:
         largest_by_axis[row["column"]] = max(

@@ -1,4 +1,4 @@
-"""What a case predicts for values of its parameters; each evaluation is kept in a folder."""
+"""Predictions of a case for values of its parameters; each evaluation is stored in a folder."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ Settings = tuple[str, ...]
 
 @dataclass
 class PredictedReadings:
-    """What is predicted for a vector of parameters; with a note there is nothing.
+    """Readings predicted for a vector of parameters; empty if there is a note.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Predictor:
     count: int = 0
 
     def __call__(self, x: Array, *, slopes: bool = True) -> PredictedReadings:
-        """What is predicted, known or new."""
+        """Return the prediction for parameters x, stored or newly computed."""
         x = np.array(self.comm.bcast(x))
         listed = json.dumps(
             [
@@ -144,14 +144,14 @@ class Predictor:
         return prediction
 
     def _row_of(self, error: Exception, settings: Settings) -> str:
-        """Where the place that is not reached stands in the data; empty of another error."""
+        """Return file and line of the datum whose place is not reached; empty for another error."""
         if not isinstance(error, NotRead):
             return ""
         rows = zip(self.rows.get(settings, ()), self.readings[settings], strict=False)
         return next((row for row, reading in rows if reading.at == error.place), "")
 
     def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
-        """A case, this or another one, for a vector of parameters; those of a field are in a file."""
+        """Return a case, this or another, with the parameters x; vectors of a field are in a file."""
         source = source_with_numbers(
             base, [parameter.number for parameter in self.parameters], x[: len(self.parameters)]
         )

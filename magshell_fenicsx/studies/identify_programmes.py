@@ -63,7 +63,7 @@ class PathColumn:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is predicted: as in identify.json, in words, the rows of its table, and what is drawn."""
+    """Prediction of a programme: as in identify.json, in words, and as rows of its table."""
 
     name: str
     content: dict[str, Any]
@@ -169,7 +169,9 @@ class Programme:
         return dict.fromkeys(name for name in names if name not in ("", "end"))
 
     def _outcome(self, folder: Path, key: str) -> Outcome | None:
-        """What is known of a run; an error may have been of the machine, and is tried again."""
+        """Return the stored outcome of a run; None after an error, which may have been one of the
+        machine, so that it is tried again.
+        """
         outcome = stored_outcome_of_case(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
             return None
@@ -179,7 +181,7 @@ class Programme:
     def prediction(
         self, folder: Path, posterior: Posterior, noise: Mapping[str, Mapping[str, Any]]
     ) -> Prediction:
-        """What the runs say.
+        """Return the prediction with its bands from the stored runs.
 
         Raises
         ------
@@ -199,7 +201,7 @@ class Programme:
         curves = [_PathCurve(item.curve, self.place) for item in (first, *runs)]
         places, steps = self.places, self.steps
         if places is None:
-            places = np.array(curves[0].of(self.last)[0])
+            places = np.array(curves[0].along_step(self.last)[0])
             steps = np.full(places.size, self.last, dtype=np.int64)
         rows = [
             row
@@ -277,7 +279,7 @@ class Programme:
         noise: float,
         samples: int,
     ) -> Iterator[dict[str, Any]]:
-        values = np.array([curve.at(column, places, steps) for curve in curves])
+        values = np.array([curve.values_at(column, places, steps) for curve in curves])
         for i, place in enumerate(places):
             value, band = values[0, i], band_of(values[1:, i], samples)
             low, high = band or (np.nan, np.nan)
@@ -325,7 +327,7 @@ class _PathCurve:
         self._rows = [row for row in rows if row["branch"] == 0 and row["mode"] in OWN_MODES]
         self._place = place
 
-    def of(self, step: int, column: str = "") -> tuple[list[float], list[float]]:
+    def along_step(self, step: int, column: str = "") -> tuple[list[float], list[float]]:
         """Places and values of a column in a step, from the point where it begins."""
         rows_of_step = [i for i, row in enumerate(self._rows) if row["step"] == step]
         rows = (
@@ -335,11 +337,13 @@ class _PathCurve:
             float(row[column or self._place]) for row in rows
         ]
 
-    def at(self, column: PathColumn, places: Array, steps: NDArray[np.int64]) -> Array:
-        """A column at places, where the path first passes each in its step; nan where it does not."""
+    def values_at(self, column: PathColumn, places: Array, steps: NDArray[np.int64]) -> Array:
+        """Return a column where the path first passes each place in its step; nan where it does
+        not.
+        """
         values = np.full(len(places), np.nan)
         for step in np.unique(steps):
-            x, y = map(np.array, self.of(int(step), column.of))
+            x, y = map(np.array, self.along_step(int(step), column.of))
             if x.size < 2:
                 continue
             y = y - y[0] if column.change else y
@@ -370,8 +374,8 @@ def programme(
     *,
     with_field: bool = False,
 ) -> Programme:
-    """What a section asks for; collective. Where a field is looked for, the case has room for its
-    points.
+    """Build the programme of a section; collective. If a field is identified, the case must have
+    room for its points.
 
     Raises
     ------
@@ -442,7 +446,7 @@ def programme(
 def refuse_unfit_programmes(
     source: Source, case: Case, section: IdentifySection, make_case: MakeCase
 ) -> None:
-    """See that what is to be predicted is there; collective.
+    """Check that cases, settings and results of all predictions exist; collective.
 
     Raises
     ------
@@ -481,7 +485,7 @@ class _PathColumnNames:
         in_units = self.sizes.column(name)
         return in_units.name if in_units else name
 
-    def of(self, name: str, unit: str | None, location: str) -> tuple[str, float]:
+    def column_of(self, name: str, unit: str | None, location: str) -> tuple[str, float]:
         """The column of a name with a unit, and what one of that unit is in it.
 
         Raises
@@ -525,7 +529,7 @@ def _measured(
             f"{location}: needs two columns or more: the place first, then what was measured there"
         )
     measured = [
-        (header, *names.of(header, units[header], location), values)
+        (header, *names.column_of(header, units[header], location), values)
         for header, values in values_by_header.items()
     ]
     headers_by_result = dict[str, str]()

@@ -1,4 +1,4 @@
-"""What an identification has found, in words."""
+"""Sentences about the results of an identification."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 
 
 def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
-    """What is found, in words."""
+    """Describe the results of an identification in sentences."""
     measured = posterior.measured
     lines, keys = list[str](), list(content["parameters"])
     for key, entry in content["parameters"].items():

@@ -66,7 +66,7 @@ class NoNoise(ValueError):
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known.
+    """Measured data, their noise, and the priors of the parameters.
 
     Attributes
     ----------
@@ -288,7 +288,7 @@ def _covariance(A: Array, size: Array) -> Array:
 
 
 def _refuse_unseen(A: Array) -> None:
-    """See that every combination of parameters changes something."""
+    """Check that every combination of parameters has an influence on data or priors."""
     length = np.linalg.norm(A, axis=0)
     if (idle := np.flatnonzero(length == 0)).size:
         raise NotSeen(idle)
@@ -298,7 +298,7 @@ def _refuse_unseen(A: Array) -> None:
 
 
 def _guessed(measured: Measured, y: Array) -> Array:
-    """The noise of the columns; where it is to be estimated, the root mean square of the residuals."""
+    """Initial noise of the columns: as given, or the root mean square of the residuals."""
     noise = np.array(measured.noise)
     for column in np.flatnonzero(np.isnan(noise)):
         noise[column] = np.sqrt(np.mean((measured.data - y)[measured.group == column] ** 2)) or 1.0
@@ -308,8 +308,8 @@ def _guessed(measured: Measured, y: Array) -> Array:
 def _weighed(
     initial: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
-    """What is known, with the prior of the field as the data choose it; the noise, and its degrees
-    of freedom.
+    """Return data and prior with the strength that the data choose for a field's prior; the noise,
+    and its degrees of freedom.
     """
     if measured.field:
         measured, noise = _Strength(initial, measured, x, y, J, noise, size).best()
@@ -342,7 +342,7 @@ class _Strength:
 
     @property
     def unknown_strengths(self) -> NDArray[np.int64]:
-        """Which of deviation and length are not given."""
+        """Indices of those of deviation (0) and length (1) that are not given."""
         return np.flatnonzero(
             np.isnan([self.fields_of_priors[0].deviation, self.fields_of_priors[0].length])
         )
@@ -353,13 +353,15 @@ class _Strength:
         return np.flatnonzero(np.isnan(self.initial.noise))
 
     def z(self, deviation: float, length: float) -> Array:
-        """Of a prior and of the noise that the search begins with."""
+        """Logarithms of the unknown deviation and length, and of the unknown noise where the search
+        begins.
+        """
         return np.log(
             [*np.array([deviation, length])[self.unknown_strengths], *self.noise[self.unknown]]
         )
 
     def weighed(self, z: Array) -> tuple[Measured, Array]:
-        """What is known then, and the noise."""
+        """Return data with the prior of strengths z, and the noise of z."""
         first, _ = self.fields_of_priors
         values, noise = np.array([first.deviation, first.length]), np.array(self.noise)
         values[self.unknown_strengths], noise[self.unknown] = (

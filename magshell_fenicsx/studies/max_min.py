@@ -41,7 +41,7 @@ MIN_GAIN = 1e-5  # a gain, over the value at the start
 
 
 class MaxMinGoal(Protocol):
-    """What is raised, of an evaluation, and what must not become negative; over their sizes at the
+    """Values to be raised and constraints that must not be negative, scaled with their sizes at the
     start.
     """
 

@@ -154,7 +154,7 @@ class SweepPoint:
 
     @property
     def label(self) -> str:
-        """For example `energy=full, remanent.polar=45`."""
+        """Keys and values in words, for example `energy=full, remanent.polar=45`."""
         return ", ".join(f"{short_key(key)}={value}" for key, value in self.values.items())
 
 
@@ -234,7 +234,9 @@ def short_key(key: str) -> str:
 
 
 def value_at(data: Any, path: Sequence[str]) -> Any:
-    """What plain data of a case has at a key's words; None if it has no such key."""
+    """Return the value of a key, given by its words, in plain data of a case; None if there is no
+    such key.
+    """
     for name in path:
         try:
             data = data[int(name)] if isinstance(data, list) else data[name]

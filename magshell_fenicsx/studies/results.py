@@ -40,7 +40,7 @@ class Scalar:
     at: str = ""
     value: float = 0.0
 
-    def of(self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> float | None:
+    def value_in(self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> float | None:
         """The number; None if the run does not have it.
 
         Parameters
@@ -112,7 +112,7 @@ def parse_scalar(text: str) -> Scalar:
 def _crossing(
     path: Sequence[Mapping[str, str]], column: str, place_column: str, value: float
 ) -> float | None:
-    """A column at the first point where the column `place_column` has a value, by cubic interpolation.
+    """Return a column where `place_column` first has a value, by cubic interpolation.
 
     The interpolation uses points of one load, because the curve has a corner at the end of the
     field. At a requested point of the path the result is the number in its row.

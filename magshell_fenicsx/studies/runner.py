@@ -91,7 +91,7 @@ class Folder:
 
     @contextmanager
     def locked(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
-        """The same for one job alone, which holds it inside `with`; collective."""
+        """Prepare the folder and lock it for this job inside `with`; collective."""
         with locked_folder(out, comm, make=True):
             self.prepare(out, comm, case)
             yield
@@ -342,7 +342,7 @@ class Outcome:
 
     @classmethod
     def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
-        """That of a run without a result."""
+        """Return the outcome of a run without a result."""
         return cls(None, None, why, None, wall_s, [], "path", factorisations)
 
     def value(self, scalar: Scalar) -> float | None:
@@ -356,7 +356,7 @@ class Outcome:
             "limit_points": limits,
             "snaps": self.snaps,
         }
-        return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
+        return scalar.value_in(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
 
     def serves(self, scalar: Scalar) -> bool:
         """Whether it has what a number needs: of a fold alone only the knockdown is known."""

@@ -59,7 +59,7 @@ class Smooth:
 
     @property
     def block(self) -> slice:
-        """Of the field in the vector of parameters."""
+        """Slice of the field in the vector of parameters."""
         return slice(self.first, self.first + self.size)
 
     @property
@@ -92,7 +92,7 @@ class Smooth:
         return self.components * self._factor[1]
 
     def at_bounds(self) -> list[str]:
-        """Which of s and l have reached a bound."""
+        """Return those of deviation s and length l that have reached a bound."""
         return [
             name
             for name, value, (low, high) in zip(
@@ -102,7 +102,7 @@ class Smooth:
         ]
 
     def with_strength(self, deviation: float, length: float) -> "Smooth":
-        """The same prior of another strength."""
+        """Return the prior with another deviation and length."""
         return replace(self, deviation=deviation, length=length)
 
     def starts(self, prior: "Smooth") -> list[tuple[float, float]]:

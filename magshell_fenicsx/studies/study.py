@@ -195,7 +195,7 @@ def _write(study_result: Study, keys: Sequence[str], content: dict[str, Any], fo
 def _outcome(measured: Timings, scalar: Scalar) -> str:
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
-    value = scalar.of(measured.summary, measured.rows)
+    value = scalar.value_in(measured.summary, measured.rows)
     result_text = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
     stopped = measured.summary["stopped"]
     return f"{result_text}, {measured.typical('wall_s'):.2f} s" + (

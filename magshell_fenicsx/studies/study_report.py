@@ -165,7 +165,7 @@ def _row(run: Run, scalar: Scalar) -> Row:
         return row
     return row | {
         **summary["mesh"],
-        "result": scalar.of(summary, measured.rows),
+        "result": scalar.value_in(summary, measured.rows),
         **{key: measured.typical(key) for key in TIMES},
         "jit_first_s": measured.first["jit_s"] if measured.first else None,
         "factorisations": summary["factorisations"],

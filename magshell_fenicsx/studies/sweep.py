@@ -222,7 +222,7 @@ def _is_known(file: Path, scalar: Scalar | None) -> bool:
 
 
 def _words(outcome: Outcome, scalar: Scalar | None) -> str:
-    """What a point has reached."""
+    """Describe the result of a point in words."""
     result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
         value = outcome.value(scalar)
@@ -302,7 +302,7 @@ def _symmetry(case: Case) -> str:
 
 @dataclass
 class SweepCache:
-    """What the chains of one rank share.
+    """Scenes and folds that the chains of one rank share.
 
     Attributes
     ----------
@@ -416,14 +416,14 @@ def with_earlier(
 
 
 def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
-    """The same text for equal numbers, whatever their unit."""
+    """Return the values of a point as text that is the same for equal numbers, whatever their unit."""
     pairs = zip(values, axes, strict=True)
     return tuple(f"{axis.number(value):.10g}" if axis.numbers else value for value, axis in pairs)
 
 
 @dataclass(frozen=True)
 class Listed:
-    """What sweep.json says: the swept keys, a hash of the case without them, and the values of all
+    """Content of sweep.json: the swept keys, a hash of the case without them, and the values of all
     points.
     """
 

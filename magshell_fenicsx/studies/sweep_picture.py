@@ -133,8 +133,8 @@ def _common(outcomes: Sequence[Outcome], name: str) -> float:
 
 
 def _ends(outcomes: Sequence[Outcome]) -> Results:
-    """What the last point of each curve has: its load, or its displacement where all loads are the
-    same.
+    """Return values at the last point of each curve: its load, or its displacement where all loads
+    are the same.
     """
     last = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
     last_row = next((row for row in last if row), {})
@@ -147,7 +147,7 @@ def _ends(outcomes: Sequence[Outcome]) -> Results:
 
 
 def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
-    """Colours and contours over both swept numbers; points without a result are crosses in a hole."""
+    """Draw colours and contours over both swept numbers, with crosses where there is no result."""
     from matplotlib.ticker import MaxNLocator
 
     rows, columns = axes

@@ -41,7 +41,7 @@ def path(*points: tuple[str, float, float]) -> list[dict[str, str]]:
 
 
 def force_at(w: float, rows: list[dict[str, str]]) -> float | None:
-    return parse_scalar(f"force@w_over_h={w}").of({}, rows)
+    return parse_scalar(f"force@w_over_h={w}").value_in({}, rows)
 
 
 def test_result_at_a_requested_point_is_its_row() -> None:
@@ -52,7 +52,7 @@ def test_result_at_a_requested_point_is_its_row() -> None:
     assert force_at(2, rows) == 3.7
     assert force_at(3, rows) == 4.4
     assert force_at(4, rows) is None
-    assert parse_scalar("force@end").of({}, rows) == 4.4
+    assert parse_scalar("force@end").value_in({}, rows) == 4.4
 
 
 def test_a_frequency_is_no_column() -> None:
@@ -86,21 +86,21 @@ def test_result_is_the_first_on_the_way() -> None:
     rows = path(("force", 0.0, 0.0), ("force", 2.0, 2.0), ("force", 1.0, 3.0))
     assert force_at(1.5, rows) == 1.5
     aside = [{**rows[2], "branch": "1"}, {**rows[2], "mode": "antisymmetric"}]
-    assert parse_scalar("force@end").of({}, [*rows[:2], *aside]) == 2.0
+    assert parse_scalar("force@end").value_in({}, [*rows[:2], *aside]) == 2.0
 
 
 def test_results_of_the_summary() -> None:
     points = [{"amplitude": "pressure", "value": 0.3}, {"amplitude": "lambda_m", "value": -0.0034}]
     told = {"knockdown": 0.3, "limit_points": points}
-    assert Scalar("knockdown").of(told, []) == 0.3
-    assert Scalar("critical_field").of(told, []) == -0.0034
-    assert Scalar("critical_field").of({"limit_points": points[:1]}, []) is None
+    assert Scalar("knockdown").value_in(told, []) == 0.3
+    assert Scalar("critical_field").value_in(told, []) == -0.0034
+    assert Scalar("critical_field").value_in({"limit_points": points[:1]}, []) is None
     earlier = {"snaps": [{"time": 2.0, "overshoot": 0.0}]}  # of an earlier version
     of_snaps = [
-        Scalar(name).of(earlier, []) for name in ("snap_time", "snap_departure", "snap_jump")
+        Scalar(name).value_in(earlier, []) for name in ("snap_time", "snap_departure", "snap_jump")
     ]
     assert of_snaps == [2.0, None, None]
-    assert Scalar("snap_jump").of({"snaps": []}, []) is None
+    assert Scalar("snap_jump").value_in({"snaps": []}, []) is None
 
 
 @pytest.mark.parametrize(

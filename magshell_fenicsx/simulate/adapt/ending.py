@@ -50,7 +50,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         shell in `source`, or one of several shells has no chart.
     """
     fields, comm, x, values = (
-        CellFields.of(source),
+        CellFields.of_scene(source),
         target.comm,
         _chart(target),
         values_of_all_cells(source, u),
@@ -84,7 +84,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, of several shells in that of each."""
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart; of several shells in that of each."""
     return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 
@@ -114,7 +114,7 @@ class CellFields:
         self._near = scipy.spatial.cKDTree(self.centres)
 
     @classmethod
-    def of(cls, scene: Scene) -> "CellFields":
+    def of_scene(cls, scene: Scene) -> "CellFields":
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
@@ -139,7 +139,9 @@ class CellFields:
         return np.asarray(self._corners.mean(axis=1))
 
     def evaluate(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
-        """The values (n, components) of a `values_of_all_cells` field at positions found by `places`."""
+        """Values (n, components) of a field of `values_of_all_cells` at positions found by
+        `places`.
+        """
         return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
 
     def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -200,7 +202,7 @@ class CellFields:
         return xi, distances
 
     def table(self, derivatives: int, xi: Array) -> Array:
-        """Shape functions and derivatives (derivative, n, nodes) at points of the reference cell."""
+        """Shape functions and derivatives (derivative, n, nodes) at points of a reference cell."""
         return np.asarray(self._element.tabulate(derivatives, xi)[..., 0])
 
     @property
@@ -223,7 +225,7 @@ def _solve(matrices: Array, right: Array) -> Array:
 
 
 class NoResult(RuntimeError):
-    """A run has no scalar result that could be compared between meshes; the message has the reason."""
+    """A run has no scalar result to compare between meshes; the message has the reason."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def indicators(
     Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and shares (n,).
     """
     (scene, low), (richer, high) = coarse_solution, fine_solution
-    cells, comm = CellFields.of(richer), richer.newton.system.comm
+    cells, comm = CellFields.of_scene(richer), richer.newton.system.comm
     u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
     scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no scale
     energy = _TangentEnergy(richer, cells, high.state.u)
@@ -370,8 +370,8 @@ def estimated(low: float, high: float) -> float:
 def _remeshed(
     choice: Choice, coarse_solution: Solved, fine_solution: Solved, reduction: float
 ) -> Choice | None:
-    """The same degree on another mesh, with the error times `reduction`; None if no other mesh is
-    possible.
+    """Return the choice of another mesh of the same degree, with the error times `reduction`; None
+    if there is no other mesh.
     """
     scene, degree = coarse_solution[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy

@@ -118,7 +118,8 @@ class EnergyDirection:
 
 @dataclass(frozen=True)
 class Adjoint:
-    """What contracts the derivatives of a result: dJ/dp is J_p and the sum over the places.
+    """Adjoint of a result J: dJ/dp is J_p plus the contracted derivatives of the equations at all
+    places.
 
     Attributes
     ----------
@@ -169,7 +170,7 @@ class Adjoint:
 
     @property
     def size(self) -> float:
-        """What one of J is in its unit."""
+        """Size of the unit of J, in J's own numbers."""
         return self.scene.sizes.by_unit[self.scale] if self.scale else 1.0
 
     @property
@@ -512,7 +513,7 @@ def solved(
 
 
 def mixed(scene: Scene, state: State, functional: Functional, name: str) -> float:
-    """What the potentials and the reaction in J change by with an amplitude."""
+    """Return the derivative of the potentials and the reaction in J by an amplitude."""
     system = scene.model.system
     changes = sum(
         c * system.curvature(state.u, state.mu, i, name) for i, c in functional.potentials.items()

@@ -185,7 +185,7 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
 
 
 def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> list[WeightedTerm]:
-    """What the terms give at a place."""
+    """Return the terms that contribute at a place, with their weights."""
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
     of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
@@ -214,7 +214,9 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
 def _known_gradient(
     term: FieldDifferentiable, place: AdjointState, w: fem.Function, name: str
 ) -> tuple[fem.Function, Array] | None:
-    """What a term gives that knows its derivatives by a field itself."""
+    """Return the contribution of a term that provides its own derivatives by a field; None without
+    one.
+    """
     mu = factor_of(term.amplitude, place.state.mu)
     return term.by_field(
         name, w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu
@@ -222,7 +224,7 @@ def _known_gradient(
 
 
 def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
-    """The same in another scene on the same mesh."""
+    """Transfer an adjoint to another scene on the same mesh."""
     mu = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
     places = []
     for place in adjoint.places:
@@ -263,7 +265,7 @@ def _as_form(scene: Scene, slope: Slope) -> FormTerm:
 def _of_starts(
     scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function
 ) -> Array:
-    """By the thickness at the places where bodies start from the shell's face, which lifts them;
+    """Derivative by the thickness where bodies start from the shell's face, which lifts them;
     collective.
 
     To lift a body is to lower the whole shell for this body alone.
@@ -389,7 +391,7 @@ def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
 
 
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """By a factor of the vector at each place."""
+    """Derivative by a factor of the vector at each place."""
     Q = f.function_space
     vectors = f.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[: len(forces)]]
     return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
@@ -398,8 +400,8 @@ def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normal
 def _curvatures(
     scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array
 ) -> Array:
-    """By kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from those by the
-    tensor in space.
+    """Derivative by kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from that by
+    the tensor in space.
     """
     natural = scene.problem.loads.natural
     assert natural
@@ -407,7 +409,7 @@ def _curvatures(
 
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """By w0, from those by the place."""
+    """Derivative by the deviation w0, from that by the place."""
     return np.asarray(np.sum(forces * normals[..., scene.model.axes], axis=-1, keepdims=True))
 
 

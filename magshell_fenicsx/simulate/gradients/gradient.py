@@ -53,7 +53,8 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
 
 
 def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
-    """By a central difference of the contracted equations, on the same mesh: nothing is solved.
+    """Derivative by a number of the case: a central difference of the contracted equations on the
+    same mesh, without a solve.
 
     `others` keeps the scenes with other values of this number, for further results of the same
     scene.
@@ -174,7 +175,7 @@ def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) 
 
 
 def _own_value(other: Scene, place: AdjointState, state: State) -> float:
-    """What J itself contains of a place."""
+    """Return the part of J that depends on a place directly, through potentials and energy."""
     system = other.model.system
     value = sum(
         c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items()

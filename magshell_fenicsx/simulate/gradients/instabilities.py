@@ -32,7 +32,7 @@ class LostResult(RuntimeError):
 
 
 def located(records: Sequence[Record], amplitude: str) -> list[Record]:
-    """Where the path loses its stability in an amplitude."""
+    """Return the records at which the path loses its stability under growth of an amplitude."""
     in_amplitude = [r for r in records if r.amplitude == amplitude and not r.branch]
     return [
         r
@@ -42,7 +42,7 @@ def located(records: Sequence[Record], amplitude: str) -> list[Record]:
 
 
 def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
-    """Those up to the first bifurcation at which a step leaves the path."""
+    """Return the records up to the first bifurcation at which a step leaves the path."""
     before_branch, steps = list[Record](), scene.problem.programme
     for record in records:
         before_branch.append(record)
@@ -52,12 +52,12 @@ def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
 
 
 def load(record: Record, amplitude: str) -> float:
-    """Its size."""
+    """Return the absolute value of an amplitude at a record."""
     return abs(record.point.state.mu[amplitude])
 
 
 def refuse_unitless(scene: Scene, result: str) -> None:
-    """See that a case has the units of one of `FOLDS`.
+    """Check that a case has the units of a result of `FOLDS`.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def refuse_unitless(scene: Scene, result: str) -> None:
 
 
 def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
-    """See that a result is not of a point which moves along the path with what varies.
+    """Check that a result is not read at a point that moves along the path when parameters vary.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
 
 
 def as_asked(adjoint: Adjoint, result: object) -> Adjoint:
-    """With the unit of the result."""
+    """Return the adjoint with the unit of the requested result."""
     if result not in SCALES:
         return adjoint
     refuse_unitless(adjoint.scene, str(result))

@@ -1,5 +1,5 @@
-"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a
-history.
+"""Results that can be differentiated, by name: columns, shapes, vibrations and barriers at the end
+of a history.
 
 Before anything is built names alone say what a problem will have.
 """
@@ -46,7 +46,7 @@ BARRIER = "barrier"
 
 
 def refuse_no_barrier(problem: Problem) -> None:
-    """See that a case ends where a probing force is zero again.
+    """Check that a case ends where a probing force is zero again.
 
     Raises
     ------
@@ -124,7 +124,8 @@ def adjoint_of_barrier(
 def refuse_no_result(
     scene: Scene, results: Iterable[str], key: str, *, extra_results: Sequence[str] = ()
 ) -> None:
-    """See before a history that the results at a key have gradients; `extra_results` are allowed there too.
+    """Check, before a history is computed, that the results at a key have gradients;
+    `extra_results` are allowed too.
 
     Raises
     ------
@@ -184,7 +185,9 @@ def vibration_at_end(scene: Scene, history: History, result: str) -> float | Non
 
 
 class NamesOnlyScene(Scene):
-    """A scene as far as names go."""
+    """A stand-in for a scene without mesh and model, which knows the names of amplitudes and
+    results.
+    """
 
     def __init__(self, problem: Problem) -> None:
         loads = problem.loads
@@ -219,13 +222,12 @@ class NamesOnlyScene(Scene):
         return State(np.zeros(0), dict.fromkeys(names, 0.0))
 
     def conjugate_unit(self, name: str) -> float:
-        """Of nothing that is built."""
+        """Return 1: without a model there is no unit."""
         return 1.0
 
 
 def refuse_unknown_results(problem: Problem, designed: Mapping[str, str]) -> None:
-    """See that the results and parameters of gradients, and the results of a design, are there, by
-    the names alone.
+    """Check by name that results and parameters of gradients, and results of a design, exist.
 
     Parameters
     ----------

@@ -35,7 +35,9 @@ STEP = 1e-4  # of h: of a node
 def of_measures(
     model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
 ) -> list[WeightedTerm]:
-    """What terms add that have been divided by an integral over what they act on; collective."""
+    """Return the terms that come from the derivative of an integral by which other terms are
+    divided; collective.
+    """
     added, comm, v = list[WeightedTerm](), model.V.mesh.comm, fem.Function(model.V)
     for share in shares:
         if share.term.over is None:
@@ -116,8 +118,8 @@ def fields_of_placement(terms: Sequence[FormTerm]) -> list[OfPlacement]:
 
 
 def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array) -> Iterator[Array]:
-    """What a field (own cells, nodes, size) changes by as each node of all cells moves along its
-    normal; collective.
+    """Derivative of a field (own cells, nodes, size) by a motion of each node of all cells along
+    its normal; collective.
 
     `normals` (own cells, nodes, 3) are those of own cells.
     """

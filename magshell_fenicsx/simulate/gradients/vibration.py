@@ -77,14 +77,14 @@ class Vibration:
 
     @property
     def kind(self) -> str:
-        """In words."""
+        """Name of the mode, or of the group of equal frequencies, in words."""
         if len(self.modes) > 1:
             return f"mean of the modes {', '.join(map(str, self.numbers))}, whose frequencies are equal"
         return self.modes[0].label
 
 
 def refuse_no_vibration(problem: Problem, result: str) -> None:
-    """See that a case has a frequency in hertz.
+    """Check that a case has a frequency in hertz.
 
     Raises
     ------
