@@ -373,9 +373,8 @@ def _followed(
     def take(label: Label, locus: BoundaryPoint, mode: Boundary) -> None:
         row = _row(family, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
-        part = max(
-            (row_of_curve["key"] - value) / (end - value) for row_of_curve in rows
-        )  # of the way, which may turn back
+        # of the way, which may turn back
+        part = max((row_of_curve["key"] - value) / (end - value) for row_of_curve in rows)
         remaining = (
             remaining_time_text((time.perf_counter() - start_time) * (1 / part - 1))
             if part > 0

@@ -24,10 +24,8 @@ LEGEND: Mapping[str, Any] = {
     "loc": "upper left",
     "bbox_to_anchor": (1.0, 1.0),
 }
-NARROW, LOW = (
-    0.25,
-    0.08,
-)  # of the width of the picture: a region that has no place for more than its mode, or for that
+# of the width of the picture: a region that has no place for more than its mode, or for that
+NARROW, LOW = 0.25, 0.08
 Row = Mapping[str, Any]
 
 

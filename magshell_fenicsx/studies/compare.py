@@ -27,10 +27,11 @@ from magshell_fenicsx.studies.study_report import estimated_error
 Errors = Mapping[str, Sequence[tuple[float, float]]]
 ModelName = Literal["shell", "solid"]
 MODELS: tuple[ModelName, ...] = ("shell", "solid")
+# settings of a model alone
 WITHOUT: dict[ModelName, list[str]] = {
     "shell": ["solid=null"],
     "solid": [],
-}  # settings of a model alone
+}
 UNCOMPARED = ("angle", "time")  # amplitudes over which curves are not compared
 FOLDER = Folder(
     "a comparison",
@@ -185,9 +186,8 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     stretches the thickness. The displacement since the end of the field excludes this.
     """
     load_name = amplitude_of(run)
-    x = (
-        "w_point_over_h" if load_name == "force" else "w_pole_over_h"
-    )  # the same point in both models
+    # the same point in both models
+    x = "w_point_over_h" if load_name == "force" else "w_pole_over_h"
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == load_name)
     row_before = run.rows[max(first - 1, 0)]
     part = [

@@ -376,9 +376,8 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
         settings = [f"mesh.refinement={case.mesh.refinement * goal.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"
-    result = run(
-        case.problem(), search.folder / "verified", comm, overwrite=True
-    )  # the folder is the design's
+    # the folder is the design's
+    result = run(case.problem(), search.folder / "verified", comm, overwrite=True)
     values = {name: _value(result, name) for name in goal.results if name not in goal.targets}
     extra_results = dict[str, float]()
     for target in goal.targets.values():

@@ -140,10 +140,8 @@ def _draw_history(
         values = np.array(
             [np.nan if row[result] is None else row[result] for row in rows], dtype=float
         )
-        colour, line_width = (
-            f"C{i}",
-            1.6 + 1.6 * (len(results) - 1 - i),
-        )  # lines that lie on each other are all seen
+        # lines that lie on each other are all seen
+        colour, line_width = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         until = np.append(number[best], number[-1:] if best.any() else [])
         best_values = np.append(values[best], values[best][-1:])

@@ -126,10 +126,8 @@ def _with_part_of_curvature(points: Array, part: float) -> Array:
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    directions, rotation = (
-        [tangents[0]],
-        np.eye(3),
-    )  # from the frame of the curve to that of the bent one
+    # from the frame of the curve to that of the bent one
+    directions, rotation = [tangents[0]], np.eye(3)
     for tangent, next_tangent in itertools.pairwise(tangents):
         turn = np.cross(tangent, next_tangent)
         angle = np.arctan2(np.linalg.norm(turn), tangent @ next_tangent)

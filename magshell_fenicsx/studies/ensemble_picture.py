@@ -38,9 +38,8 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
         correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None
     )
     weibull = fit(values) if len(values) else None
-    with_density = (
-        weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
-    )  # marks alone have none
+    # marks alone have none
+    with_density = weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
     panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
     *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]

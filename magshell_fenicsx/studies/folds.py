@@ -265,9 +265,8 @@ def _apart_from_strength(case: Case) -> str:
     """
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
-        has_both = (
-            magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
-        )  # then their ratio counts
+        # then their ratio counts
+        has_both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
         magnetic.pop("lambda_m", None)
         if magnetic["remanent"] and not has_both:
             magnetic["remanent"].pop("flux_density", None)

@@ -34,10 +34,8 @@ from magshell_fenicsx.studies.runner import Case
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*([\w.]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 MOST_READINGS = 10_000
-SHAPE, MOVED = (
-    ("x", "y", "z"),
-    ("ux", "uy", "uz"),
-)  # columns of a shape: places, and what they are displaced by
+# columns of a shape: places, and what they are displaced by
+SHAPE, MOVED = ("x", "y", "z"), ("ux", "uy", "uz")
 OF_POINTS = "measured_"  # names of these places in the case
 
 
@@ -224,7 +222,9 @@ class ResultNames:
         """
         number, unit = number_and_unit(str(amount))
         _, case_unit, factor = (
-            self.result_of(result, None, location) if not unit else self._of_unit(result, unit, location)
+            self.result_of(result, None, location)
+            if not unit
+            else self._of_unit(result, unit, location)
         )
         if case_unit and not unit and float(number):
             raise CaseError(

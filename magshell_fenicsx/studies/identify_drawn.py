@@ -22,9 +22,8 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
     spread, axes = np.linalg.eigh(posterior.correlation)
     spread = np.maximum(spread, 0.0)
     rng = np.random.default_rng(0)
-    stratified = [
-        (rng.permutation(count) + 0.5) / count for _ in size
-    ]  # Latin hypercube: each axis has its quantiles
+    # Latin hypercube: each axis has its quantiles
+    stratified = [(rng.permutation(count) + 0.5) / count for _ in size]
     normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
     wider = (
         posterior.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0))

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.studies.smooth import Smooth
 
 Array = NDArray[np.float64]
-Model = Callable[
-    [Array], tuple[Array, Array] | None
-]  # x (p,) -> y (n,) and J (n, p); None where there is none
+# x (p,) -> y (n,) and J (n, p); None where there is none
+Model = Callable[[Array], tuple[Array, Array] | None]
 
 CONVERGED = 1e-3  # a step below this part of a standard deviation is the last one
 HALVINGS = 10
@@ -37,11 +36,8 @@ MIN_FREEDOM = 1.0  # degree of freedom
 MIN_NOISE_FREEDOM = 0.5  # of a degree: with less, data do not say their noise
 MIN_RELATIVE_NOISE = 1e-12  # no estimated noise is less than this part of the data
 LOG_STRENGTH_STEP = 0.05  # differences of logarithms of strengths
-SAMPLES, WIDER, SUREST = (
-    64,
-    1.3,
-    0.5,
-)  # of their posterior, wider than a normal one, whose logarithms are sure to 1.4
+# of their posterior, wider than a normal one, whose logarithms are sure to 1.4
+SAMPLES, WIDER, SUREST = 64, 1.3, 0.5
 MOST_AXES = 8  # of the posterior, the longest ones, along which it is looked at
 NORMAL = (
     0.25  # difference of the misfit from its parabola up to which the posterior counts as normal

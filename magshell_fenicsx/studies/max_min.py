@@ -1,11 +1,10 @@
-"""The lowest of instabilities or frequencies raised as far as it goes, by all that is known of
-each.
+"""Max-min optimisation: raise the lowest of several instabilities or frequencies.
 
-Their minimum has corners where two cross, and which are the lowest changes from place to place: an
-optimiser of smooth functions leaps there, or stops. Here every value that was seen is a plane, by
-its slope where it was seen. The highest place under the planes is tried next, in a box about the
-best place so far: a bundle method with a trust region (Schramm and Zowe, SIAM J. Optim. 2, 121-152,
-1992). SciPy's linear programming finds it.
+The lowest value has a kink where two values cross, and which one is the lowest changes from point
+to point. An optimiser of smooth functions stops there. Here every value and its slope, at every
+evaluated point, define a plane. The next point is the highest one under all planes, in a box about
+the best point so far. This is a bundle method with a trust region (Schramm and Zowe, SIAM J. Optim.
+2, 121-152, 1992). SciPy's linear programming finds the point. See docs/theory.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +19,18 @@ from magshell_fenicsx.studies.design_evaluation import DesignEvaluation
 
 Array = NDArray[np.float64]
 
-FIRST_BOX_SIZE, MAX_BOX_SIZE = (
-    0.25,
-    1.0,
-)  # half the side of the box, over the half ranges of variables, or in radians
-# an old plane is at least so many squares of the distance above the best place, over its value at
-# the start
+# half the side of the box, over half the range of a variable, or in radians for angles
+FIRST_BOX_SIZE, MAX_BOX_SIZE = 0.25, 1.0
+# Values are curved, so a plane from afar may lie below them: an old plane counts as at least this
+# many squares of the distance above the best point, over the value at the start.
 CURVATURE_BOUND = 0.3
-MAX_PLANES = 60  # places whose planes count
-PENALTY_RANGE = (
-    10.0,
-    1e6,
-)  # times what a constraint is broken by counts, beside the values; as often as it must, up to this
-CONSTRAINT_TOLERANCE = 1e-9  # a constraint that is broken by less is kept
-ACCEPTED_GAIN_RATIO, GROWING_GAIN_RATIO = (
-    0.05,
-    0.7,
-)  # of the gain that was foreseen: a place is taken, the box grows
-MIN_GAIN = 1e-5  # a gain, over the value at the start
+MAX_PLANES = 60  # number of evaluated points whose planes are used
+# first and largest factor of the violation of a constraint in the height of a point
+PENALTY_RANGE = 10.0, 1e6
+CONSTRAINT_TOLERANCE = 1e-9  # a constraint with a smaller violation is satisfied
+ACCEPTED_GAIN_RATIO = 0.05  # gain over predicted gain from which a point is accepted
+GROWING_GAIN_RATIO = 0.7  # gain over predicted gain from which the box grows
+MIN_GAIN = 1e-5  # smallest predicted gain, over the value at the start
 
 
 class MaxMinGoal(Protocol):
@@ -53,8 +46,12 @@ class MaxMinGoal(Protocol):
 
 @dataclass(frozen=True)
 class _EvaluatedPoint:
-    """Values (n,) and constraints (m,) at a place, and their slopes by the variables over their
-    spans.
+    """Values (n,), constraints (m,) and their slopes at a point.
+
+    Attributes
+    ----------
+    y
+        (p,) variables over half their ranges, by which slopes (n, p) and (m, p) are derivatives.
     """
 
     y: Array
@@ -63,9 +60,9 @@ class _EvaluatedPoint:
     constraints: Array
     constraint_slopes: Array
 
-    def height(self, broken: float) -> float:
-        """The lowest value, less what a broken constraint counts, times a factor."""
-        return float(self.values.min() + broken * self.constraints.min(initial=0.0))
+    def height(self, penalty: float) -> float:
+        """The lowest value less the penalty of the largest violation of a constraint."""
+        return float(self.values.min() + penalty * self.constraints.min(initial=0.0))
 
 
 def raise_lowest(
@@ -75,24 +72,24 @@ def raise_lowest(
     first: Array,
     iterations: int,
 ) -> str:
-    """Evaluate places that raise the lowest value, each after the one before; why it ended.
+    """Raise the lowest value from point to point; return why the search ended.
 
     Parameters
     ----------
     evaluated
-        An evaluation without values is that of a lost path.
+        Evaluates variables (p,); without values if the path is lost.
     limits
-        Bounds of the variables; None: none.
+        Lower and upper bounds of the variables; None where there is none.
     first
-        Has values.
+        Variables (p,) of the first point, whose evaluation has values.
     iterations
-        The most evaluations after that of `first`.
+        Largest number of evaluations after that of `first`.
     """
     low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
 
-    def place(x: Array) -> _EvaluatedPoint | None:
+    def evaluate_point(x: Array) -> _EvaluatedPoint | None:
         evaluation = evaluated(x)
         if not evaluation.values:
             return None
@@ -103,32 +100,34 @@ def raise_lowest(
         values, slopes = goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation)
         return _EvaluatedPoint(x / span, values, slopes, constraints, constraint_slopes)
 
-    best, size, (broken, most_broken) = place(first), FIRST_BOX_SIZE, PENALTY_RANGE
+    best, size, (penalty, max_penalty) = evaluate_point(first), FIRST_BOX_SIZE, PENALTY_RANGE
     assert best
     others: list[_EvaluatedPoint] = []
     for _ in range(iterations):
         box = np.maximum(low / span - best.y, -size), np.minimum(high / span - best.y, size)
-        step, gain, violation = _predicted_step(best, others[-MAX_PLANES:], box, broken)
-        while violation > CONSTRAINT_TOLERANCE and broken < most_broken:
-            further = _predicted_step(best, others[-MAX_PLANES:], box, 10 * broken)
-            if (
-                further[2] > violation / 2
-            ):  # all is done for the constraints that can be done in the box
+        step, gain, violation = _predicted_step(best, others[-MAX_PLANES:], box, penalty)
+        while violation > CONSTRAINT_TOLERANCE and penalty < max_penalty:
+            further = _predicted_step(best, others[-MAX_PLANES:], box, 10 * penalty)
+            # a larger penalty hardly lowers the violation within the box
+            if further[2] > violation / 2:
                 break
-            broken, (step, gain, violation) = 10 * broken, further
+            penalty, (step, gain, violation) = 10 * penalty, further
         if gain < MIN_GAIN:
             box_text = f"within {size:.2g} of the variables' ranges"
-            return f"no more than {MIN_GAIN:g} of the value at the start is foreseen to be gained {box_text}"
-        tried = place(np.clip(span * (best.y + step), low, high))
-        part = (tried.height(broken) - best.height(broken)) / gain if tried else -np.inf
-        if part > ACCEPTED_GAIN_RATIO:
+            return (
+                f"no more than {MIN_GAIN:g} of the value at the start is foreseen to be gained "
+                f"{box_text}"
+            )
+        tried = evaluate_point(np.clip(span * (best.y + step), low, high))
+        gain_ratio = (tried.height(penalty) - best.height(penalty)) / gain if tried else -np.inf
+        if gain_ratio > ACCEPTED_GAIN_RATIO:
             assert tried
             best, tried = tried, best
         others += [tried] if tried else []
-        if part > GROWING_GAIN_RATIO:
+        if gain_ratio > GROWING_GAIN_RATIO:
             size = min(2 * size, MAX_BOX_SIZE)
-        elif part <= ACCEPTED_GAIN_RATIO:
-            size /= 2 if part > -1 else 4
+        elif gain_ratio <= ACCEPTED_GAIN_RATIO:
+            size /= 2 if gain_ratio > -1 else 4
     return "iteration limit reached"
 
 
@@ -136,30 +135,31 @@ def _predicted_step(
     best: _EvaluatedPoint,
     others: Sequence[_EvaluatedPoint],
     box: tuple[Array, Array],
-    broken: float,
+    penalty: float,
 ) -> tuple[Array, float, float]:
-    """The step to the highest place under all planes, see `_EvaluatedPoint.height`; the gain; what
-    constraints are broken by.
+    """Return the step to the highest point under all planes, the predicted gain of
+    `_EvaluatedPoint.height`, and the remaining violation of constraints.
     """
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         offset = best.y - other.y
-        lowest = (
-            best.values.min() + CURVATURE_BOUND * offset @ offset
-        )  # values bend: a plane from afar may be below what is known
+        lowest = best.values.min() + CURVATURE_BOUND * offset @ offset
         planes.append(np.maximum(other.values + other.slopes @ offset, lowest))
         slopes.append(other.slopes)
-    n, of_values, of_kept = len(best.y), sum(map(len, planes)), len(best.constraints)
-    below_planes = np.column_stack([-np.vstack(slopes), np.ones(of_values), np.zeros(of_values)])
+    variable_count, constraint_count = len(best.y), len(best.constraints)
+    value_count = sum(map(len, planes))
+    below_planes = np.column_stack(
+        [-np.vstack(slopes), np.ones(value_count), np.zeros(value_count)]
+    )
     constraint_rows = np.column_stack(
-        [-best.constraint_slopes, np.zeros(of_kept), -np.ones(of_kept)]
+        [-best.constraint_slopes, np.zeros(constraint_count), -np.ones(constraint_count)]
     )
-    program = (
-        scipy.optimize.linprog(  # of the step, the height and what the constraints are broken by
-            np.concatenate([np.zeros(n), [-1.0, broken]]),
-            A_ub=np.vstack([below_planes, constraint_rows]),
-            b_ub=np.concatenate([*planes, best.constraints]),
-            bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
-        )
+    # unknowns: the step, the height, and the largest violation of the constraints
+    program = scipy.optimize.linprog(
+        np.concatenate([np.zeros(variable_count), [-1.0, penalty]]),
+        A_ub=np.vstack([below_planes, constraint_rows]),
+        b_ub=np.concatenate([*planes, best.constraints]),
+        bounds=[*zip(*box, strict=True), (None, None), (0.0, None)],
     )
-    return program.x[:n], float(-program.fun - best.height(broken)), float(program.x[-1])
+    gain = float(-program.fun - best.height(penalty))
+    return program.x[:variable_count], gain, float(program.x[-1])

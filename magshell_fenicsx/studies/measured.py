@@ -50,9 +50,8 @@ class Timings:
         return median(values) if values else None
 
 
-Origin = Mapping[
-    str, str | None
-]  # the sources and the mesh file: keys of summary.json and their values
+# the sources and the mesh file: keys of summary.json and their values
+Origin = Mapping[str, str | None]
 
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:

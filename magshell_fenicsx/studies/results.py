@@ -40,7 +40,9 @@ class Scalar:
     at: str = ""
     value: float = 0.0
 
-    def value_in(self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> float | None:
+    def value_in(
+        self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]
+    ) -> float | None:
         """The number; None if the run does not have it.
 
         Parameters
@@ -127,9 +129,8 @@ def _crossing(
         None,
     )
     if i is None:
-        target_reached = bool(x) and math.isclose(
-            x[-1], value, rel_tol=1e-9
-        )  # a target is reached within the solver's tolerance
+        # a target is reached within the solver's tolerance
+        target_reached = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)
         return float(path[-1][column]) if target_reached else None
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:

@@ -356,7 +356,9 @@ class Outcome:
             "limit_points": limits,
             "snaps": self.snaps,
         }
-        return scalar.value_in(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
+        return scalar.value_in(
+            summary, [{key: str(v) for key, v in row.items()} for row in self.curve]
+        )
 
     def serves(self, scalar: Scalar) -> bool:
         """Whether it has what a number needs: of a fold alone only the knockdown is known."""

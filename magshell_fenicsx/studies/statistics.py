@@ -40,10 +40,8 @@ RESAMPLED = 300
 MIN_SAMPLES_FOR_CORRELATION = 3  # samples for a correlation
 LEAST_DIFFERENT = 8  # different values for three parameters
 SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
-GRID, ROUNDS = (
-    9,
-    9,
-)  # locations that are tried at once, and how often the grid is refined around the best
+# locations that are tried at once, and how often the grid is refined around the best
+GRID, ROUNDS = 9, 9
 SHAPES = 1.0, 1e3
 STEPS = 5  # of Newton's method, which begins close
 LEVEL = 0.95

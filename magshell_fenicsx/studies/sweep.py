@@ -56,11 +56,8 @@ from magshell_fenicsx.studies.sweep_picture import draw_sweep
 
 NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
 FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
-SYMMETRIES = (
-    "none",
-    "half",
-    "axisymmetric",
-)  # a model with an earlier symmetry covers the later ones
+# a model with an earlier symmetry covers the later ones
+SYMMETRIES = "none", "half", "axisymmetric"
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 CURVE = (
     *(
@@ -150,9 +147,8 @@ def sweep(
     points = access_disk(comm, lambda: with_earlier(folder, source, axes, requested, make_case))
     earlier_count = len(points) - len(requested)
     files = [folder / "points" / f"{point.key}.json" for point in points]
-    first = {
-        point.key: number for number, point in reversed(list(enumerate(points)))
-    }  # equal points are one
+    # equal points are one
+    first = {point.key: number for number, point in reversed(list(enumerate(points)))}
     missing = access_disk(
         comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar))
     )

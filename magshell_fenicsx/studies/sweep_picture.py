@@ -23,11 +23,8 @@ LEGEND_ROWS = 16
 STYLES = ("-", "--", ":", "-.")
 MAPPED = 3  # least different values of both axes of a map
 SMOOTH = 8  # least for contours; fewer are cells with their values
-WRITTEN, LONGEST, BRIGHT = (
-    9,
-    5,
-    0.6,
-)  # most columns and digits of written values; colours from here on are bright
+# most columns and digits of written values; colours from here on are bright
+WRITTEN, LONGEST, BRIGHT = 9, 5, 0.6
 KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E h R^2$)"
 
 
@@ -166,9 +163,8 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     else:
         levels = MaxNLocator(24, steps=[1, 2, 5, 10]).tick_values(np.nanmin(grid), np.nanmax(grid))
         filled = plot.contourf(x, y, grid, levels, cmap="viridis")
-        lines = plot.contour(
-            x, y, grid, levels[::2], colors="white", linewidths=0.8
-        )  # at steps of the colours
+        # at steps of the colours
+        lines = plot.contour(x, y, grid, levels[::2], colors="white", linewidths=0.8)
         plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
     for is_hidden, style in (
@@ -201,10 +197,16 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
         if np.isfinite(value):
             light = value - low > BRIGHT * (high - low)
             text = f"{value:.{digits}f}".replace("-", "−")
+            # fmt: skip
             plot.annotate(
-                text, (x[j], y[i]), (0, 7), textcoords="offset points", ha="center", fontsize=7,
+                text,
+                (x[j], y[i]),
+                (0, 7),
+                textcoords="offset points",
+                ha="center",
+                fontsize=7,
                 color="0.1" if light else "white",
-            )  # fmt: skip
+            )
 
 
 def _values(

@@ -160,9 +160,8 @@ class CellFields:
         cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
         xi, distances = self._in_cells(x, cells)
         enough = INSIDE_TOLERANCE
-        while len(
-            far_points := np.flatnonzero(distances > enough)
-        ):  # a large cell may have a distant centre
+        # a large cell may have a distant centre
+        while len(far_points := np.flatnonzero(distances > enough)):
             candidates = self._near.query(x[far_points], count)[1].reshape(len(far_points), count)
             for tried in candidates.T:
                 xi_tried, off = self._in_cells(x[far_points], tried)

@@ -46,22 +46,16 @@ from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 STEP = 1e-30  # along the imaginary axis: the derivative is exact
-FIRST_REFINEMENTS = (
-    0.5,
-    1.0,
-    2.0,
-)  # refinements of the first mesh, tried until the path has a result
+# refinements of the first mesh, tried until the path has a result
+FIRST_REFINEMENTS = 0.5, 1.0, 2.0
 FINER = 1.5  # factor of the refinement that is compared with
 SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
 ERROR_SHARE = 0.4  # each part of the estimated error over the tolerance
 MOST_ROUNDS = 6
 MOST_LAYERS = 9
 Say = Callable[[str], None]
-DEGREES = (
-    (3e-3, 3),
-    (2e-4, 4),
-    (0.0, 5),
-)  # the fastest degree for tolerances down to the first number
+# the fastest degree for tolerances down to the first number
+DEGREES = (3e-3, 3), (2e-4, 4), (0.0, 5)
 PATH_DEGREE = 3  # degree of the path
 SAFETY = 1.25  # factor of the estimate for the error of the finer solution
 AIM, MIN_REDUCTION = 0.55, 1 / 5  # estimated error over the tolerance
@@ -146,9 +140,8 @@ class _TangentEnergy:
         K = np.einsum("...c,...ijc->...ij", self._normal, covariant_derivative)
         E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
         slope = work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
-        bent = (
-            law.bending(self._strain, S, self._raise) for S in (K, -K)
-        )  # without what is linear, of plies
+        # without what is linear, of plies
+        bent = (law.bending(self._strain, S, self._raise) for S in (K, -K))
         density = slope / 2 + sum(bent) / 2
         return np.asarray((density * self._area) @ self._weights)
 
@@ -304,9 +297,8 @@ def rounds(
             f"{judged.dofs} unknowns: "
             f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
         )
-        least_ratio = (
-            0.0 if coarse_solution[0].problem.axisymmetric else MIN_REDUCTION * tolerance
-        )  # what is cheap is not made worse
+        # what is cheap is not made worse
+        least_ratio = 0.0 if coarse_solution[0].problem.axisymmetric else MIN_REDUCTION * tolerance
         if least_ratio <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
             break
         another = _remeshed(
@@ -392,9 +384,8 @@ def _remeshed(
     size, expected_ratio = equidistributed(
         scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
     )
-    if not _fits(
-        fine_solution[0], 2 * fine_solution[0].model.system.dofs * expected_ratio
-    ):  # twice, since this is an estimate
+    # twice, since this is an estimate
+    if not _fits(fine_solution[0], 2 * fine_solution[0].model.system.dofs * expected_ratio):
         return None
     return Choice(degree, round(choice.refinement * expected_ratio**0.5, 3), size)
 

@@ -238,9 +238,8 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})
     rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
-    value = (
-        state.mu[record.amplitude] - Q.value / rate
-    )  # what locating it has left, to second order
+    # what locating it has left, to second order
+    value = state.mu[record.amplitude] - Q.value / rate
     direction = EnergyDirection(phi, m, stiffness=float(-1 / rate))
     return Adjoint(
         scene,
@@ -355,10 +354,8 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     scene, places, left_loads = adjoint.scene, list(adjoint.places), set[str]()
     part: Adjoint | None = adjoint
     place_number = 0  # of the place at the record
-    loads, driven_amplitudes = (
-        dict[str, float](),
-        set[str](),
-    )  # dJ/dmu of loads as earlier steps have left them
+    # dJ/dmu of loads as earlier steps have left them
+    loads, driven_amplitudes = dict[str, float](), set[str]()
     while record.step:
         place, step, system = (
             part.places[0] if part else None,

@@ -47,9 +47,8 @@ if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-Projection = Callable[
-    [Scene, fem.Function, Array, Array, Array], Array
-]  # of field, forces, places, normals -> forces
+# of field, forces, places, normals -> forces
+Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]
 MASS = "mass"
 
 
@@ -194,9 +193,8 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         for t, m in of_terms
     ]
     shares += _of_parameters(scene, place, name)
-    for held_amplitude in (
-        place.rows.keys() & scene.model.load_sizes.keys() - place.follows
-    ):  # as many of its unit
+    # as many of its unit
+    for held_amplitude in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:
         share = (
             -c[held_amplitude]
             * scene.model.system.potential(place.state.u, mu, held_amplitude)

@@ -16,12 +16,13 @@ from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import leaves_path
 
+# result -> the amplitude of its fold
 FOLDS = {
     "knockdown": "pressure",
     "buckling_pressure_Pa": "pressure",
     "critical_field": "lambda_m",
     "critical_field_mT": "lambda_m",
-}  # result -> the amplitude of its fold
+}
 SCALES = {"buckling_pressure_Pa": "p_c", "critical_field_mT": "λ_m"}  # of those in units
 MAX_LOAD_RATIO = 1.15  # instabilities up to this multiple of the lowest are looked at
 MAX_INSTABILITIES = 5  # and at most so many

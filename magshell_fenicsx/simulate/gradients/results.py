@@ -110,9 +110,8 @@ def adjoint_of_barrier(
         AdjointState(state_after, zero_vector, unknown, multiplicity),
         AdjointState(state_before, zero_vector, unknown, -multiplicity),
     ]
-    adjoint_with_begins = with_begins(
-        Adjoint(scene, ends), end, begins
-    )  # loads as earlier steps have left them
+    # loads as earlier steps have left them
+    adjoint_with_begins = with_begins(Adjoint(scene, ends), end, begins)
     places = [ends[0], *earlier.places, *adjoint_with_begins.places[2:]]
     value, names = (
         barrier(scene, step, state_before, state_after),

@@ -49,10 +49,8 @@ from magshell_fenicsx.simulate.touch import between, pressed_as_at, pressing, re
 
 FIRST_FREQUENCIES = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
-MAX_DIFFERENCE_STEP, MAX_DIFFERENCE_STEP_IN_CONTACT = (
-    0.3,
-    0.003,
-)  # e phi at most, over h; where shells touch
+# e phi at most, over h; where shells touch
+MAX_DIFFERENCE_STEP, MAX_DIFFERENCE_STEP_IN_CONTACT = 0.3, 0.003
 DEGENERACY_TOLERANCE = (
     1e-4  # squared frequencies closer than this, relative, are one multiple frequency
 )
@@ -141,9 +139,8 @@ def vibrations(
             for g in groups
             if g.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
         ][:max_count]
-        if (
-            groups_near_lowest[-1].numbers[-1] < len(modes) or len(modes) < count
-        ):  # the last group is complete
+        # the last group is complete
+        if groups_near_lowest[-1].numbers[-1] < len(modes) or len(modes) < count:
             return groups_near_lowest
 
 
