@@ -121,7 +121,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _no_reminders(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Studies say no more than their lines, however slow the machine is."""
     if request.path.parent.name == "studies":
-        monkeypatch.setattr("magshell_fenicsx.studies.runner.EACH", 3600.0)
+        monkeypatch.setattr("magshell_fenicsx.studies.runner.SECONDS_BETWEEN_LINES", 3600.0)
 
 
 def hemisphere(

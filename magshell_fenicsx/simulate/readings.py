@@ -191,7 +191,7 @@ class Read:
 
     Raises
     ------
-    Lost
+    LostResult
         If the path is lost before.
     """
 
@@ -247,7 +247,7 @@ class Read:
 
         Raises
         ------
-        Lost
+        LostResult
             If it is not on the path.
         """
         scene, of = self.scene, reading.of
@@ -298,7 +298,7 @@ class Read:
         ------
         Outside
             If it does not.
-        Lost
+        LostResult
             If Newton's method fails there.
         """
         if place not in self._solved:
@@ -391,7 +391,7 @@ def read(
 
     Raises
     ------
-    Lost
+    LostResult
         If the path does not have one of them.
     CaseError
         If a result has no derivative.

@@ -78,7 +78,7 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
 
     Raises
     ------
-    Lost
+    LostResult
         If the path ends at an instability: there the amplitude alone has a gradient.
     """
     column = in_units(scene, end.point.state, result)[0] if isinstance(result, str) else ""
@@ -124,7 +124,7 @@ def instabilities(
 
     Raises
     ------
-    Lost, FoldLost
+    LostResult, FoldLost
         If there is none, or the lowest one has no gradient.
     """
     amplitude = FOLDS[result]

@@ -172,7 +172,7 @@ def vibration_at_end(scene: Scene, history: History, result: str) -> float | Non
 
     Raises
     ------
-    Lost
+    LostResult
         If it cannot be computed.
     """
     if not NAMES.fullmatch(result):

@@ -116,7 +116,7 @@ def vibrations(
 
     Raises
     ------
-    Lost
+    LostResult
         If it cannot be computed.
     """
     if seen_on(scene.model).model is not scene.model:
@@ -167,7 +167,7 @@ def frequency(problem: Problem, result: str, omega2: float) -> float:
 
     Raises
     ------
-    Lost
+    LostResult
         If the state is unstable: it does not vibrate.
     """
     if result.startswith("omega2"):
@@ -199,7 +199,7 @@ def adjoints_of_vibrations(
 
     Raises
     ------
-    Lost
+    LostResult
         If the state has no such vibration.
     CaseError
         If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave
