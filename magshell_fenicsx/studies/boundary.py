@@ -449,12 +449,14 @@ def _put_together(
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
-    sentences = [
-        f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
-        + f", {load_text(row, begin['amplitude'])}: {CHANGED if 'fold' in row['mode'] else WORDS_OF_KINDS[row['kind']]}"
-        + (f", {row['mode']}" if row["kind"] == "crossing" else "")
-        for row in special
-    ]
+
+    def sentence(row: dict[str, Any]) -> str:
+        place = f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
+        words = CHANGED if "fold" in row["mode"] else WORDS_OF_KINDS[row["kind"]]
+        modes = f", {row['mode']}" if row["kind"] == "crossing" else ""
+        return f"{place}, {load_text(row, begin['amplitude'])}: {words}{modes}"
+
+    sentences = [sentence(row) for row in special]
     stopped = [part["stopped"] for part in (down, up) if part["stopped"]]
     key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
     for end, key in zip(sorted((span.first, span.last)), key_range, strict=True):

@@ -116,7 +116,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
 
 
 def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
-    """Rows whose load is in the case's units if they have it in these, and the label of its axis."""
+    """Return rows whose load is in the case's units if they have it, and the label of its axis."""
     load_quantity = shown_quantity(amplitude(load).column, {name for row in rows for name in row})
     return [
         {**row, "load": row.get(load_quantity.name, row["load"])} for row in rows
@@ -126,7 +126,7 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
 def _plane(
     plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
 ) -> None:
-    """Lines of both keys on which there is an instability, by which load, and where there is none."""
+    """Draw lines of both keys at which an instability occurs, by load, and marks where none does."""
     load_words = set[str]()
 
     def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:

@@ -16,7 +16,10 @@ from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.varied import NoInstability, instability
 
 LOAD_TOLERANCE = 1e-3  # of a load: the run and its repetition, on another processor
-FORM = "write it as DIR:POINT, with the folder of a run and the number of a fold or bifurcation in its path.csv"
+FORM = (
+    "write it as DIR:POINT, with the folder of a run and the number of a fold or bifurcation "
+    "in its path.csv"
+)
 
 
 @dataclass(frozen=True)

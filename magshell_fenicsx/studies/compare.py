@@ -337,7 +337,10 @@ def compare(
             file, settings, model, refinement, folder / f"{model}_{refinement:g}", say
         )
         runs[model].append(model_run)
-        yield f"{model} at refinement {refinement:g}: {model_run.dofs} unknowns, {model_run.cpu_s:.1f} s CPU"
+        yield (
+            f"{model} at refinement {refinement:g}: {model_run.dofs} unknowns, "
+            f"{model_run.cpu_s:.1f} s CPU"
+        )
         if not amplitude_of(model_run):
             raise NothingLeft(
                 f"the {model} did not leave its undeformed state: {model_run.summary['stopped']}"

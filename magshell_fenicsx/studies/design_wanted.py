@@ -286,7 +286,7 @@ class DesignGoal:
         )
 
     def missed(self, evaluation: DesignEvaluation) -> str:
-        """Describe the targets and constraints that an evaluation misses; empty if it misses none."""
+        """Describe targets and constraints that an evaluation misses; empty if it misses none."""
         objective, sentences = self.section.objective, list[str]()
         if objective.value is not None and objective.reach:
             value = evaluation.values[objective.reach]

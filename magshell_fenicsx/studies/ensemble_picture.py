@@ -115,7 +115,7 @@ def _draw_function(function: Any, values: Array, without: Array, weibull: Weibul
 
 
 def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
-    """The result over a column, with Spearman's correlation and how likely one as large is by chance."""
+    """Draw the result over a column, with Spearman's correlation and its probability by chance."""
     pairs = np.array(
         [
             (row[key], row[RESULT])

@@ -320,7 +320,8 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
 
     Returns
     -------
-    It, the name of each row's place, and where these are in the file's unit; the case itself and nothing without them.
+    The case, the name of each row's place, and where these are in the file's unit; the case itself
+    and nothing without places.
 
     Raises
     ------

@@ -151,7 +151,7 @@ class Predictor:
         return next((row for row, reading in rows if reading.at == error.place), "")
 
     def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
-        """Return a case, this or another, with the parameters x; vectors of a field are in a file."""
+        """Return a case, this or another, with parameters x; vectors of a field are in a file."""
         source = source_with_numbers(
             base, [parameter.number for parameter in self.parameters], x[: len(self.parameters)]
         )

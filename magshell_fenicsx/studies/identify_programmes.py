@@ -139,7 +139,9 @@ class Programme:
             outcome = self._run(cases[key])
             keep_outcome(outcome, cases[key], _file(folder, key))
             why = f", {outcome.stopped}" if outcome.stopped else ""
-            yield f"{missing.index(key) + 1:5d}/{len(missing)}  {self.name}: {len(outcome.curve)} points{why}"
+            number = missing.index(key) + 1
+            points = f"{len(outcome.curve)} points"
+            yield f"{number:5d}/{len(missing)}  {self.name}: {points}{why}"
 
         compute(missing, computed, predictor.comm, say)
         predictor.count += len(missing)

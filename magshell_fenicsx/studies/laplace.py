@@ -408,8 +408,10 @@ class _Strength:
         return self.weighed(z)
 
     def covariance(self) -> Array:
-        """(p, p) of the posterior, over all strengths and noises as likely as they are (H. Rue, S. Martino and
-        N. Chopin, J. R. Stat. Soc. B 71, 319, 2009, section 3): by weighted samples about the best."""
+        """Covariance (p, p) of the posterior, over all strengths and noises as likely as they are:
+        by weighted samples about the best (H. Rue, S. Martino and N. Chopin, J. R. Stat. Soc. B 71,
+        319, 2009, section 3).
+        """
         _, last = self.fields_of_priors
         z, count = (
             self.z(last.deviation, last.length),

@@ -434,4 +434,5 @@ def _row(
 ) -> str:
     ends = intervals.get(key)
     value_text = "" if value is None else f"{value:.6g}"
-    return f"| {suffix}{key.replace('_', ' ')} | {value_text} | {f'{ends[0]:.5g} to {ends[1]:.5g}' if ends else ''} |"
+    interval = f"{ends[0]:.5g} to {ends[1]:.5g}" if ends else ""
+    return f"| {suffix}{key.replace('_', ' ')} | {value_text} | {interval} |"

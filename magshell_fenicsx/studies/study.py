@@ -187,7 +187,10 @@ def _write(study_result: Study, keys: Sequence[str], content: dict[str, Any], fo
     write_csv(study_result.rows, (*keys, *COLUMNS), folder / "study.csv")
     write_table(study_result.rows, keys, content, folder / "study.md")
     repeats = repeated(content["repeat"]).lower()
-    title = f"{content['result']} of {content['case']}\n{content['machine']['cpu']}, kernels compiled, {repeats}"
+    title = (
+        f"{content['result']} of {content['case']}\n"
+        f"{content['machine']['cpu']}, kernels compiled, {repeats}"
+    )
     own_error = study_result.reference.error if study_result.reference else None
     draw_study(study_result.rows, keys, title, own_error, folder / "study.png")
 

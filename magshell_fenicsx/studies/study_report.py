@@ -261,7 +261,8 @@ def write_table(
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     file.write_text(
         f"# {content['result']} of {content['case']}: error against run time\n\n"
-        f"{content['reference_said']} {repeated(content['repeat'])} on {describe_machine(content['machine'])}.\n"
+        f"{content['reference_said']} {repeated(content['repeat'])} on "
+        f"{describe_machine(content['machine'])}.\n"
         f"{LEGEND}\n![](study.png)\n\n{table}\n",
         encoding="utf-8",
     )
@@ -292,7 +293,10 @@ def reference_sentence(reference: Reference | None) -> str:
         if reference.order
         else "the last difference: no order was observed"
     )
-    return f"{value}; its own error is estimated at {reference.error:.1e}, {how}): smaller errors mean nothing."
+    return (
+        f"{value}; its own error is estimated at {reference.error:.1e}, {how}): "
+        "smaller errors mean nothing."
+    )
 
 
 def _cell(row: Row, key: str) -> str:

@@ -171,7 +171,8 @@ def sweep(
         for number, outcome in run_chain(chain, cache):
             keep_outcome(outcome, points[number].case, files[number])
             place = f"{missing.index(number) + 1:4d}/{len(missing)}"
-            yield f"{place}  {points[number].label}: {_words(outcome, scalar)}, {outcome.wall_s:.1f} s"
+            words = _words(outcome, scalar)
+            yield f"{place}  {points[number].label}: {words}, {outcome.wall_s:.1f} s"
 
     compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
     outcomes_of_points = [
@@ -225,11 +226,13 @@ def _words(outcome: Outcome, scalar: Scalar | None) -> str:
         result_text = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g}"
     elif outcome.knockdown is not None:
         pascals = outcome.in_units.get("buckling_pressure_Pa")
-        result_text = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
+        in_pascals = f", {pascals:.6g} Pa" if pascals else ""
+        result_text = f"k_d = {outcome.knockdown:.6f}{in_pascals} ({outcome.found})"
     elif outcome.barrier is not None:
         result_text = f"barrier = {outcome.barrier:.6g} E h R^2"
     elif outcome.limit:
-        result_text = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
+        limit = outcome.limit
+        result_text = f"{limit['kind']} at {limit['amplitude']} = {limit['value']:.6g}"
     return f"{result_text}, stopped early: {outcome.stopped}" if outcome.stopped else result_text
 
 
@@ -412,7 +415,7 @@ def with_earlier(
 
 
 def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
-    """Return the values of a point as text that is the same for equal numbers, whatever their unit."""
+    """Return the values of a point as text, the same for equal numbers whatever their unit."""
     pairs = zip(values, axes, strict=True)
     return tuple(f"{axis.number(value):.10g}" if axis.numbers else value for value, axis in pairs)
 

@@ -197,7 +197,6 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
         if np.isfinite(value):
             light = value - low > BRIGHT * (high - low)
             text = f"{value:.{digits}f}".replace("-", "−")
-            # fmt: skip
             plot.annotate(
                 text,
                 (x[j], y[i]),
@@ -212,7 +211,7 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
 def _values(
     plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results
 ) -> None:
-    """Draw a number of each point over the last axis with numbers; points without it are left out."""
+    """Draw a number of each point over the last numeric axis; points without it are left out."""
     axis = last_numeric_axis(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, value in zip(points, results.values, strict=True):

@@ -84,7 +84,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart; of several shells in that of each."""
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart; of several shells each in its own."""
     return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 
@@ -149,8 +149,8 @@ class CellFields:
 
         Returns
         -------
-        The cells (n,), the nearest for a point outside all cells; the positions (n, 1 or 2) in the reference cell; and
-        the distances (n,) from the cells, in cells, zero inside.
+        The cells (n,), the nearest for a point outside all cells; the positions (n, 1 or 2) in the
+        reference cell; and the distances (n,) from the cells, in cells, zero inside.
         """
         count = min(CANDIDATES, len(self.nodes))
         candidates = self._near.query(x, count)[1].reshape(len(x), count)

@@ -84,7 +84,8 @@ def indicators(
 
     Returns
     -------
-    Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and shares (n,).
+    Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and
+    shares (n,).
     """
     (scene, low), (richer, high) = coarse_solution, fine_solution
     cells, comm = CellFields.of_scene(richer), richer.newton.system.comm

@@ -10,7 +10,8 @@ its second variation, and
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 
-The equations of vibrations and of energy barriers are contracted at several displacements: `AdjointState`.
+The equations of vibrations and of energy barriers are contracted at several displacements:
+`AdjointState`.
 So are those of states under a conjugate q that a step holds: it is q = -Pi_mu of the state where
 the step began, which p changes too. So are loads that a step leaves and was not controlled by, as a
 force at a depth.

@@ -77,7 +77,8 @@ class Vibration:
     def kind(self) -> str:
         """Name of the mode, or of the group of equal frequencies, in words."""
         if len(self.modes) > 1:
-            return f"mean of the modes {', '.join(map(str, self.numbers))}, whose frequencies are equal"
+            numbers = ", ".join(map(str, self.numbers))
+            return f"mean of the modes {numbers}, whose frequencies are equal"
         return self.modes[0].label
 
 
