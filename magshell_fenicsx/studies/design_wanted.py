@@ -149,11 +149,13 @@ class DesignGoal:
     Attributes
     ----------
     results
-        That of the objective first.
+        Names of the results that are needed, that of the objective first.
     targets
-        Of the wanted shape.
+        Target of the last stage: undeformed places -> places of the desired shape.
     stages
-        Those that come before it.
+        Targets of the stages before it.
+    scale
+        Absolute values of the results at the start.
     """
 
     section: DesignSection
@@ -166,11 +168,11 @@ class DesignGoal:
         return self.section.results
 
     def begin(self, first: DesignEvaluation) -> None:
-        """Take the scales."""
+        """Scale results with their values at the start."""
         self.scale = {result: abs(value) or 1.0 for result, value in first.values.items()}
 
     def objective(self, evaluation: DesignEvaluation) -> float:
-        """Least is best."""
+        """Return the scaled objective; the least value is the best."""
         return self._objective(evaluation)[0]
 
     def slope(self, evaluation: DesignEvaluation) -> Array:
@@ -226,7 +228,7 @@ class DesignGoal:
         )
 
     def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
-        """(values, variables)."""
+        """Return the gradients (values, variables) of `lowest_values`."""
         results = self.section.objective.results
         groups = [
             _value_and_close_ones(
@@ -241,13 +243,13 @@ class DesignGoal:
         )
 
     def constraints(self, evaluation: DesignEvaluation) -> Array:
-        """Not negative where all are kept."""
+        """Return the scaled slacks of the constraints; negative where one is violated."""
         return np.array(
             [limit.slack(evaluation.values) / self._size(limit) for limit in self._limits]
         )
 
     def constraint_slopes(self, evaluation: DesignEvaluation) -> Array:
-        """(constraints, variables)."""
+        """Return the gradients (constraints, variables) of `constraints`."""
         return np.array(
             [limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits]
         )
@@ -280,7 +282,7 @@ class DesignGoal:
         return (violation if violation > CONSTRAINT_TOLERANCE else 0.0, self.objective(evaluation))
 
     def words(self, evaluation: DesignEvaluation) -> str:
-        """The results of an evaluation."""
+        """Return the results of an evaluation as text."""
         return ", ".join(
             f"{key} = {value:.6g}" for key, value in (evaluation.values | evaluation.seen).items()
         )

@@ -71,9 +71,9 @@ class Measured:
     group
         (n,) number of the column of each.
     noise
-        Of each column the standard deviation; nan where it is to be estimated.
+        Standard deviation of the noise of each column; nan where it is to be estimated.
     mean, deviation
-        (p,) of the priors; a deviation is infinite where there is none.
+        (p,) mean and standard deviation of the priors; the deviation is infinite without a prior.
     field
         The prior of a field among the parameters, whose deviations are infinite here.
     """
@@ -104,7 +104,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Posterior:
-    """The parameters that fit best.
+    """The posterior of the parameters: a Gaussian about the best fit (Laplace's approximation).
 
     Attributes
     ----------
@@ -113,14 +113,16 @@ class Posterior:
     group
         (n,) number of the column of each.
     noise, freedom
-        Of each column: standard deviation, and degrees of freedom that it is estimated from
-        (infinite if it is given).
+        Standard deviation of the noise of each column, and the degrees of freedom from which it is
+        estimated (infinite if it is given).
     covariance
-        (p, p) of the posterior.
+        (p, p) covariance of the posterior.
+    misfit
+        Sum of the squared residuals over their standard deviations, with those of the priors.
     steps
-        Of Gauss-Newton.
+        Number of Gauss-Newton steps.
     ended
-        Why it ended.
+        Reason why the iteration ended.
     known
         With the prior of a field as strong as the data have chosen it.
     """
@@ -153,7 +155,7 @@ class Posterior:
 
     @property
     def correlation(self) -> Array:
-        """(p, p)."""
+        """Correlation matrix (p, p) of the parameters."""
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
 
     def quantiles(self, slopes: Array, column: NDArray[np.int64] | None = None) -> Array:
@@ -369,7 +371,7 @@ class _Strength:
         ), noise
 
     def surprise(self, z: Array) -> float:
-        """-2 ln p(d)."""
+        """Return -2 ln p(d), with p(d) the evidence of the data for strengths z."""
         (measured, noise), (rest, A) = self.weighed(z), self._rows(z)
         assert measured.field
         Q, R = np.linalg.qr(A * self.size)
@@ -387,7 +389,7 @@ class _Strength:
         return measured.rows(self.y, self.J, self.x, noise)
 
     def best(self) -> tuple[Measured, Array]:
-        """The most likely ones."""
+        """Return data, prior and noise with the most likely strengths."""
         first, last = self.fields_of_priors
         z = min((self.z(*start) for start in last.starts(first)), key=self.surprise)
         if len(z):

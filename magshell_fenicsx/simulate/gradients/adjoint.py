@@ -63,12 +63,12 @@ class AdjointState:
     Attributes
     ----------
     w
-        At supports that of a reaction, otherwise zero there.
+        Multiplier of the residual R; at supports that of a reaction, otherwise zero there.
     rows
         c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are
         held.
     energy, potentials
-        c, and c_i of what J itself contains.
+        c, and the part of c_i that J itself contains.
     follows
         Amplitudes of the rows whose conjugates are those of a later place.
     steps
@@ -106,9 +106,9 @@ class EnergyDirection:
     wave
         m of phi, which is in the space of waves; None of a displacement.
     stiffness
-        Of the second variation Q_m(phi) of a wave.
+        Factor of the second variation Q_m(phi) of a wave.
     inertia
-        Of phi . M phi.
+        Factor of phi . M phi.
     """
 
     phi: Vector
@@ -140,8 +140,7 @@ class Adjoint:
     free
         The amplitude that J is; "" where it is given.
     scale
-        Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp;
-        "": it has none.
+        Name of the unit (`Quantity.scale`) in which `derivative` gives dJ/dp; "" without a unit.
     left
         Amplitudes that are loads as an earlier step has left them, which was not controlled by
         them.
