@@ -117,7 +117,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
             from magshell_fenicsx.simulate.gradients.results import refuse_unknown_results
 
             with _placed(read):
-                refuse_unknown_results(problem, read.design.named if read.design else {})
+                refuse_unknown_results(problem, read.design.named_results if read.design else {})
         if read.ensemble:
             from magshell_fenicsx.studies.samples import refuse_unknown_keys
 

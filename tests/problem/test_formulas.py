@@ -60,7 +60,7 @@ def test_a_natural_shape_that_is_none(natural):
 def test_unknown_results_and_parameters(section, said):
     case = Case.model_validate(CASE | section)
     with pytest.raises(CaseError, match=said):
-        refuse_unknown_results(case.problem(), case.design.named if case.design else {})
+        refuse_unknown_results(case.problem(), case.design.named_results if case.design else {})
 
 
 def test_names_of_a_problem_are_those_of_its_scene():
