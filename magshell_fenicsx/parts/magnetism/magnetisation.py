@@ -365,10 +365,10 @@ def account(context: Context, loads: Loads) -> Account:
         reason = "lambda_m is zero" if magnetic else "no magnetic section"
         return Account(words, [f"magnetic energy: {reason}"])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
-    if field.soft_magnet:
+    if field.soft:
         susceptibility, remanence_text = (
             magnetic.susceptibility,
-            "without remanence" if field.soft_magnet.alone else "beside the remanence",
+            "without remanence" if field.soft.alone else "beside the remanence",
         )
         susceptibility = (
             f"{susceptibility:g}" if isinstance(susceptibility, int | float) else susceptibility

@@ -107,7 +107,7 @@ class MagnetisedShell:
         zero = NodalDerivatives(np.zeros_like(self.r0), np.zeros_like(self.remanence))
         if not of_shape:
             return zero
-        by_thickness = np.zeros((len(self.r0), 0))
+        by_thickness: Array = np.zeros((len(self.r0), 0))
         if self.thickness_factor is not None:
             by_thickness = np.zeros_like(self.thickness_factor[1])
         return replace(zero, by_place=np.zeros_like(self.r0), by_thickness=by_thickness)

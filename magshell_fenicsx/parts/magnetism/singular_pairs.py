@@ -382,15 +382,11 @@ class SingularPairs:
         X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         cells_at_once = max(1, MAX_POINTS_AT_ONCE // len(X))
-        for part in (
-            cells[first : first + cells_at_once] for first in range(0, len(cells), cells_at_once)
-        ):
-            yield (
-                part,
-                ShellFaces(self._shape, part, include_uncharged=self._include_uncharged).at(
-                    Boxes.undivided(len(part)), ab, weights, nodal_derivatives
-                ),
-            )
+        for first in range(0, len(cells), cells_at_once):
+            part = cells[first : first + cells_at_once]
+            faces = ShellFaces(self._shape, part, include_uncharged=self._include_uncharged)
+            boxes = Boxes.undivided(len(part))
+            yield part, faces.charges_at(boxes, ab, weights, nodal_derivatives)
 
     @cached_property
     def _on_strips(self) -> list[Array]:

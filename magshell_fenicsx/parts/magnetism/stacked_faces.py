@@ -131,10 +131,8 @@ def find_free_sides(corners: Array, parts: Ints) -> list[FreeSides]:
     middles = np.stack([corners[:, [i, j]].mean(axis=1) for i, j in ENDS], axis=1).reshape(-1, 3)
     neighbours = cKDTree(middles).query(middles, 2, distance_upper_bound=SIDE_TOLERANCE)[1][:, 1]
     part_of_side = np.append(np.repeat(parts, 3), -1)
-    return [
-        tuple(map(bool, is_free))
-        for is_free in (part_of_side[neighbours] != part_of_side[:-1]).reshape(-1, 3)
-    ]  # type: ignore[misc]
+    is_free = (part_of_side[neighbours] != part_of_side[:-1]).reshape(-1, 3)
+    return [(bool(first), bool(second), bool(third)) for first, second, third in is_free]
 
 
 class StackedFaces:
