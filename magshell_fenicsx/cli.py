@@ -65,7 +65,7 @@ def _made(source: Any) -> Any:
 
 def _shared(source: Any) -> Any:
     """The same on all ranks, which share its files; collective."""
-    from magshell_fenicsx.case.opened import with_same_files
+    from magshell_fenicsx.case.case_variants import with_same_files
 
     return with_same_files(_made(source), world())
 
@@ -137,7 +137,7 @@ def run(
     ] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
-    from magshell_fenicsx.case.opened import opened
+    from magshell_fenicsx.case.case_variants import open_case
 
     folder = chosen_folder(out, case.stem)
     how: dict[str, Any] = {
@@ -147,7 +147,7 @@ def run(
         "pictures": pictures,
     }
     with exit_codes():
-        read = opened(case, world(), set_ or [])
+        read = open_case(case, world(), set_ or [])
     from magshell_fenicsx.output.report.verdict import (
         sentence_of,
     )  # what solves: a refused case does without

@@ -100,7 +100,7 @@ def view(folder: Run) -> None:
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
-    from magshell_fenicsx.case.opened import read_together, with_same_files
+    from magshell_fenicsx.case.case_variants import read_together, with_same_files
 
     with exit_codes():
         source = read_together(case, world(), set_ or [])

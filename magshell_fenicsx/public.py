@@ -10,7 +10,7 @@ from warnings import warn
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import opened, with_same_files
+from magshell_fenicsx.case.case_variants import open_case, with_same_files
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -53,7 +53,7 @@ def problem_of(
                 "terms: a problem has its energies already: give them to what makes the problem"
             )
         return given
-    case = opened(given, comm)
+    case = open_case(given, comm)
     try:
         return (case.with_terms([*case.own_terms, *terms]) if terms else case).problem()
     except (CaseError, MeshError) as e:
@@ -106,7 +106,7 @@ class Scene(SceneOfProblem):
             stacklevel=2,
         )
         assert not isinstance(self._given, Problem), "a scene of a problem has no case"
-        return opened(self._given, self.comm)
+        return open_case(self._given, self.comm)
 
 
 def follow(

@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import opened
+from magshell_fenicsx.case.case_variants import open_case
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import RowMaker
@@ -142,7 +142,7 @@ def scale(repeats: str, degree: str, refinement: str) -> tuple[Scene, Report]:
 def of_case(kind: str, case: str, settings: str, results: str) -> tuple[Scene, Report]:
     """A part of the run of a case."""
     comm = MPI.COMM_WORLD
-    scene = Scene(with_modes(opened(case, comm, json.loads(settings)).problem(), comm), comm)
+    scene = Scene(with_modes(open_case(case, comm, json.loads(settings)).problem(), comm), comm)
     report = KINDS[kind](scene, json.loads(results))
     return scene, {"jit_s": scene.model.kernels.seconds, **report}
 

@@ -20,13 +20,13 @@ from pydantic import (
 
 from magshell_fenicsx.case.loading import (
     Loading,
-    listed,
+    loads_by_key,
     programme,
-    refuse_strange,
     refuse_unfit_steps,
+    refuse_unknown_patches,
 )
-from magshell_fenicsx.case.merged import expanded, written
-from magshell_fenicsx.case.shells import Part, Several, Shells, in_words_of_shells
+from magshell_fenicsx.case.multi_shell_case import merge_shells, without_merged_keys
+from magshell_fenicsx.case.shells import MemberCase, SeveralShells, Shells, in_words_of_shells
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import (
     NOTED,
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem
 
 Waves = Annotated[int, Field(ge=1, le=200)]
-LIKE_THE_SHELL = (
+SECTIONS_WITH_SHELL_UNITS = (
     "mesh",
     "points",
     "sensors",
@@ -96,11 +96,13 @@ class Case(WithParts):
     boundary: BoundarySection
     """What is held"""
     points: dict[str, Coordinates] = Field(default_factory=dict)
-    """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
+    """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no
+    unit]"""
     shells: Shells | None = None
-    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and `magnetic.remanent`. Formulas
-    and results are over the R, h, E and density of the first. The edge or point `rim` of the shell `upper` is
-    `upper.rim` in a case and `upper_rim` in columns; the shell itself is the patch `upper`"""
+    """Name -> one of several shells, in place of `shell`, `boundary`, `points` and
+    `magnetic.remanent`. Formulas and results are over the R, h, E and density of the first. The
+    edge or point `rim` of the shell `upper` is `upper.rim` in a case and `upper_rim` in columns;
+    the shell itself is the patch `upper`"""
     magnetic: Annotated[MagneticSection, LazyValidation(MagneticSection)] | None = None
     """Remanence and applied field, which is applied before the load"""
     sensors: Sensors = Field(default_factory=dict)
@@ -112,14 +114,15 @@ class Case(WithParts):
     bodies: Bodies = Field(default_factory=dict)
     """Name -> rigid body that presses on the shell, or stands in its way"""
     contact: Pairs = Field(default=[])
-    """Pairs that may touch, half a thickness from their mid-surfaces (of rubber half the deformed one), without
-    friction: [[shell, shell]] is the shell with itself; in place of `shell` the name of one of several shells, or of a
-    patch of a mesh file; with keys {between: [shell, shell], stiffness: 1e5}"""
+    """Pairs that may touch, half a thickness from their mid-surfaces (of rubber half the deformed
+    one), without friction: [[shell, shell]] is the shell with itself; in place of `shell` the name
+    of one of several shells, or of a patch of a mesh file; with keys {between: [shell, shell],
+    stiffness: 1e5}"""
     joints: Joints = Field(default=[])
     """Edges of several shells that meet, and how they are joined"""
     loading: Loading | None = None
-    """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
-    in which the field is a step too"""
+    """The load after the field, without which the path ends with the field; or a list of steps, one
+    after the other, in which the field is a step too"""
     mesh: MeshSection = MeshSection.model_construct()
     """Elements"""
     stability: StabilitySection | None = None
@@ -137,44 +140,44 @@ class Case(WithParts):
     output: OutputSection = OutputSection.model_construct()
     """How pictures look"""
     reactions: bool | None = None
-    """Forces and moments of every support as columns of path.csv; by default where a support moves"""
+    """Forces and moments of every support as columns of path.csv; by default where a support
+    moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] | Waves = "auto"
-    """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
-    that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge, or
-    those of several such shells (axisymmetric), or for a number m the sector of 180/m degrees between two mirror
-    planes through e3, which waves cos(mφ) have, of what is closed around e3, of several such shells and of mesh
-    files; 1 is a half"""
+    """The part that is modelled: the smallest that the case allows (auto), all (none), one side of
+    a mirror plane that shape, supports, fields and load share (half), the meridian of what is
+    closed around e3 and has an edge, or those of several such shells (axisymmetric), or for a
+    number m the sector of 180/m degrees between two mirror planes through e3, which waves cos(mφ)
+    have, of what is closed around e3, of several such shells and of mesh files; 1 is a half"""
 
-    _several: Several | None = PrivateAttr(default=None)
+    _several: SeveralShells | None = PrivateAttr(default=None)
 
     @property
-    def several(self) -> Several | None:
-        """The shells of a case that has several."""
+    def several(self) -> SeveralShells | None:
+        """Shells of a case that has several; None of one shell."""
         return self._several
 
-    def with_shells(self, parts: Sequence[Part]) -> Self:
-        """The case with its several shells as these, which differ in imperfections."""
+    def with_shells(self, parts: Sequence[MemberCase]) -> Self:
+        """Return the case with other imperfections of its several shells."""
         assert self.several
-        several = Several(parts, self.several.joints, self.several.pairs)
+        several = SeveralShells(parts, self.several.joints, self.several.pairs)
         shell = self.shell.model_copy(update={"file": several.file})
         assert isinstance(shell, MeshSurface)
-        copied = self.model_copy(
-            update={"shell": shell, "shells": {part.name: part.section for part in parts}}
-        )
+        sections = {part.name: part.section for part in parts}
+        copied = self.model_copy(update={"shell": shell, "shells": sections})
         copied._several = several
         shell.files.given[shell.path] = several.assembly
         return copied
 
     @model_serializer(mode="wrap")
-    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return written(handler(self), self.shells)
+    def _plain_data(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_merged_keys(handler(self), self.shells)
 
     @model_validator(mode="wrap")
     @classmethod
     def _units_go_with_those_of_the_shell(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
-        data, several = expanded(data, info.context, cls)
+        data, several = merge_shells(data, info.context, cls)
         section = handler(data)
         if several and isinstance(section.shell, MeshSurface):
             section._several = several
@@ -182,13 +185,14 @@ class Case(WithParts):
         if isinstance(data, dict) and not section.shell.with_units:
             for key in section._with_units(data):
                 raise ValueError(
-                    f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none"
+                    f"{key}: has a unit, but the shell's lengths have none: give all of them one, "
+                    "or none"
                 )
         return section
 
     def _with_units(self, data: Mapping[str, Any]) -> Iterator[str]:
-        """The keys of its plain data that have units as lengths of the shell have."""
-        for key in LIKE_THE_SHELL:
+        """Yield the keys of plain data that have units as lengths of the shell have."""
+        for key in SECTIONS_WITH_SHELL_UNITS:
             yield from numbers_with_units(getattr(self, key), data.get(key), key)
         shell = data.get("shell")
         if isinstance(shell, Mapping):
@@ -202,13 +206,17 @@ class Case(WithParts):
         for ability in self.context.abilities:
             ability.refuse_unfit(self.context)
         for key, patches in self.patches.items():
-            refuse_strange(key, patches, self.shell, self.dimples)
+            refuse_unknown_patches(key, patches, self.shell, self.dimples)
         refuse_unfit_steps(self.context)
         return self
 
     def problem(self, smooth: Collection[str] = ()) -> "Problem":
-        """What will be computed; `smooth` are keys whose formulas are known to have no details
-        between samples.
+        """Return the problem of the case.
+
+        Parameters
+        ----------
+        smooth
+            Keys whose formulas are known to have no details between samples.
 
         Raises
         ------
@@ -221,32 +229,31 @@ class Case(WithParts):
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:
-        """Keys with values by patch -> the names of these."""
-        return {
-            key: names
-            for ability in self.context.abilities
-            for key, names in ability.patches().items()
-        }
+        """Names of patches by key, of all keys that have values by patch."""
+        patches = dict[str, Iterable[str]]()
+        for ability in self.context.abilities:
+            patches |= ability.patches()
+        return patches
 
     @model_validator(mode="after")
     def _model_fits(self) -> Self:
-        read = isinstance(self.shell, MeshSurface)
-        for key in (
-            sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}) if read else []
-        ):
-            if not self.several:
-                raise ValueError(
-                    f"mesh.{key}: not with geometry: mesh, whose elements are those of the file"
-                )
+        is_mesh_file = isinstance(self.shell, MeshSurface)
+        size_keys = sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"})
+        if size_keys and is_mesh_file and not self.several:
+            raise ValueError(
+                f"mesh.{size_keys[0]}: not with geometry: mesh, whose elements are those of the "
+                "file"
+            )
         if self.model == "shell":
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
         if isinstance(self.thickness_factor, dict | UserField):
             raise ValueError(
-                "shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body"
+                "shell.thickness_factor: of a solid a formula: a step in the thickness is no swept "
+                "body"
             )
-        self.mesh.refuse_unfit_solid(mesh_file=read)
+        self.mesh.refuse_unfit_solid(mesh_file=is_mesh_file)
         if self.symmetry not in ("auto", "none", "half"):
             raise ValueError(f"symmetry: {self.symmetry}: a solid is whole or half")
         if self.solid:
@@ -255,42 +262,42 @@ class Case(WithParts):
 
     @cached_property
     def context(self) -> Context:
-        """What its parts know of it."""
+        """Sections, units and steps of the case, as its parts need them."""
         sections = {key: getattr(self, key) for key in type(self).model_fields}
         sections["imperfections"] = self.imperfections
-        whole, solid = isinstance(self.loading, list), self.model == "solid"
-        around = Context(self.shell, self.points, sections, whole=whole, solid=solid)
-        return replace(around, steps=programme(self.loading, around))
+        is_programme, is_solid = isinstance(self.loading, list), self.model == "solid"
+        without_steps = Context(
+            self.shell, self.points, sections, whole=is_programme, solid=is_solid
+        )
+        return replace(without_steps, steps=programme(self.loading, without_steps))
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
-        """Its steps; before a single load the natural shape grows, then the field."""
+        """Steps of the case; before a single load the natural shape grows, then the field."""
         return tuple(self.context.steps)
 
     @property
     def approaches(self) -> dict[str, str]:
         """Body -> name of its approach, the amplitude."""
-        return approaches(self.bodies, list(listed(self.loading).values()))
+        return approaches(self.bodies, list(loads_by_key(self.loading).values()))
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with some sections changed, whose parts know it and not this one."""
+        """Return a copy with some sections changed, whose parts know the copy alone."""
         copied = super().model_copy(update=update, deep=deep)
         copied.__dict__.pop("context", None)
         return copied
 
     @property
     def imperfections(self) -> dict[str, ImperfectionSection]:
-        """Key of each imperfection below `shell` -> section; `defect` is one of them."""
+        """Key of each imperfection below `shell` -> its section; `defect` is one of them."""
         shell = self.shell
-        defect = (
-            shell.defect
-            if isinstance(shell, ShellSection | CapSurface | RevolutionSurface)
-            else None
-        )
-        listed = dict[str, ImperfectionSection]()
+        if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) and shell.defect:
+            return {"defect": shell.defect}
+        sections = dict[str, ImperfectionSection]()
         for i, section in enumerate(shell.imperfections):
-            listed |= {f"imperfections.{i}{key}": each for key, each in section.listed().items()}
-        return {"defect": defect} if defect else listed
+            for key, imperfection in section.listed().items():
+                sections[f"imperfections.{i}{key}"] = imperfection
+        return sections
 
     @property
     def dimples(self) -> dict[str, str]:
@@ -300,12 +307,12 @@ class Case(WithParts):
 
     @property
     def thickness_factor(self) -> str | dict[str, float] | UserField | None:
-        """What multiplies h: a formula, numbers of patches, or a function of a program."""
+        """Factor of h: a formula, numbers of patches, or a function of a program."""
         return self.shell.thickness_factor
 
     @property
     def width(self) -> float | None:
-        """Of a strip, over its length."""
+        """Width of a strip over its length; None of other shapes."""
         return self.shell.width if isinstance(self.shell, ShellSection) else None
 
     @property
@@ -315,34 +322,32 @@ class Case(WithParts):
 
     @property
     def remanent(self) -> RemanentSection | None:
-        """What is magnetised for good."""
+        """Remanence of the shell; None without."""
         return self.magnetic.remanent if self.magnetic else None
 
     @property
     def sources(self) -> Sequence[SourceSection]:
-        """Of the applied field."""
+        """Sources of the applied field."""
         return (self.magnetic.applied.sources if self.magnetic else None) or []
 
     @property
     def time_unit(self) -> float | None:
-        """See `Context.time_unit`."""
+        """Unit of time in s, see `Context.time_unit`."""
         return self.context.time_unit
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """Hashes of what is solved besides its own keys: mesh file, other files, user-defined
-        energies.
+        """Hashes of what is solved besides the case's own keys.
+
+        They are of the mesh file, other files, and user-defined energies.
         """
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        return (
-            mesh
-            | digests({key: s for key, s in self.readers.items() if s is not self.shell})
-            | self.term_digests
-        )
+        readers = {key: s for key, s in self.readers.items() if s is not self.shell}
+        return mesh | digests(readers) | self.term_digests
 
     @property
     def readers(self) -> dict[str, FileKeys]:
-        """The sections that read a file, by key; those below `shell` without that."""
+        """Sections that read a file, by key; keys below `shell` are without that."""
         sections: dict[str, object] = {
             "shell": self.shell,
             "magnetic.remanent": self.remanent,
@@ -354,6 +359,7 @@ class Case(WithParts):
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     def placed(self, message: str) -> str:
+        """Return a message with the place of its key in the file."""
         return super().placed(in_words_of_shells(message, self.origin.data))
 
     @classmethod
@@ -369,7 +375,8 @@ class Case(WithParts):
 
     @classmethod
     def from_source(cls, source: Source | Mapping[str, Any]) -> "Case":
-        """A case of a mapping like a case file, or of a `Source`, which knows its places in a file.
+        """Return the case of a mapping like a case file, or of a `Source`, which knows its places
+        in a file.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What `magshell check` prints of a case."""
+"""Description of a case, as `magshell check` prints it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,12 @@ from magshell_fenicsx.simulate.overlap import refuse_overlap
 
 
 def describe(case: Case, problem: Problem | None = None) -> str:
-    """What `magshell check` prints: dimensionless numbers, what is built, what is left out.
+    """Return the text of `magshell check`: dimensionless numbers, what is built, what is left out.
 
     Parameters
     ----------
     problem
-        That of the case, if it is made already.
+        The problem of the case, if it is made already.
 
     Raises
     ------
@@ -33,56 +33,29 @@ def describe(case: Case, problem: Problem | None = None) -> str:
         If the case cannot be built, or nothing is held.
     """
     try:
-        return _described(case, problem or make_problem(case))
+        return _description(case, problem or make_problem(case))
     except (CaseError, MeshError) as e:
         raise CaseError(case.placed(str(e))) from None
 
 
-def _described(case: Case, problem: Problem) -> str:
-    too_large = None if case.mesh.tolerance else refuse_beyond_memory(problem)
-    unsupported = all(
-        condition in ("free", "symmetry") for condition in problem.conditions.values()
-    )
-    springs_may_hold = bool(problem.loads.own)  # a run asks its tangent
-    if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
-        raise CaseError(
-            "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
-        )
-    numbers = {
-        "R/h": 1 / problem.material.h,
-        "nu": problem.material.nu,
-        "p_c/E": problem.material.classical_pressure,
-        "lambda_m": case.lambda_m,
-        "Lambda_m = lambda_m R/h": case.lambda_m / problem.material.h,
-    }
-    flat = (
-        case.context.shell.geometry in FLAT_GEOMETRIES and not problem.loads.pressure
-    )  # p_c is of spheres, and the unit of pressures
-    if flat:
-        del numbers["p_c/E"]
-    lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
-    lines += _in_units(case, without="p_c" if flat else "")
-    lines += case.several.told if case.several else []
-    lines += [line for part in case.context.abilities for line in part.numbers(case.context)]
+def _description(case: Case, problem: Problem) -> str:
+    """Return the text of `describe`."""
+    memory_warning = None if case.mesh.tolerance else refuse_beyond_memory(problem)
+    _refuse_unsupported(problem)
+    lines = _number_lines(case, problem)
     patch = None
     if case.mesh.tolerance is None:
         patch = None if problem.axisymmetric else problem.triangulated()
-        cells, unknowns = _count(problem, patch)
-        refuse_overlap(problem, cells)
-        lines.append(
-            f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"
-        )
-        if patch and not problem.body and (sliver := problem.flat_triangle(patch)):
-            lines.append(f"mesh: may be unstable: {sliver}")
-        if patch and isinstance(problem.shape, MeshFile):
-            lines += _surface(patch)
+        lines += _mesh_lines(problem, patch)
     else:
         lines.append(
-            f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}"
+            "mesh: found by the run, for a relative error of its result below "
+            f"{case.mesh.tolerance:g}"
         )
     left_out = list(problem.left_out)
-    if problem.loads.pressure and (open_at := _open(problem, patch)):
-        left_out.append(no_potential(open_at))
+    edges = _edges_without_potential(problem, patch) if problem.loads.pressure else ()
+    if edges:
+        left_out.append(no_potential(edges))
     if case.ensemble:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
     if case.design:
@@ -91,46 +64,90 @@ def _described(case: Case, problem: Problem) -> str:
         left_out.append(
             "identify: numbers that are looked for (magshell identify alone varies them)"
         )
-    left_out = left_out or ["nothing"]
-    lines += [
-        "built:",
-        *(f"  {item}" for item in problem.included),
-        "left out:",
-        *(f"  {item}" for item in left_out),
-    ]
-    missed: list[str] = []
+    lines += ["built:", *(f"  {item}" for item in problem.included)]
+    lines += ["left out:", *(f"  {item}" for item in left_out or ["nothing"])]
+    unresolved: list[str] = []
     if patch and (formulas := case_formulas(problem.context)):
-        missed = unresolved_formulas(
-            formulas,
-            cells_of_patch(patch, degree_of(problem.context)),
-            problem.azimuth,
-            problem.material.h,
-        )
-    lines += [f"warning: {said}" for said in (*problem.warnings, too_large, *missed) if said]
+        cells = cells_of_patch(patch, degree_of(problem.context))
+        unresolved = unresolved_formulas(formulas, cells, problem.azimuth, problem.material.h)
+    warnings = (*problem.warnings, memory_warning, *unresolved)
+    lines += [f"warning: {warning}" for warning in warnings if warning]
     return "\n".join(lines)
 
 
+def _refuse_unsupported(problem: Problem) -> None:
+    """Refuse a shell that nothing holds."""
+    unsupported = all(
+        condition in ("free", "symmetry") for condition in problem.conditions.values()
+    )
+    springs_may_hold = bool(problem.loads.own)  # a run asks its tangent
+    if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
+        raise CaseError(
+            "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
+        )
+
+
+def _number_lines(case: Case, problem: Problem) -> list[str]:
+    """Return the dimensionless numbers and the sizes of a case, and the numbers of its parts."""
+    material = problem.material
+    numbers = {
+        "R/h": 1 / material.h,
+        "nu": material.nu,
+        "p_c/E": material.classical_pressure,
+        "lambda_m": case.lambda_m,
+        "Lambda_m = lambda_m R/h": case.lambda_m / material.h,
+    }
+    # p_c is of spheres, and the unit of pressures
+    is_flat = case.context.shell.geometry in FLAT_GEOMETRIES and not problem.loads.pressure
+    if is_flat:
+        del numbers["p_c/E"]
+    lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    lines += _in_units(case, without="p_c" if is_flat else "")
+    if case.several:
+        lines += case.several.scale_lines
+    for part in case.context.abilities:
+        lines += part.numbers(case.context)
+    return lines
+
+
+def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
+    """Return the size of a mesh, a warning on slivers, and what a mesh file holds."""
+    cells, unknowns = _count(problem, patch)
+    refuse_overlap(problem, cells)
+    lines = [f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"]
+    if patch is None:
+        return lines
+    sliver = None if problem.body else problem.flat_triangle(patch)
+    if sliver:
+        lines.append(f"mesh: may be unstable: {sliver}")
+    if isinstance(problem.shape, MeshFile):
+        lines += _surface_lines(patch)
+    return lines
+
+
 def _in_units(case: Case, without: str) -> list[str]:
-    """The sizes of a case with units, but for one scale."""
+    """Return the sizes of a case with units, without one scale."""
     sizes = sizes_of(case.context)
-    named = {
+    words_and_units = {
         "h": ("h", "mm"),
         "p_c": ("p_c", "Pa"),
         "2πD/R": ("2 pi D/R", "N"),
         "λ_m": ("applied field", sizes.field),
     }
     factor = {"λ_m": case.lambda_m}
-    shown = {
-        scale: words for scale, words in named.items() if scale in sizes.by_unit and scale != without
+    shown_scales = {
+        scale: words
+        for scale, words in words_and_units.items()
+        if scale in sizes.by_unit and scale != without
     }
     return [
         f"{name} = {sizes.by_unit[scale] * factor.get(scale, 1.0):.6g} {unit}"
-        for scale, (name, unit) in shown.items()
+        for scale, (name, unit) in shown_scales.items()
     ]
 
 
-def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
-    """The edges at which a live pressure has no potential."""
+def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
+    """Return the edges at which a live pressure has no potential."""
     span = problem.meridian
     if span is None:
         return open_edges(
@@ -139,35 +156,40 @@ def _open(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
     return ring_openings(span.ends(), problem.conditions, problem.loads.pressed)[1]
 
 
-def _surface(patch: PatchMesh) -> list[str]:
-    """What a mesh file holds, for its author to see that it was read as it was meant."""
+def _surface_lines(patch: PatchMesh) -> list[str]:
+    """Return what a mesh file holds, so that its author sees that it was read as meant."""
     places = patch.embedding(patch.nodes)
     a, b, c = places[patch.cells[0, :3]]
     normal = np.cross(b - a, c - a)
-    extent, at, n = np.ptp(places, axis=0), (a + b + c) / 3, normal / np.linalg.norm(normal)
+    extent, place = np.ptp(places, axis=0), (a + b + c) / 3
+    unit_normal = normal / np.linalg.norm(normal)
     return [
-        f"extent over the radius: {' x '.join(f'{x:.4g}' for x in extent)}",
+        f"extent over the radius: {' x '.join(f'{size:.4g}' for size in extent)}",
         f"edges: {', '.join(patch.edges) or 'none'}; patches: {', '.join(patch.patches) or 'none'}",
-        f"outside: the normal at {_told(at)}, over the radius, is {_told(n)}",
+        f"outside: the normal at {_vector_text(place)}, over the radius, "
+        f"is {_vector_text(unit_normal)}",
     ]
 
 
-def _told(vector: NDArray[np.float64]) -> str:
+def _vector_text(vector: NDArray[np.float64]) -> str:
+    """Return a vector as text."""
     return f"({', '.join(f'{x + 0.0:.4g}' for x in np.round(vector, 9))})"
 
 
 def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
-    """Cells and unknowns of the mesh, or of the meridian."""
-    k = degree_of(problem.context)
+    """Return the numbers of cells and of unknowns of the mesh, or of the meridian."""
+    degree = degree_of(problem.context)
     if patch is None:
         assert problem.meridian
-        along = problem.meridian
-        pieces = max(len(along.shell_meridians) - sum(one == other for one, other in along.joints), 1)
-        count = len(meridian_vertices(problem)) - pieces
-        return count, 2 * (k * count + pieces)
+        chart = problem.meridian
+        joined = sum(first == second for first, second in chart.joints)
+        piece_count = max(len(chart.shell_meridians) - joined, 1)
+        count = len(meridian_vertices(problem)) - piece_count
+        return count, 2 * (degree * count + piece_count)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if problem.body:  # three hexahedra a layer above each triangle
         count = len(problem.body.layer_bounds) - 1
         return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
-    return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))
+    inner_nodes = (degree - 1) * (degree - 2) // 2
+    return len(cells), 3 * (corners + (degree - 1) * sides + inner_nodes * len(cells))

@@ -1,5 +1,6 @@
-"""The example cases, which stand beside the package in the repository and inside it where it is
-installed.
+"""The example cases.
+
+They are beside the package in the repository, and inside it where it is installed.
 """
 
 from pathlib import Path
@@ -9,26 +10,28 @@ from magshell_fenicsx.input.source import CaseError, read_source
 PACKAGE = Path(__file__).parents[1]
 INSTALLED = PACKAGE / "examples"  # made by setup.py
 CASES = (INSTALLED if INSTALLED.is_dir() else PACKAGE.parent) / "cases"
-FOR_EDITORS = (
-    "# yaml-language-server:"  # its path leads to the schema from the folder of cases alone
-)
+# begin of a line for editors: its path leads to the schema from the folder of cases alone
+EDITOR_LINE = "# yaml-language-server:"
 
 
 def examples() -> dict[str, Path]:
-    """Name -> file, the benchmarks last."""
+    """Return name -> file, the benchmarks last."""
     files = [*sorted(CASES.glob("*.yaml")), *sorted(CASES.glob("benchmarks/*.yaml"))]
     return {file.stem: file for file in files}
 
 
 def title(file: Path) -> str:
-    """What a case is of: the first line of its comment, up to a colon."""
+    """Return the title of a case: the first line of its comment, up to a colon."""
     comment = _text(file).partition("\n")[0].removeprefix("# ")
     return (comment + " ").partition(": ")[0].strip().removesuffix(".")
 
 
 def write_example(name: str, file: Path | None = None) -> list[Path]:
-    """Write an example to a file, by default NAME.yaml, and its mesh beside it; which files these
-    are.
+    """Write an example to a file, by default NAME.yaml, with the files that it names beside it.
+
+    Returns
+    -------
+    The files.
 
     Raises
     ------
@@ -40,42 +43,49 @@ def write_example(name: str, file: Path | None = None) -> list[Path]:
         raise CaseError(f"example {name}: there is no such case, only {', '.join(of_package)}")
     target = file or Path(f"{name}.yaml")
     try:
-        return _written(_contents(of_package[name], target), target)
+        return _write_files(_contents(of_package[name], target), target)
     except OSError as e:
         raise CaseError(f"{e.filename or target}: cannot be written: {e.strerror}") from None
 
 
 def _text(file: Path) -> str:
-    """A case without its line for editors."""
+    """Return the text of a case without its line for editors."""
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    return "".join(line for line in lines if not line.startswith(FOR_EDITORS))
+    return "".join(line for line in lines if not line.startswith(EDITOR_LINE))
 
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
-    """The case, and the mesh file that it names or the data of its name, which come to stand beside
-    it.
+    """Return the contents of the files of an example.
 
-    So do the cases and data that it predicts.
+    They are the case, and beside it the mesh file that it names or the data of its name. So are the
+    cases and data that it predicts.
     """
-    text, given = _text(source), read_source(source).data
-    mesh, data = (given.get("shell") or {}).get("file"), source.with_suffix(".csv")
-    if data.exists():
-        predicted = (given.get("identify") or {}).get("predict") or {}
-        named = [each[of] for each in predicted.values() for of in ("case", "data") if of in each]
-        others = {target.parent / file: _text(source.parent / file).encode() for file in named}
-        return {target: text.encode(), target.with_suffix(".csv"): data.read_bytes(), **others}
+    text, case_data = _text(source), read_source(source).data
+    mesh, data_file = (case_data.get("shell") or {}).get("file"), source.with_suffix(".csv")
+    if data_file.exists():
+        predicted = (case_data.get("identify") or {}).get("predict") or {}
+        names = list[str]()
+        for prediction in predicted.values():
+            names += [prediction[key] for key in ("case", "data") if key in prediction]
+        other_files = {target.parent / file: _text(source.parent / file).encode() for file in names}
+        return {
+            target: text.encode(),
+            target.with_suffix(".csv"): data_file.read_bytes(),
+            **other_files,
+        }
     if mesh is None:
         return {target: text.encode()}
-    beside = Path(mesh).name
+    mesh_name = Path(mesh).name
     return {
-        target: text.replace(mesh, beside).encode(),
-        target.parent / beside: (source.parent / mesh).read_bytes(),
+        target: text.replace(mesh, mesh_name).encode(),
+        target.parent / mesh_name: (source.parent / mesh).read_bytes(),
     }
 
 
-def _written(contents: dict[Path, bytes], target: Path) -> list[Path]:
-    """Write the files if none is in the way; the mesh of another copy of the case serves this one
-    too.
+def _write_files(contents: dict[Path, bytes], target: Path) -> list[Path]:
+    """Write the files if none is in the way, and return them.
+
+    The mesh of another copy of the case serves this one too.
     """
     for path, content in contents.items():
         if path.exists() and (path == target or path.read_bytes() != content):

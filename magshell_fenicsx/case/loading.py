@@ -1,6 +1,4 @@
-"""The programme of a case: its steps with their numbers and amplitudes, what all must have in
-common, and patches.
-"""
+"""The programme of a case: its steps, what all of them must have in common, and patches."""
 
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
@@ -26,19 +24,19 @@ Loading: TypeAlias = Annotated[
 ]
 
 
-def listed(loading: Any) -> dict[str, Any]:
-    """Key -> load, or its plain data: of the one load of a case or of a list of steps."""
+def loads_by_key(loading: Any) -> dict[str, Any]:
+    """Return key -> load, or its plain data: of the one load of a case or of a list of steps."""
     if isinstance(loading, Sequence):
         return {f"loading.{i}": load for i, load in enumerate(loading)}
     return {"loading": loading} if loading else {}
 
 
 def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[ProgrammeStep, ...]:
-    """The steps of a case: those of a list, or what comes before one load, and then that."""
+    """Return the steps of a case: those of a list, or what comes before one load, and then that."""
     before: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
         before = [pair for kind in FIRST for pair in STEPS[kind].before(context, loading)]
-    keyed = [*before, *listed(loading).items()]
+    keyed = [*before, *loads_by_key(loading).items()]
     loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
     for number, (key, load) in enumerate(keyed, 1):
@@ -47,14 +45,14 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
             places = places_of.setdefault(load.amplitude, [])
             if load.place not in places:
                 places.append(load.place)
-            which = places.index(load.place) + 1
-            name = load.amplitude + (f"_{which}" if which > 1 else "")
+            number_of_place = places.index(load.place) + 1
+            name = load.amplitude + (f"_{number_of_place}" if number_of_place > 1 else "")
         steps.append(ProgrammeStep(number, name, key, load))
     return tuple(steps)
 
 
 def refuse_unfit_steps(context: Context) -> None:
-    """See that each step has what it needs, a way to go, and known amplitudes to hold.
+    """Check that each step has what it needs, a way to go, and known amplitudes to hold.
 
     Raises
     ------
@@ -67,61 +65,58 @@ def refuse_unfit_steps(context: Context) -> None:
         goal = load.target or load.bound
         if step.name not in context.driven_before(step.number) and goal and goal[1] == 0:
             raise ValueError(
-                f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
-                "begins there"
+                f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the "
+                "first step of a load begins there"
             )
-        before = context.before(step.number)
-        if before and not before[-1].load.rests and not load.in_time:
-            kind = before[-1].kind
+        earlier_steps = context.before(step.number)
+        if earlier_steps and not earlier_steps[-1].load.rests and not load.in_time:
+            kind = earlier_steps[-1].kind
             raise ValueError(
-                f"{key}: begins in equilibrium: the step of kind: {kind} before it needs until: rest"
+                f"{key}: begins in equilibrium: the step of kind: {kind} before it needs "
+                "until: rest"
             )
         _refuse_unfit_hold(step, context.steps)
 
 
 def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:
-    held = {other.name: other.load for other in steps if other.load.holdable}
-    loads: dict[str, Step | None] = {"pressure": None, **held}
+    """Refuse amplitudes that a step cannot hold."""
+    loads: dict[str, Step | None] = {"pressure": None}
+    loads |= {other.name: other.load for other in steps if other.load.holdable}
     if step.load.in_time:
         loads.pop(step.name)
-    limit = step.until == "limit"
-    allowed = sorted(set(loads) - (set() if limit else {step.name}))
+    to_limit = step.until == "limit"
+    names = sorted(set(loads) - (set() if to_limit else {step.name}))
+    allowed = ", ".join(names) or "none"
     for name, how in step.load.hold.items():
         key = f"{step.key}.hold.{name}"
-        if name == step.name and not (limit and how == "conjugate"):
-            raise ValueError(
-                f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}"
-            )
+        holds_conjugate = how == "conjugate"
+        if name == step.name and not (to_limit and holds_conjugate):
+            raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
         if name == step.name and step.load.bound:
             raise ValueError(
                 f"{key}: conjugate: the way to the instability has no end: leave out the target"
             )
         if name not in loads:
-            raise ValueError(
-                f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}"
-            )
-        load = loads[name]
+            raise ValueError(f"{key}: the programme has no such amplitude; allowed: {allowed}")
         if isinstance(how, Gas) and name != "pressure":
             raise ValueError(
                 f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate"
             )
-        if how == "conjugate" and load is not None and not load.held_conjugate:
+        load = loads[name]
+        if not holds_conjugate or load is None:
+            continue
+        if not load.held_conjugate:
             raise ValueError(
                 f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
             )
-        if (
-            how == "conjugate"
-            and load is not None
-            and load.released
-            and (step.load.in_time or step.load.released_by)
-        ):
+        if load.released and (step.load.in_time or step.load.released_by):
             raise ValueError(f"{key}: conjugate: {load.released}")
 
 
-def refuse_strange(
+def refuse_unknown_patches(
     key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]
 ) -> None:
-    """See that a shell has the patches of a key; a mesh file knows its own later.
+    """Check that a shell has the patches of a key; a mesh file knows its own later.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.meeting import Meeting
-from magshell_fenicsx.case.opened import changed, perfect_case
+from magshell_fenicsx.case.case_variants import case_with_values, perfect_case
+from magshell_fenicsx.case.contact_mesh_size import ContactPlace
 from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, on_features
 from magshell_fenicsx.input.expressions import formula, formula_group
 from magshell_fenicsx.input.source import CaseError
@@ -28,7 +28,13 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
-from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS, LocalImperfection, different, leaves, spots
+from magshell_fenicsx.parts.imperfections.symmetry import (
+    MAX_RIMS,
+    LocalImperfection,
+    different,
+    leaves,
+    spots,
+)
 from magshell_fenicsx.parts.laminate import Laminated, laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.part import Modelled
@@ -76,7 +82,7 @@ def make_problem(
     met: Sequence[Array] = (),
 ) -> Problem:
     """The problem of a case, with its user-defined energies and `terms`; its half at a plane that
-    is `kept`, if given.
+    is `own_mirror`, if given.
 
     Formulas of the keys in `smooth` are known to have no details that samples do not show. Other
     shells touch it at the places `met` (3,), over R.
@@ -114,7 +120,8 @@ def make_problem(
         section.refuse_unfit_values(context, sample)
     formulas = case_formulas(context)
     narrow = [
-        None if each.spec.key in smooth else adaptive_cells(each.formulas, drawn) for each in formulas
+        None if each.spec.key in smooth else adaptive_cells(each.formulas, drawn)
+        for each in formulas
     ]
     drawn = (
         drawn.with_samples(narrow_places([leaves for leaves in narrow if leaves]))
@@ -167,7 +174,7 @@ def make_problem(
         varying, everywhere = imperfection_refinements(wide, perfect, turn, material.h)
         varying += formula_refinements(formulas, narrow, drawn, turn, material.h)
         varying = [each.finer(case.mesh.refinement) for each in varying]
-    facing = [Meeting(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
+    facing = [ContactPlace(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
     shown: list[Refined] = [*local, *touched, *facing]
     size = grading(
         context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local)
@@ -190,12 +197,13 @@ def make_problem(
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims and isinstance(beyond, Sector):
         raise CaseError(
-            f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: half"
+            f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: "
+            "half"
         )
     shape = _matched(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
     span = drawn.meridian if axisymmetric else None
     if not axisymmetric:
-        Vertices.of(case, points, drawn, size, turn).refuse_near(shape, beyond)
+        Vertices.of_case(case, points, drawn, size, turn).refuse_near(shape, beyond)
     conditions = edge_conditions(case.boundary, turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
@@ -247,7 +255,7 @@ def make_problem(
         output=case.output,
         pending_modes=_awaited(case),
         document=document_of(case),
-        remade=lambda values: make_problem(changed(case, values)),
+        remade=lambda values: make_problem(case_with_values(case, values)),
     )
     refuse_duplicate_names(problem)
     return problem
@@ -347,7 +355,10 @@ def _wrong_unit(case: Case, places: Array) -> str | None:
     if not isinstance(case.shell, MeshSurface) or 1 / FAR_FROM_ONE <= extent <= FAR_FROM_ONE:
         return None
     key = "unit" if case.shell.with_units else "radius"
-    return f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: is shell.{key} right?"
+    return (
+        f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: "
+        f"is shell.{key} right?"
+    )
 
 
 def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
@@ -366,7 +377,10 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
 
 
 def imperfect(
-    perfect: Outline, imperfections: Mapping[str, ImperfectionGeometry], turn: float, still: Collection[str]
+    perfect: Outline,
+    imperfections: Mapping[str, ImperfectionGeometry],
+    turn: float,
+    still: Collection[str],
 ) -> Outline:
     """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have
     their cells.
@@ -394,12 +408,14 @@ def _matched(
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
-        lines = line_coordinates(np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius))
+        lines = line_coordinates(
+            np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius)
+        )
         return replace(shape, circles=tuple(lines), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
-def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
+def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     """A plane in which the mid-surface with its thickness, plies and imperfections is its own
     image, with the edges that are lost; else None.
 
@@ -417,7 +433,9 @@ def kept(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     ]
     vectors = [unit(v) for part in parts for v in part.vectors]
     planes = (
-        [plane] if perfect.round and plane.through_e3 else perfect.mirrors(plane.in_plane_vectors, loosely)
+        [plane]
+        if perfect.round and plane.through_e3
+        else perfect.mirrors(plane.in_plane_vectors, loosely)
     )
     for one in planes:
         along = all(abs(one.normal @ v) < ROUNDING for v in vectors)
@@ -441,7 +459,9 @@ def towards_tip(size: Grading, sector: Sector) -> Grading:
     return replace(size, features=[*size.features, tip])
 
 
-def _symmetry(case: Case, drawn: Outline, parts: list[SymmetryConstraint]) -> tuple[bool, Mirror | None]:
+def _symmetry(
+    case: Case, drawn: Outline, parts: list[SymmetryConstraint]
+) -> tuple[bool, Mirror | None]:
     """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
     reason = why_not_axisymmetric(parts)
     if reason and case.symmetry == "axisymmetric":

@@ -19,17 +19,11 @@ from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import AMPLITUDES, IN_TIME, OF_EVERY_RUN, QUANTITIES
 
-_NOISE = {
-    "title",
-    "discriminator",
-    "gt",
-    "ge",
-    "lt",
-    "le",
-}  # the last are bounds of quantities, which are text
+# keys of pydantic that editors do not need; the last four are bounds of quantities, which are text
+_NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}
 Schema = dict[str, Any]
-WHOLE = "The whole case"
-TAGS = ("geometry", "kind")
+TITLE_OF_CASE = "The whole case"
+TAG_KEYS = ("geometry", "kind")
 HEAD = """\
 # The case file
 
@@ -68,7 +62,7 @@ The column `amplitude` names the amplitude that varied:
 
 
 class _WithMeanings(GenerateJsonSchema):
-    """Gives keys their docstrings, and sections the full names of their classes as titles."""
+    """Generator of a schema whose keys have their docstrings, and sections their class names."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
         schema_of_model = super().model_schema(schema)
@@ -85,57 +79,74 @@ class _WithMeanings(GenerateJsonSchema):
 
 
 def schema() -> dict[str, Any]:
-    """What a case file may hold, key by key; rules between keys are `Case`'s alone."""
+    """Return the schema of a case file, key by key; rules between keys are `Case`'s alone."""
     head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "magshell_fenicsx case"}
-    whole = _without_noise(_apart(Case.model_json_schema(schema_generator=_WithMeanings)))
-    whole["properties"] = dict(
-        sorted(whole["properties"].items(), key=lambda item: item[0] in PARTS)
-    )  # parts come last
-    whole["anyOf"] = [{"required": whole.pop("required")}, {"required": ["shells"]}]
-    return {**head, **whole}
+    of_case = _without_noise(
+        _with_definitions(Case.model_json_schema(schema_generator=_WithMeanings))
+    )
+    # parts come last
+    properties = sorted(of_case["properties"].items(), key=lambda item: item[0] in PARTS)
+    of_case["properties"] = dict(properties)
+    of_case["anyOf"] = [{"required": of_case.pop("required")}, {"required": ["shells"]}]
+    return {**head, **of_case}
 
 
 def schema_text() -> str:
+    """Return the content of docs/case.schema.json."""
     return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"
 
 
-def _apart(whole: Schema) -> Schema:
-    """With every section as a definition: pydantic 2.14 writes some in full where they stand."""
+def _with_definitions(schema_of_case: Schema) -> Schema:
+    """Return a schema with every section as a definition.
+
+    pydantic 2.14 writes some in full where they are used.
+    """
     titles = {
         f"#/$defs/{name}": section["title"]
-        for name, section in whole["$defs"].items()
+        for name, section in schema_of_case["$defs"].items()
         if "title" in section
     }
     sections: dict[str, Schema] = {}
 
-    def named(part: Any) -> Any:
+    def referring(part: Any) -> Any:
         if isinstance(part, list):
-            return [named(each) for each in part]
+            return [referring(item) for item in part]
         if not isinstance(part, dict):
             return part
         inner = {
-            key: value if key in ("default", "$defs") else named(value)
+            key: value if key in ("default", "$defs") else referring(value)
             for key, value in part.items()
         }
         if "$ref" in part:
             inner["$ref"] = titles.get(part["$ref"], part["$ref"])
-        if "properties" not in part or part is whole or not isinstance(part.get("title"), str):
+        if (
+            "properties" not in part
+            or part is schema_of_case
+            or not isinstance(part.get("title"), str)
+        ):
             return inner
         sections[part["title"]] = inner
         return {"$ref": part["title"]}
 
-    with_names = named(whole)
-    lifted = {name: named(section) for name, section in whole["$defs"].items()}
-    others = {name: section for name, section in lifted.items() if f"#/$defs/{name}" not in titles}
-    short = Counter(title.rsplit(".", 1)[-1] for title in sections)
-    names = {
-        title: last if short[last := title.rsplit(".", 1)[-1]] == 1 else title.replace(".", "__")
-        for title in sections
+    with_names = referring(schema_of_case)
+    definitions_of_case = {
+        name: referring(section) for name, section in schema_of_case["$defs"].items()
     }
+    others = {
+        name: section
+        for name, section in definitions_of_case.items()
+        if f"#/$defs/{name}" not in titles
+    }
+    counts = Counter(title.rsplit(".", 1)[-1] for title in sections)
+    names = {}
+    for title in sections:
+        class_name = title.rsplit(".", 1)[-1]
+        is_unique = counts[class_name] == 1
+        names[title] = class_name if is_unique else title.replace(".", "__")
 
     def shortened(part: Any) -> Any:
         if isinstance(part, list):
-            return [shortened(each) for each in part]
+            return [shortened(item) for item in part]
         if not isinstance(part, dict):
             return part
         return {
@@ -148,58 +159,61 @@ def _apart(whole: Schema) -> Schema:
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
-    """Without what pydantic adds and JSON Schema does not know; `names`: keys are those of the
-    case, not its words.
+    """Return a schema without what pydantic adds and JSON Schema does not know.
+
+    `names` is whether the keys are those of the case, and none of the schema.
     """
     if isinstance(part, list):
         return [_without_noise(item) for item in part]
     if not isinstance(part, dict):
         return part
-    kept = part if names else {key: value for key, value in part.items() if key not in _NOISE}
-    return {
-        key: value
-        if key == "default"
-        else _without_noise(value, names=key in ("properties", "$defs"))
-        for key, value in kept.items()
-    }
+    content = part if names else {key: value for key, value in part.items() if key not in _NOISE}
+    cleaned = {}
+    for key, value in content.items():
+        has_names = key in ("properties", "$defs")
+        cleaned[key] = value if key == "default" else _without_noise(value, names=has_names)
+    return cleaned
 
 
 def reference() -> str:
-    """The whole page."""
-    whole = schema()
-    sections = whole["$defs"]
+    """Return the content of docs/case.md."""
+    of_case = schema()
+    sections = of_case["$defs"]
     titles = {
-        name: _title(paths, sections[name]) for name, paths in _places(whole, sections).items()
+        name: _title(paths, sections[name]) for name, paths in _places(of_case, sections).items()
     }
-    parts = [HEAD, _section(WHOLE, whole, titles)]
+    parts = [HEAD, _section(TITLE_OF_CASE, of_case, titles)]
     parts += [_section(title, sections[name], titles) for name, title in titles.items()]
     return "\n".join([*parts, columns_page()])
 
 
-def _places(whole: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
-    """Section -> the keys that it stands under, in the order of the file."""
+def _places(of_case: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
+    """Return section -> the keys under which it is, in the order of the file."""
     places: dict[str, list[str]] = {}
 
     def visit(part: Schema, path: str) -> None:
-        named = {"NAME": part["additionalProperties"]} if part.get("additionalProperties") else {}
-        for key, value in (part["properties"] | named).items():
+        any_name = (
+            {"NAME": part["additionalProperties"]} if part.get("additionalProperties") else {}
+        )
+        for key, value in (part["properties"] | any_name).items():
             for name in _references(value):
                 full_key = f"{path}{key}"
                 if full_key not in places.setdefault(name, []):
                     places[name].append(full_key)
                     visit(sections[name], f"{full_key}.")
 
-    visit(whole, "")
+    visit(of_case, "")
     return places
 
 
 def _references(part: Any) -> Iterator[str]:
-    """Names of the sections in a part of the schema."""
-    for key, value in (
-        part.items()
-        if isinstance(part, dict)
-        else enumerate(part if isinstance(part, list) else [])
-    ):
+    """Yield the names of the sections in a part of the schema."""
+    items: Iterable[tuple[Any, Any]] = ()
+    if isinstance(part, dict):
+        items = part.items()
+    elif isinstance(part, list):
+        items = enumerate(part)
+    for key, value in items:
         if key == "$ref":
             yield value.rsplit("/", 1)[-1]
         else:
@@ -207,8 +221,8 @@ def _references(part: Any) -> Iterator[str]:
 
 
 def _title(paths: list[str], section: Schema) -> str:
-    """The keys, and the values of what tells it from other sections under these."""
-    for key in TAGS:
+    """Return the keys of a section, and the tag that tells it from others under these keys."""
+    for key in TAG_KEYS:
         if key in section.get("required", []):
             tag = section["properties"][key]
             return f"{paths[0]}, {key}: {', '.join(tag.get('enum', [tag.get('const')]))}"
@@ -216,13 +230,13 @@ def _title(paths: list[str], section: Schema) -> str:
 
 
 def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
+    """Return the text of a section, with a table of its keys."""
     lines = ["", f"## {title}", "", section["description"], ""]
     if section["properties"]:
         lines += ["| key | allowed | unit | default | meaning |", "| --- | --- | --- | --- | --- |"]
         required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
-        keys = sorted(
-            section["properties"].items(), key=lambda item: item[0] not in TAGS
-        )  # what tells it apart first
+        # the tag that tells it from others comes first
+        keys = sorted(section["properties"].items(), key=lambda item: item[0] not in TAG_KEYS)
         lines += [_row(key, value, key in required, titles) for key, value in keys]
     else:
         lines += [f"Allowed: {_allowed(section, titles)}."]
@@ -230,41 +244,56 @@ def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
 
 
 def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
-    told = re.fullmatch(r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split()))
-    assert told
-    value = part.get("default")
-    default = (
-        "**required**"
-        if required
-        else ""
-        if isinstance(value, dict) or value is None
-        else f"`{_plain(value)}`"
+    """Return the row of a key in the table of its section."""
+    meaning_and_unit = re.fullmatch(
+        r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split())
     )
-    cells = (f"`{key}`", _allowed(part, titles), told[2] or "", default, told[1])
+    assert meaning_and_unit
+    value = part.get("default")
+    default = ""
+    if required:
+        default = "**required**"
+    elif value is not None and not isinstance(value, dict):
+        default = f"`{_value_text(value)}`"
+    cells = (
+        f"`{key}`",
+        _allowed(part, titles),
+        meaning_and_unit[2] or "",
+        default,
+        meaning_and_unit[1],
+    )
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 
 def _allowed(part: Schema, titles: dict[str, str]) -> str:
-    """What a value may be, in words."""
+    """Return words for what a value may be."""
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
         return f"[{title.split(': ')[-1]}](#{anchor(title)})"
-    for several in ("anyOf", "oneOf"):
-        if several in part:
-            words = [_allowed(one, titles) for one in part[several] if one.get("type") != "null"]
-            return (", " if several == "oneOf" else " or ").join(words)
+    for alternatives in ("anyOf", "oneOf"):
+        if alternatives in part:
+            words = [
+                _allowed(alternative, titles)
+                for alternative in part[alternatives]
+                if alternative.get("type") != "null"
+            ]
+            return (", " if alternatives == "oneOf" else " or ").join(words)
     if "const" in part or "enum" in part:
-        return ", ".join(f"`{_plain(value)}`" for value in part.get("enum", [part.get("const")]))
+        return ", ".join(
+            f"`{_value_text(value)}`" for value in part.get("enum", [part.get("const")])
+        )
     kind = part["type"]
     if kind == "string":
         return f"text such as `{part['examples'][0]}`" if "examples" in part else "text"
     if kind == "boolean":
         return "`true`, `false`"
     if kind == "array" and "prefixItems" in part:
-        return f"[{', '.join(_allowed(one, titles) for one in part['prefixItems'])}]"
+        return (
+            f"[{', '.join(_allowed(alternative, titles) for alternative in part['prefixItems'])}]"
+        )
     if kind == "array":
-        few, most = part.get("minItems"), part.get("maxItems")
-        count = f"{few} × " if few == most and few else ""
+        min_items, max_items = part.get("minItems"), part.get("maxItems")
+        count = f"{min_items} × " if min_items == max_items and min_items else ""
         return f"list of {count}{_allowed(part['items'], titles)}"
     if kind == "object":
         return f"name: {_allowed(part['additionalProperties'], titles)}"
@@ -272,27 +301,32 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
 
 
 def _bounded(part: Schema, kind: str) -> str:
-    low = part.get("minimum", part.get("exclusiveMinimum"))
-    above, most = ("from" if "minimum" in part else "above"), part.get("maximum")
-    lower = "" if low is None else f", {above} {low:g}"
-    upper = "" if most is None else f" to {most:g}" if low is not None else f", to {most:g}"
+    """Return words for a kind of number with its bounds."""
+    smallest = part.get("minimum", part.get("exclusiveMinimum"))
+    lower_word, largest = ("from" if "minimum" in part else "above"), part.get("maximum")
+    lower = "" if smallest is None else f", {lower_word} {smallest:g}"
+    upper = ""
+    if largest is not None:
+        upper = f" to {largest:g}" if smallest is not None else f", to {largest:g}"
     return kind + lower + upper
 
 
-def _plain(value: Any) -> str:
+def _value_text(value: Any) -> str:
+    """Return a value as a case has it."""
     if isinstance(value, float):
         return f"{value:g}"
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def anchor(title: str) -> str:
-    """Of a heading, as GitHub makes it."""
+    """Return the anchor of a heading, as GitHub makes it."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def columns_page() -> str:
-    """Both tables in Markdown; the order of the parts' columns does not depend on what is imported
-    first.
+    """Return the tables of columns and of amplitudes in Markdown.
+
+    The order of the parts' columns does not depend on what is imported first.
     """
     of_parts = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
     columns = [
@@ -321,9 +355,11 @@ def columns_page() -> str:
 
 
 def _in_units(q: Quantity) -> str:
-    return "" if q.kind == "text" else " or ".join(f"`{each.name}`" for each in q.in_units)
+    """Return the columns of a quantity in units."""
+    return "" if q.kind == "text" else " or ".join(f"`{in_unit.name}`" for in_unit in q.in_units)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return [f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |" for line in lines]

@@ -1,8 +1,7 @@
-"""The section `shells`: several shells in place of one, each as a case of its own, and one mesh of
-them all.
+"""The section `shells`: several shells in place of one, each as a case of its own, and one mesh.
 
-Each shell is planned and meshed by its own case. Together they stand where a mesh file stands, so
-that all else sees one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is
+Each shell is planned and meshed by its own case. Together they replace a mesh file, so that all
+else sees one surface in pieces: an edge, a point or a patch `rim` of the shell `upper` is
 `upper_rim` there.
 """
 
@@ -111,8 +110,7 @@ Shells = Annotated[dict[str, OneOfShells], Field(min_length=1, max_length=50)]
 
 
 def in_words_of_shells(message: str, data: Any) -> str:
-    """Return a message with the names of the case file: `upper.rim` in place of `upper_rim`, which
-    stands for it.
+    """Return a message with the names of the case file: `upper.rim` in place of `upper_rim`.
 
     Parameters
     ----------
@@ -122,7 +120,8 @@ def in_words_of_shells(message: str, data: Any) -> str:
 
     Examples
     --------
-    >>> in_words_of_shells("boundary.a_rim: is joined; its edges: a_top, a_tip_uz", {"shells": {"a": {}}})
+    >>> message = "boundary.a_rim: is joined; its edges: a_top, a_tip_uz"
+    >>> in_words_of_shells(message, {"shells": {"a": {}}})
     'shells.a.boundary.rim: is joined; its edges: a.top, a_tip_uz'
     """
     shells = data.get("shells") if isinstance(data, Mapping) else None
@@ -147,7 +146,7 @@ def in_words_of_shells(message: str, data: Any) -> str:
 
 
 def _texts(data: Any) -> Iterator[str]:
-    """All keys and texts of plain data."""
+    """Yield all keys and texts of plain data."""
     if isinstance(data, Mapping):
         for key, value in data.items():
             yield from (str(key), *_texts(value))
@@ -158,44 +157,54 @@ def _texts(data: Any) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class Part:
-    """A shell of several: its section, and its own case."""
+class MemberCase:
+    """One of several shells.
+
+    Attributes
+    ----------
+    name
+        Its name in the case.
+    section
+        Its section in the case.
+    case
+        The case of the shell alone.
+    """
 
     name: str
     section: OneOfShells
     case: "Case"
 
     def refused(self, message: str) -> str:
-        """A message of its own case, with the key in the whole case."""
+        """Return a message of the shell's own case, with the key in the whole case."""
         return f"shells.{self.name}.{message}"
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """An error of its own case within begins with its key."""
+        """Let an error of the shell's own case within begin with its key."""
         try:
             yield
         except (CaseError, MeshError) as e:
             raise type(e)(self.refused(str(e))) from None
 
 
-class Several:
-    """The shells of a case; an `MultiShellMesh` is made of them where a mesh is needed."""
+class SeveralShells:
+    """The shells of a case; a `MultiShellMesh` is made of them where a mesh is needed."""
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[MemberCase],
         joints: Sequence[tuple[str, str]] = (),
         pairs: Sequence[Sequence[str]] = (),
     ) -> None:
         self.parts, self.joints, self.pairs = parts, joints, pairs
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Several":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SeveralShells":
         return self
 
     @cached_property
     def digest(self) -> str:
-        """A hash of all from which they are made."""
-        told = [
+        """Hash of all from which the shells are made."""
+        contents = [
             [
                 part.name,
                 part.case.model_dump_json(),
@@ -206,24 +215,24 @@ class Several:
             for part in self.parts
         ]
         return hashlib.sha256(
-            json.dumps([told, self.joints, self.pairs], sort_keys=True).encode()
+            json.dumps([contents, self.joints, self.pairs], sort_keys=True).encode()
         ).hexdigest()
 
     @property
     def file(self) -> str:
-        """The name of the mesh file for which they stand."""
+        """Name of the mesh file that they replace."""
         return f"shells {self.digest[:16]}"
 
-    def place(self, part: Part) -> ShellPose:
-        """Where a shell is, over the R of the first one."""
+    def place(self, part: MemberCase) -> ShellPose:
+        """Return the place of a shell, over the R of the first one."""
         R, place = self.parts[0].case.shell.reference, part.section.place
         return ShellPose(place.Q, np.array(place.position) / R, part.case.shell.reference / R)
 
     @cached_property
     def assembly(self) -> MultiShellMesh:
-        """All of them as one mesh."""
+        """All shells as one mesh."""
         from magshell_fenicsx.case.coaxial import meridians  # the solver takes long to import
-        from magshell_fenicsx.case.members import Members
+        from magshell_fenicsx.case.member_meshes import MemberMeshes
 
         materials = self.materials or {}
         moduli = {
@@ -233,19 +242,21 @@ class Several:
             part.name: "laminate" if part.case.shell.laminate else part.case.shell.law
             for part in self.parts
         }
-        members = Members(self)
-        of_members = members.mirrors, partial(meridians, self), members.normal, members.half
-        return MultiShellMesh(self.digest, members.whole, self.joints, moduli, laws, *of_members)
+        members = MemberMeshes(self)
+        of_members = members.mirrors, partial(meridians, self), members.normal, members.halved
+        return MultiShellMesh(
+            self.digest, members.whole_shells, self.joints, moduli, laws, *of_members
+        )
 
-    def of(self, name: str) -> str:
-        """The shell of an edge, or itself."""
+    def shell_of(self, name: str) -> str:
+        """Return the name of the shell of an edge, or of a shell itself."""
         return next(
             (part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name
         )
 
     @cached_property
     def thickness(self) -> "Thickness | None":
-        """What multiplies the thickness of the first one; None for 1."""
+        """Factor of the thickness of the first shell; None for 1."""
         from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
 
         factors: dict[str, Any] = {}
@@ -267,24 +278,31 @@ class Several:
 
     @cached_property
     def materials(self) -> "dict[str, OwnMaterial] | None":
-        """Name of a shell -> its material over that of the first; None where all have that one."""
+        """Name of a shell -> its material over that of the first; None where all are alike."""
         from magshell_fenicsx.models.shell.parameters import OwnMaterial
 
-        first, own = self.parts[0].case.shell, dict[str, OwnMaterial]()
+        first, materials = self.parts[0].case.shell, dict[str, OwnMaterial]()
         laws = list(self.laws)
         for part in self.parts:
             shell, keys = part.case.shell, ("modulus", "density")
-            E, rho = ((getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys)
-            own[part.name] = OwnMaterial(E, shell.poisson_ratio, rho, laws.index(self._law(part)))
-        return None if len({*own.values()}) == 1 else own
+            modulus_ratio, density_ratio = (
+                (getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys
+            )
+            materials[part.name] = OwnMaterial(
+                modulus_ratio, shell.poisson_ratio, density_ratio, laws.index(self._law(part))
+            )
+        return None if len({*materials.values()}) == 1 else materials
 
     @cached_property
     def laws(self) -> "tuple[Law, ...]":
-        """The different ones, that of the first shell at first."""
+        """Different laws of elasticity, that of the first shell at first."""
         return tuple(dict.fromkeys(self._law(part) for part in self.parts))
 
-    def _law(self, part: Part) -> "Law":
-        """That of a shell, with Poisson's ratio of the first one, which `materials` replace."""
+    def _law(self, part: MemberCase) -> "Law":
+        """Return the law of a shell, with Poisson's ratio of the first one.
+
+        `materials` replace Poisson's ratio.
+        """
         from magshell_fenicsx.models.shell.parameters import Material
 
         first = self.parts[0].case.shell
@@ -295,7 +313,7 @@ class Several:
 
     @cached_property
     def laminates(self) -> "dict[str, Laminate]":
-        """Name of a shell -> its plies, where it is."""
+        """Name of a shell -> its plies, where it has some."""
         laminates: dict[str, Laminate] = {}
         for part in self.parts:
             if laminate := laminate_of(part.case.shell, 0.0):
@@ -304,8 +322,8 @@ class Several:
         return laminates
 
     @property
-    def told(self) -> list[str]:
-        """What `check` says of the scales."""
+    def scale_lines(self) -> list[str]:
+        """Lines of `magshell check` on the scales."""
         has_density = self.parts[0].case.shell.density is not None
         scales = "R, h, E, nu and the density" if has_density else "R, h, E and nu"
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
@@ -321,15 +339,15 @@ class Several:
             lines.append(f"  {part.name}: {said}")
         return lines
 
-    def ratio(self, part: Part) -> float:
-        """The thickness of a shell over that of the first one."""
+    def ratio(self, part: MemberCase) -> float:
+        """Return the thickness of a shell over that of the first one."""
         first, shell = self.parts[0].case.shell, part.case.shell
-        own = shell.reference / shell.R_over_h
-        return 1.0 if part is self.parts[0] else own / (first.reference / first.R_over_h)
+        thickness = shell.reference / shell.R_over_h
+        return 1.0 if part is self.parts[0] else thickness / (first.reference / first.R_over_h)
 
     @property
     def readers(self) -> dict[str, FileKeys]:
-        """Their sections that read a file, by key."""
+        """Sections of the shells that read a file, by key."""
         by_key = dict[str, FileKeys]()
         for part in self.parts:
             by_key |= {part.refused(key): section for key, section in part.case.readers.items()}
@@ -338,13 +356,15 @@ class Several:
         return by_key
 
 
-def _about(i: int, j: int) -> Callable[[float], Array]:
-    def turn(angle: float) -> Array:
+def _rotation_about(i: int, j: int) -> Callable[[float], Array]:
+    """Return the rotation (3, 3) from axis i to axis j, as a function of an angle in rad."""
+
+    def rotation(angle: float) -> Array:
         Q, c, s = np.eye(3), np.cos(angle), np.sin(angle)
         Q[i, i], Q[i, j], Q[j, i], Q[j, j] = c, -s, s, c
         return Q
 
-    return turn
+    return rotation
 
 
-_about_e3, _about_e2 = _about(0, 1), _about(2, 0)
+_about_e3, _about_e2 = _rotation_about(0, 1), _rotation_about(2, 0)

@@ -1,5 +1,8 @@
-"""Places of a case that are vertices of its mesh: on edges and planes that they nearly are on, and
-distinct."""
+"""Places of a case that are vertices of its mesh.
+
+Places that are nearly on edges and planes are moved onto them; distinct places must be far enough
+from each other.
+"""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -28,11 +31,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 CHART = 2  # coordinates of a place in a chart
-BESIDE_CURVE = 1e-3  # of the element size, at gmsh's edges, beside which it makes smaller elements
-FEWER = 0.7  # lines of a grid are nearer than places by up to this factor
+EDGE_DISTANCE = 1e-3  # over the element size: at gmsh's edges, beside which elements are smaller
+GRID_FACTOR = 0.7  # lines of a grid are nearer than places by up to this factor
 
 
-def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None) -> Points:
+def named_points(case: "Case", outline: Outline, turn: float, plane: Mirror | None) -> Points:
     """Return the named vertices in the chart, "pole" among them.
 
     Parameters
@@ -51,61 +54,62 @@ def named_points(case: "Case", drawn: Outline, turn: float, plane: Mirror | None
     points: Points = {}
     for name, place in case.points.items():
         x = np.array(place) / R
-        refuse_off_surface(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
-        chart = chart_of(_on_planes(Q @ x, plane), drawn, half=plane is not None)
-        points[name] = on_features(chart, drawn, points)
+        refuse_off_surface(f"points.{name}", x, outline, R, with_units=case.shell.with_units)
+        chart = chart_of(_on_planes(Q @ x, plane), outline, half=plane is not None)
+        points[name] = on_features(chart, outline, points)
     if points:
         points["pole"] = next(iter(points.values()))
-    elif drawn.highest is not None:
-        points["pole"] = drawn.highest
+    elif outline.highest is not None:
+        points["pole"] = outline.highest
     return points
 
 
-def chart_of(x: Array, drawn: Outline, *, half: bool) -> Array:
+def chart_of(x: Array, outline: Outline, *, half: bool) -> Array:
     """Return the chart of a place (3,), of its image where the other half is modelled."""
-    places = drawn.inverse(x)
-    return drawn.on_half(places) if half else places
+    places = outline.inverse(x)
+    return outline.on_half(places) if half else places
 
 
 def _on_planes(x: Array, plane: Mirror | None) -> Array:
-    """A place (3,), moved onto planes of symmetry that it nearly is on."""
+    """Return a place (3,), moved onto planes of symmetry that it is nearly on."""
     for side in plane.planes.values() if plane else ():
         off = float(side.signed_distance(x))
         x = x - off * side.normal if abs(off) <= SAME_PLACE_TOLERANCE else x
     return x
 
 
-def on_features(chart: Array, drawn: Outline, points: Mapping[str, Array]) -> Array:
-    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it nearly is
+def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> Array:
+    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it is nearly
     on.
 
     Parameters
     ----------
     points
-        Those known before, which come first.
+        Points that are known before; they come first.
     """
     if len(chart) != CHART:
         return chart
-    (place,) = drawn.embedding(chart[None])
+    (place,) = outline.embedding(chart[None])
 
     def is_at(other: Array) -> bool:
-        return bool(np.linalg.norm(drawn.embedding(other[None])[0] - place) <= SAME_PLACE_TOLERANCE)
+        return bool(
+            np.linalg.norm(outline.embedding(other[None])[0] - place) <= SAME_PLACE_TOLERANCE
+        )
 
     for point in points.values():
         if is_at(point):
             return point
-    if drawn.disc and is_at(np.zeros(CHART)):
+    if outline.disc and is_at(np.zeros(CHART)):
         return np.zeros(CHART)
-    for edge in edges_near(chart, drawn):  # one after the other: of two that meet at a corner too
-        on = edges_near(chart, drawn)[edge]
+    for edge in edges_near(chart, outline):  # one after the other: of two that meet at a corner too
+        on = edges_near(chart, outline)[edge]
         chart = on if is_at(on) else chart
     return chart
 
 
-def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
-    """Return the names of edges, the nearest of opposite ones, and the nearest places (2,) on
-    them."""
-    shape = drawn.chart(None, Grading([], 1.0))
+def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
+    """Return the nearest places (2,) on edges by name, the nearest of opposite edges."""
+    shape = outline.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
         away = float(np.hypot(*chart))
         return {shape.edge: chart * (shape.radius / away)} if away else {}
@@ -131,26 +135,26 @@ def edges_near(chart: Array, drawn: Outline) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Vertices:
-    """Points that a mesh has vertices at, and how messages tell them.
+    """Points that a mesh has vertices at, and how messages name them.
 
     Attributes
     ----------
     points
         Name -> chart (2,).
-    drawn
+    outline
         The surface.
     size
         Element sizes over the chart.
     turn
-        The model's frame is turned about e3 by it (rad).
+        Angle of the model's frame about e3, rad.
     R, unit
         The reference length in messages, and their unit of lengths, empty without.
     named
-        The names that stand in `points` of the case.
+        The names that are in `points` of the case.
     """
 
     points: Mapping[str, Array]
-    drawn: Outline
+    outline: Outline
     size: Grading
     turn: float
     R: float
@@ -158,10 +162,10 @@ class Vertices:
     named: Collection[str]
 
     @classmethod
-    def of(
-        cls, case: "Case", points: Mapping[str, Array], drawn: Outline, size: Grading, turn: float
+    def of_case(
+        cls, case: "Case", points: Mapping[str, Array], outline: Outline, size: Grading, turn: float
     ) -> "Vertices":
-        """Return those of a case."""
+        """Return the vertices of a case."""
         R, unit = (
             (1e3 * case.shell.reference, " mm")
             if case.shell.with_units
@@ -170,10 +174,12 @@ class Vertices:
         order = sorted(
             points, key=lambda name: name not in case.points
         )  # "pole" may be one of them
-        return cls({name: points[name] for name in order}, drawn, size, turn, R, unit, case.points)
+        return cls(
+            {name: points[name] for name in order}, outline, size, turn, R, unit, case.points
+        )
 
     def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
-        """See that points are far enough from each other, from edges and from planes of symmetry.
+        """Check that points are far enough from each other, from edges and from planes of symmetry.
 
         Raises
         ------
@@ -205,46 +211,49 @@ class Vertices:
     def _refuse_beside_edges(
         self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None
     ) -> None:
-        """See that a point is not beside an edge or a plane of symmetry, but on it or away from
-        it."""
-        chart, factor = self.points[name], MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else BESIDE_CURVE
+        """Refuse a point beside an edge or a plane of symmetry, neither on it nor away from it."""
+        chart, factor = (
+            self.points[name],
+            MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else EDGE_DISTANCE,
+        )
         size = self.size(chart)
         if isinstance(shape, Grid):
             size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
-        (place,) = self.drawn.embedding(chart[None])
+        (place,) = self.outline.embedding(chart[None])
         for side in plane.planes.values() if plane else ():
             off = float(side.signed_distance(place))
             if ROUNDING < abs(off) < factor * size:
                 on, hint = (
-                    self._told(place - off * side.normal),
+                    self._in_case_frame(place - off * side.normal),
                     "put it there, or take symmetry: none",
                 )
                 self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
-        for edge, on in edges_near(chart, self.drawn).items():
+        for edge, on in edges_near(chart, self.outline).items():
             if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:
                 self._refuse(
                     name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
                 )
 
     def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
-        """Refuse a point beside a place (3,) of the case, which stands in `what`."""
+        """Refuse a point beside a place (3,) of the case, which is in the words `what`."""
         chart = self.points[name]
         one, two = self._place(chart), other
         here, there = (
-            ", ".join(f"{c}{self.unit}" for c in told.split(", ")) for told in distinguishable_texts(one, two)
+            ", ".join(f"{c}{self.unit}" for c in told.split(", "))
+            for told in distinguishable_texts(one, two)
         )
         apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
         raise CaseError(
-            f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, too near for elements "
-            f"of {size:.3g}{self.unit}: {hint}, or take elements below {FEWER * apart / factor:.2g}{self.unit}"
+            f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, "
+            f"too near for elements of {size:.3g}{self.unit}: {hint}, or take elements below {GRID_FACTOR * apart / factor:.2g}{self.unit}"
         )
 
     def _key(self, name: str) -> str:
         return f"points.{name}" if name in self.named else f"the point {name}"
 
     def _place(self, chart: Array) -> Array:
-        return self._told(self.drawn.embedding(chart[None])[0])
+        return self._in_case_frame(self.outline.embedding(chart[None])[0])
 
-    def _told(self, x: Array) -> Array:
-        """A place (3,) over R of the model, in the case's frame and length."""
+    def _in_case_frame(self, x: Array) -> Array:
+        """Return a place (3,) over R of the model, in the case's frame and length."""
         return np.asarray(x @ rotation(self.turn) * self.R)

@@ -244,6 +244,7 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     """Return the first words of a key's meaning, in brackets, with its unit."""
     section, field = _section_at(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
+    description = " ".join(description.split())  # of several lines of a docstring
     words = re.split(r"[;:.,] | \[", description)[0]
     if not words:
         return ""

@@ -7,7 +7,7 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import changed
+from magshell_fenicsx.case.case_variants import case_with_values
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 
@@ -194,7 +194,7 @@ def test_changes_of_several_numbers_keep_each_other() -> None:
         "boundary": {"rim": "clamped"},
         "loading": loading,
     }
-    found = changed(Case.from_source(data), values)
+    found = case_with_values(Case.from_source(data), values)
     data["shell"] |= {"poisson_ratio": 0.3, "thickness": "0.8 mm", "youngs_modulus": "2 MPa"}
     data["loading"]["pressure"] = 0.2
     assert found.model_dump() == Case.from_source(data).model_dump()

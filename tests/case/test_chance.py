@@ -48,8 +48,16 @@ def test_lognormal_moments_are_those_of_the_number() -> None:
 
 def test_choices_have_their_weights_and_units() -> None:
     made = DistributionSection(kind="choice", values=[1.5, "b"], weights=[3, 1])
-    assert [made.quantile(part) for part in (0.0, 0.7499, 0.7501, 1 - 1e-12)] == [1.5, 1.5, "b", "b"]
-    assert DistributionSection(kind="uniform", above=1.0, below=1.5, unit="mm").quantile(0.5) == "1.25 mm"
+    assert [made.quantile(part) for part in (0.0, 0.7499, 0.7501, 1 - 1e-12)] == [
+        1.5,
+        1.5,
+        "b",
+        "b",
+    ]
+    assert (
+        DistributionSection(kind="uniform", above=1.0, below=1.5, unit="mm").quantile(0.5)
+        == "1.25 mm"
+    )
 
 
 def test_places_are_uniform_in_area_and_apart() -> None:

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.meeting import FINE, Charted, meetings
-from magshell_fenicsx.case.members import Members
+from magshell_fenicsx.case.contact_mesh_size import CONTACT_CELL_SIZE, ChartedShell, contact_places
+from magshell_fenicsx.case.member_meshes import MemberMeshes
 from magshell_fenicsx.shape.outline import outline
 
 Array = NDArray[np.float64]
@@ -48,8 +48,8 @@ def cells_near_poles(**others: Any) -> Array:
 def test_cells_are_small_where_caps_meet() -> None:
     """0.5 sqrt(R h) at both poles; those of caps that do not touch are larger."""
     met, alone = cells_near_poles(contact=[["upper", "lower"]]), cells_near_poles()
-    assert met == pytest.approx(FINE, rel=0.2)
-    assert alone.min() > 1.5 * FINE
+    assert met == pytest.approx(CONTACT_CELL_SIZE, rel=0.2)
+    assert alone.min() > 1.5 * CONTACT_CELL_SIZE
 
 
 def test_faces_that_are_parallel_have_no_place_where_they_meet() -> None:
@@ -59,13 +59,15 @@ def test_faces_that_are_parallel_have_no_place_where_they_meet() -> None:
     x = np.linspace(0, 1, 41)
     flat, inclined = np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x, 0.1 + x])
     thickness, apart = {"a": 0.1, "b": 0.1}, {"a": 0.2, "b": 0.2}
-    found = meetings([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart, {})
+    found = contact_places([["a", "b"]], {"a": flat, "b": inclined}, thickness, apart, {})
     assert [each.tolist() for each in found["b"]] == [[0, 0, 0.1]]
-    far = meetings(
+    far = contact_places(
         [["a", "b"]], {"a": flat, "b": inclined + np.array([0, 0, 3])}, thickness, apart, {}
     )
     assert far == {"a": [], "b": []}
-    assert meetings([["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart, {}) == {
+    assert contact_places(
+        [["shell", "shell"]], {"a": flat, "b": flat + 0.1}, thickness, apart, {}
+    ) == {
         "a": [],
         "b": [],
     }
@@ -84,8 +86,11 @@ def test_the_place_is_that_of_spheres(off: float) -> None:
         return (x - centre) * [1, -1, -1]
 
     places = {"a": cap.sample(), "b": above(cap.sample())}
-    charted = {"a": Charted(cap, lambda x: x, lambda x: x), "b": Charted(cap, above, under)}
-    found = meetings(
+    charted = {
+        "a": ChartedShell(cap, lambda x: x, lambda x: x),
+        "b": ChartedShell(cap, above, under),
+    }
+    found = contact_places(
         [["a", "b"]], places, dict.fromkeys("ab", 0.02), dict.fromkeys("ab", 0.3), charted
     )
     assert found["a"][0] == pytest.approx(centre / 2.03, abs=1e-3)
@@ -115,6 +120,6 @@ def test_the_place_of_thick_faces() -> None:
     }
     several = Case.from_source(data).several
     assert several
-    met = Members(several)._met
+    met = MemberMeshes(several)._contact_places_of_shells
     assert met["thick"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)
     assert met["flat"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)

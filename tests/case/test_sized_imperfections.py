@@ -6,7 +6,7 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.opened import changed
+from magshell_fenicsx.case.case_variants import case_with_values
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 
 R, H, NU = 25.2, 0.28, 0.5
@@ -155,7 +155,7 @@ def test_other_numbers_of_what_has_a_unit(several: bool, written: str) -> None:
         ({"shells": {"a": one, "b": above}} if several else one) | {"loading": loading}
     )
     key = ("shells.a." if several else "") + "shell.imperfections.0."
-    other = changed(case, {f"{key}amplitude": 1.5, f"{key}width": 2.0})
+    other = case_with_values(case, {f"{key}amplitude": 1.5, f"{key}width": 2.0})
     assert other.origin.data is not None
     for each in (other, ms.Case.from_source(other.origin.data)):
         section = (each.shells["a"] if several and each.shells else each).shell.imperfections[0]

@@ -63,7 +63,7 @@ def test_polynomials_are_recovered_exactly(dimensions: int) -> None:
         np.repeat(np.arange(len(cells)), dimensions + 1),
         x[cells].reshape(-1, dimensions),
     )
-    to_corners = recovery.at(cell, corners, np.tile(np.eye(dimensions + 1), (len(cells), 1)))
+    to_corners = recovery.evaluation_matrix(cell, corners, np.tile(np.eye(dimensions + 1), (len(cells), 1)))
     found = to_corners @ recovery.coefficients(field(samples))
     assert found[:, 0] == pytest.approx(field(corners), abs=1e-9)
 
@@ -129,9 +129,9 @@ def moment_errors(refinement: float) -> tuple[float, float]:
 def means_of_cells(shell: SurfaceGatherer, u: Array) -> Array:
     """M/D = (1 - nu) K + nu tr K of each cell at its nodes, averaged there."""
     frame = PointFields(
-        shell._jet(shell._model.r0, shell._places), shell._model.material, None, None
+        shell._jet(shell._model.r0, shell._reference_nodes), shell._model.material, None, None
     )._frame
-    K = frame.tensor(frame.curvature_change(shell._jet(shell._model.u, shell._places)))
+    K = frame.tensor(frame.curvature_change(shell._jet(shell._model.u, shell._reference_nodes)))
     flat = np.diag([1.0, 1.0, 0.0])
     return shell._averaged(
         (1 - NU) * K + NU * np.trace(K, axis1=-2, axis2=-1)[..., None, None] * flat

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.opened import changed
+from magshell_fenicsx.case.case_variants import case_with_values
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import LaminateSection
@@ -142,7 +142,7 @@ def test_gradients() -> None:
     }
 
     def tip(key: str, value: float) -> float:
-        return float(ms.run(changed(case(**sections), {key: value})).rows[-1]["tip_uz"])
+        return float(ms.run(case_with_values(case(**sections), {key: value})).rows[-1]["tip_uz"])
 
     scene = ms.Scene(case(**sections))
     *_, last = ms.follow(scene)

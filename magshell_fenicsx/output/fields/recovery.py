@@ -255,7 +255,7 @@ class RecoveredShell:
         corners = corners.reshape(-1, 3)
         place, normal = np.zeros((2, len(vertices), 3))
         place[corners] = nodes[:, :3]
-        np.add.evaluation_matrix(normal, corners, normals[:, :3])
+        np.add.at(normal, corners, normals[:, :3])
         self._recovery = Recovery(corners, samples, weight, place, frames_across(normal), degree)
         _, first_entry = np.unique(numbers, return_index=True)
         cell, node = np.divmod(first_entry, numbers.shape[1])

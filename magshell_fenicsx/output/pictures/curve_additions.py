@@ -169,8 +169,8 @@ def add_shapes(
     factor = magnification([surface for _, surface in shapes])
     magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]
     if factor > 1:
-        for number in dict.fromkeys(i for i in numbers if i is not None):
-            axes = figure.axes[number]
+        for curve_number in dict.fromkeys(i for i in numbers if i is not None):
+            axes = figure.axes[curve_number]
             title = f"{axes.get_title()}; " if axes.get_title() else ""
             axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()

@@ -81,9 +81,11 @@ def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
 def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
     """Return the quantities on the x and the y axis of a step's curve."""
     x, y = axes_of(step.amplitude, step.rows[0])
-    is_at_pole = all(row["w_over_h"] == row["w_pole_over_h"] for row in step.rows)
-    if step.amplitude == "load" and is_at_pole:
-        x = shown_quantity("w_pole_over_h", step.rows[0])  # moments have no conjugate displacement
+    if step.amplitude != "load":
+        return x, y
+    # moments have no conjugate displacement
+    if all(row["w_over_h"] == row["w_pole_over_h"] for row in step.rows):
+        x = shown_quantity("w_pole_over_h", step.rows[0])
     return x, y
 
 

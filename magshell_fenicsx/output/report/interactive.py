@@ -193,7 +193,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     return InteractivePart(Markup(text), arrays.content, library, Markup(script))
 
 
-def _lines(shell: Surface) -> list[list[list[float]]]:
+def _lines(shell: Surface) -> list[Any]:
     """Return the outlines of bodies and sources near a shell."""
     return [np.round(line, 4).tolist() for line in near_outlines(shell)]
 

@@ -1,0 +1,262 @@
+"""A case as programs give it, the same case with other values, and the perfect shell of a case.
+
+On several ranks a file is as rank 0 reads it. A run writes down what its case says.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from pydantic import ValidationError
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.shells import MemberCase
+from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
+from magshell_fenicsx.input.source import CaseError, Source, read_source
+from magshell_fenicsx.platform.processes import on_first_rank
+from magshell_fenicsx.problem.mesh_sizes import MeshSection
+from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+KEYS_OF_SHELLS = ("shells", "shell", "boundary", "points")  # made of the data of several shells
+
+
+def open_case(
+    case: Case | Mapping[str, Any] | str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()
+) -> Case:
+    """Return the case itself, or that of a mapping or of a file; collective.
+
+    Its files are the same on all ranks.
+
+    Raises
+    ------
+    CaseError
+        On every rank, if it is neither, the file is no valid case, or the ranks have different
+        cases.
+    """
+    if isinstance(case, str | Path):
+        case = Case.from_source(read_together(case, comm, settings))
+    if isinstance(case, Mapping):
+        case = Case.from_source(Source("case", dict(case)))
+    if not isinstance(case, Case):
+        raise CaseError(
+            "give a problem, a Case, its mapping or the path of a case file, not a "
+            f"{type(case).__name__}; see Case.load"
+        )
+    return with_same_files(case, comm)
+
+
+def read_together(file: str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Source:
+    """Return the case file as rank 0 reads it; collective. See `read_source`."""
+    return on_first_rank(comm, lambda: read_source(Path(file), settings))
+
+
+def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
+    """Return the case, whose files rank 0 reads for all ranks; collective.
+
+    Raises
+    ------
+    CaseError
+        On every rank, if the ranks have different cases.
+    """
+    readers = case.readers
+    if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
+        return case
+    case_json = case.model_dump_json()
+    first_json, contents = on_first_rank(
+        comm, lambda: (case_json, {key: _content(reader) for key, reader in readers.items()})
+    )
+    if sum(comm.allgather(first_json != case_json)):
+        raise CaseError(
+            "the ranks were given different cases: give the same on each, or the path of a file"
+        )
+    for key, reader in readers.items():
+        reader.files.contents[reader.path] = contents[key]
+    for reader in readers.values():
+        reader.files.shared = True
+    return case
+
+
+def _content(reader: FileKeys) -> bytes | OSError:
+    """Return the content of a section's file, or the error of reading it."""
+    try:
+        return reader.files.content(reader.path)
+    except OSError as e:
+        return e
+
+
+def case_with_values(case: Case, values: Mapping[str, Any]) -> Case:
+    """Return the case whose file has other values, by keys such as "mesh.degree".
+
+    The values are not validated again.
+
+    Raises
+    ------
+    CaseError
+        If one is a number of the shell that is not allowed.
+    """
+    for key, value in values.items():
+        case = _case_with_value(case, key, value)
+    return case
+
+
+def _case_with_value(case: Case, key: str, value: Any) -> Case:
+    """Return a case with another value."""
+    case_data = case.origin.data
+    if case.several and key.split(".")[0] in ("shells", "mesh"):  # all shells are meshed anew
+        return _remade_case(case, key, value)
+    replaced: Case = _with_value(case, key, value)
+    if case_data is None:
+        return replaced
+    data = _data_with_value(case, case_data, key, value)  # which the next change builds on
+    if key.startswith("shell."):  # no other number is one that others are given over
+        other = _validated(data, case, key)
+        replaced = replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+    return replaced.written_as(replace(case.origin, data=data))
+
+
+def _remade_case(case: Case, key: str, value: Any) -> Case:
+    """Return a case of several shells with another value, made again from its data."""
+    if case.origin.data is None:
+        raise CaseError(
+            f"{key}: needs a case that was read from a file or a mapping: see Case.from_source"
+        )
+    data = _data_with_value(case, case.origin.data, key, value)
+    tolerance = case.mesh.tolerance
+    # a mesh that the tolerance has chosen is no mistake
+    checked = _data_with_value(case, data, "mesh.tolerance", None) if tolerance else data
+    remade = _validated(checked, case, key).with_terms(case.own_terms)
+    names = [name for name in type(case).model_fields if name not in KEYS_OF_SHELLS]
+    sections = {name: getattr(case, name) for name in names}
+    sections["mesh"] = remade.mesh.model_copy(update={"tolerance": tolerance})
+    if key.startswith("shells."):  # targets are over its numbers
+        sections["loading"] = remade.loading
+    if any(section.remanent for section in (remade.shells or {}).values()):
+        sections["magnetic"] = remade.magnetic
+    return remade.model_copy(update=sections).written_as(replace(case.origin, data=data))
+
+
+def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """Return plain data of a case with another value, in the unit that the one before had."""
+    new_data = deepcopy(dict(data))
+    *path, last = key.split(".")
+    section: Any = new_data
+    for name in path:
+        is_list = isinstance(section, list)
+        section = section[int(name)] if is_list else section.setdefault(name, {})
+    index: Any = int(last) if isinstance(section, list) else last
+    previous = section[index] if isinstance(section, list) else section.get(index)
+    number, unit = number_and_unit(previous) if isinstance(previous, str) else ("", "")
+    if not unit or value is None:
+        section[index] = value
+        return new_data
+    size, present = si_size(unit), _number_at(case, key)
+    if present and float(number):  # over h or a width, an imperfection is no number in SI units
+        size = present / float(number)
+    elif present is not None:
+        section[index] = f"1 {unit}"
+        size = _number_at(_validated(new_data, case, key), key) or size
+    section[index] = f"{value / size!r} {unit}"
+    return new_data
+
+
+def _number_at(case: Case, key: str) -> float | None:
+    """Return the number of a case at a key, in the size that it has there; None if it has none."""
+    part: Any = case
+    for name in key.split("."):
+        if isinstance(part, list):
+            part = part[int(name)]
+        else:
+            part = part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+    return part if isinstance(part, float) else None
+
+
+def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:
+    """Return the case of data; CaseError with the key of the new value if they are not valid."""
+    try:
+        return Case.model_validate(data, context=case.origin.context)
+    except ValidationError as e:
+        raise CaseError(f"{key}: {e.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+
+
+def _with_value(part: Any, key: str, value: Any) -> Any:
+    """Return a part of a case with another value; it is not validated again."""
+    if not key:
+        return value
+    first, _, rest = key.partition(".")
+    if isinstance(part, list):
+        return [
+            _with_value(item, rest, value) if i == int(first) else item
+            for i, item in enumerate(part)
+        ]
+    if isinstance(part, dict):
+        return {
+            name: _with_value(item, rest, value) if name == first else item
+            for name, item in part.items()
+        }
+    inner = getattr(part, first)
+    if inner is None and rest:  # a section that the case leaves out
+        inner = get_args(type(part).model_fields[first].annotation)[0]()
+    return part.model_copy(update={first: _with_value(inner, rest, value)})
+
+
+def perfect_case(case: Case) -> Case:
+    """Return the case without imperfections, as a shell on the smallest model and the default mesh.
+
+    Several shells keep their meshes, whose vertices meet at joints. A pressure at its end goes on
+    to the first instability.
+
+    Raises
+    ------
+    CaseError
+        If the case has values for the patch of a dimple.
+    """
+    if case.dimples and case.patches:
+        raise CaseError(
+            "shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch "
+            "is named"
+        )
+    mesh = case.mesh.model_copy(update={"tolerance": None}) if case.several else MeshSection()
+    perfect = case.model_copy(
+        update={
+            "shell": _without_imperfections(case.shell),
+            "mesh": mesh,
+            "loading": _to_the_limit(case),
+            "model": "shell",
+            "solid": None,
+            "symmetry": "auto",
+            "stability": None,
+        }
+    )
+    if not case.several:
+        return perfect
+    parts = []
+    for part in case.several.parts:
+        section_shell = _without_imperfections(part.section.shell)
+        case_shell = _without_imperfections(part.case.shell)
+        section = part.section.model_copy(update={"shell": section_shell})
+        own_case = part.case.model_copy(update={"shell": case_shell})
+        parts.append(MemberCase(part.name, section, own_case))
+    return perfect.with_shells(parts)
+
+
+def _without_imperfections(shell: Surface | ShellSection) -> Surface | ShellSection:
+    """Return the section of a shell without its imperfections."""
+    without: dict[str, Any] = {"imperfections": []}
+    if "defect" in type(shell).model_fields:
+        without["defect"] = None
+    return shell.model_copy(update=without)
+
+
+def _to_the_limit(case: Case) -> Any:
+    """Return the loading of the perfect shell, to the first instability."""
+    loading = case.loading
+    if not isinstance(loading, list):
+        return loading and loading.on_perfect(last=True)
+    steps = [step.on_perfect(last=False) for step in loading]
+    loads = [load for load in steps if load is not None]
+    return [*loads[:-1], *(load.on_perfect(last=True) for load in loads[-1:])] or None

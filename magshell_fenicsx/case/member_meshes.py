@@ -1,0 +1,255 @@
+"""The meshes of several shells, whole or halved by a plane.
+
+In the plane each of them is its own mirror image.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from math import sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.contact_mesh_size import ONE_PLACE_DISTANCE, ChartedShell, contact_places
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import (
+    ROUNDING,
+    SECOND_SYMMETRY_EDGE,
+    SYMMETRY_EDGE,
+    Mirror,
+    Sector,
+    rotation,
+)
+from magshell_fenicsx.mesh.multi_shell import MemberShell, MultiShellMesh
+from magshell_fenicsx.shape.outline import reference_shell_of
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import Vectors
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.case.shells import MemberCase, SeveralShells
+
+Array = NDArray[np.float64]
+
+
+class MemberMeshes:
+    """Meshes and mirror planes of several shells, as a `MultiShellMesh` needs them."""
+
+    def __init__(self, several: "SeveralShells") -> None:
+        self._several = several
+
+    def whole_shells(self) -> list[MemberShell]:
+        """Return all shells as they are; a message of one begins with its key."""
+        return [self._member(part, None) for part in self._several.parts]
+
+    def halved(self, plane: Mirror) -> MultiShellMesh:
+        """Return the halves of all shells on the one side of a plane, or their sectors.
+
+        The plane is one of `mirrors`.
+        """
+        assembly, parts = self._several.assembly, self._several.parts
+
+        def member_shells() -> list[MemberShell]:
+            if isinstance(plane, Sector):
+                return [self._sector(part, plane) for part in parts]
+            return [self._member(part, self._plane_of_shell(part, plane)) for part in parts]
+
+        waves = f" {plane.waves}" if isinstance(plane, Sector) else ""
+        return replace(
+            assembly,
+            digest=f"{assembly.digest} {plane.plane.tolist()}{waves}",
+            members=member_shells,
+            is_symmetric_part=True,
+        )
+
+    def mirrors(self, vectors: Vectors, loosely: bool) -> list[Mirror]:
+        """Return the planes in which each shell is its own image, as those of the halves on both
+        sides.
+
+        Parameters
+        ----------
+        vectors, loosely
+            See `Outline.mirrors`.
+        """
+        mirrors = list[Mirror]()
+        if not self._all_are_held:
+            return mirrors
+        parts = self._several.parts
+        for plane in self._candidates(vectors, loosely):
+            for side in (plane, plane.reversed):
+                own_mirrors = [self._mirror_of_shell(part, side, loosely) for part in parts]
+                is_known = any(side.is_plane_of(other) for other in mirrors)
+                if is_known or not all(own_mirrors):
+                    continue
+                removed_edges = dict[str, str]()
+                for part, mirror in zip(parts, own_mirrors, strict=True):
+                    for a, b in mirror.removed_edges.items() if mirror else ():
+                        removed_edges[f"{part.name}_{a}"] = f"{part.name}_{b}"
+                mirrors.append(replace(side, removed_edges=removed_edges))
+        return mirrors
+
+    def normal(self, x: Array) -> Array:
+        """Return the outward unit normal (3,) at the place of the perfect shells nearest to x
+        (3,).
+        """
+        distances_and_normals = list[tuple[float, Array]]()
+        for part in self._several.parts:
+            place, perfect = self._several.place(part), reference_shell_of(part.case.shell).perfect
+            in_shell_frame, nodes = place.to_shell_frame(x), perfect.nodes
+            chart = perfect.inverse(in_shell_frame)
+            feet = perfect.embedding(chart[None]) if nodes is None else nodes[:, :3]
+            distance = place.scale * float(np.linalg.norm(feet - in_shell_frame, axis=1).min())
+            distances_and_normals.append((distance, place.Q @ perfect.normal_near(chart)))
+        return min(distances_and_normals, key=lambda entry: entry[0])[1]
+
+    def _member(self, part: "MemberCase", plane: Mirror | None) -> MemberShell:
+        """Return a shell, or its half at a plane in the frame of the shell.
+
+        The frame of its mesh is turned about e3.
+        """
+        from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
+
+        with part.naming():
+            problem = make_problem(
+                part.case, plane=plane, met=self._contact_places_of_shells[part.name]
+            )
+            patch = problem.triangulated()
+        place = self._several.place(part)
+        pose = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
+        return MemberShell(part.name, patch, pose, tuple(part.section.points), problem.outward)
+
+    def _sector(self, part: "MemberCase", sector: Sector) -> MemberShell:
+        """Return the sector of a shell.
+
+        A shell that is upside down has the two planes the other way round.
+        """
+        first, second = (self._plane_of_shell(part, side) for side in sector.planes.values())
+        is_round = reference_shell_of(part.case.shell).perfect.round
+        is_closed = is_round or isinstance(part.case.shell, MeshSurface)
+        for begin, end in ((first, second), (second, first)):
+            own_sector = Sector.from_azimuth(begin.azimuth, sector.waves)
+            has_planes = own_sector.is_plane_of(begin) and own_sector.second_plane.is_plane_of(end)
+            if is_closed and begin.through_e3 and has_planes:
+                break
+        else:
+            raise CaseError(
+                part.refused(
+                    f"place: symmetry: {sector.waves} needs shells that are closed around e3"
+                )
+            )
+        member = self._member(part, own_sector)
+        if begin is first:
+            return member
+        other_edge = {SYMMETRY_EDGE: SECOND_SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE: SYMMETRY_EDGE}
+        edges = {other_edge.get(name, name): pairs for name, pairs in member.patch.edges.items()}
+        return replace(member, patch=replace(member.patch, edges=edges))
+
+    def _plane_of_shell(self, part: "MemberCase", plane: Mirror) -> Mirror:
+        """Return a plane in the frame and over the length of a shell, with its removed edges."""
+        place, start = self._several.place(part), f"{part.name}_"
+        offset = float(plane.offset - plane.normal @ place.position) / place.scale
+        own_plane = Mirror.with_normal(place.Q.T @ plane.normal, offset)
+        removed_edges = {
+            a.removeprefix(start): b.removeprefix(start)
+            for a, b in plane.removed_edges.items()
+            if a.startswith(start)
+        }
+        return replace(own_plane, offset=_rounded(own_plane.offset), removed_edges=removed_edges)
+
+    def _mirror_of_shell(self, part: "MemberCase", plane: Mirror, loosely: bool) -> Mirror | None:
+        """Return the plane in the frame of a shell that is its own image in it; else None."""
+        from magshell_fenicsx.case.planner import own_mirror  # the solver takes long to import
+
+        with part.naming():
+            return own_mirror(part.case, self._plane_of_shell(part, plane), loosely=loosely)
+
+    def _candidates(self, vectors: Vectors, loosely: bool) -> Iterator[Mirror]:
+        """Yield planes that some shell has.
+
+        They are upright ones through axes of revolution, and those of its outline.
+        """
+        places = [self._several.place(part) for part in self._several.parts]
+        shells_at_places = zip(places, self._reference_shells, strict=True)
+        axes = [
+            (place.position, place.Q[:, 2])
+            for place, reference_shell in shells_at_places
+            if reference_shell.perfect.round
+        ]
+        for point, axis in axes:
+            distances = [other - point for other, _ in axes]
+            for direction in (*vectors, *distances, np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]):
+                normal = np.cross(axis, direction)
+                if np.linalg.norm(normal) > ROUNDING:
+                    unit = Mirror.with_normal(normal).normal
+                    yield Mirror(unit, _rounded(float(unit @ point)))
+        for place, reference_shell in zip(places, self._reference_shells, strict=True):
+            for own_mirror in reference_shell.perfect.mirrors(
+                [place.Q.T @ vector for vector in vectors], loosely
+            ):
+                normal = Mirror.with_normal(place.Q @ own_mirror.normal).normal
+                yield Mirror(
+                    normal,
+                    _rounded(place.scale * own_mirror.offset + float(normal @ place.position)),
+                )
+
+    @cached_property
+    def _reference_shells(self) -> Sequence[ReferenceShell]:
+        """The undeformed surfaces of the shells."""
+        return [reference_shell_of(part.case.shell) for part in self._several.parts]
+
+    @cached_property
+    def _contact_places_of_shells(self) -> Mapping[str, Sequence[Array]]:
+        """Name of a shell -> places (3,) in its own frame where others are nearest."""
+        several, places, charted = self._several, dict[str, Array](), dict[str, ChartedShell]()
+        thickness, one_place_distance = dict[str, Array | float](), dict[str, float]()
+        if not several.pairs:
+            return {part.name: [] for part in several.parts}
+        for part, reference_shell in zip(several.parts, self._reference_shells, strict=True):
+            h, place = 1 / part.case.shell.R_over_h, several.place(part)
+            sample, scale = reference_shell.perfect.sample(), place.scale
+
+            def half(
+                x: Array, reference_shell: ReferenceShell = reference_shell, scale: float = scale
+            ) -> Array:
+                return np.asarray(scale * reference_shell.half_thickness(x))
+
+            varies = half if reference_shell.thickness_factor else None
+            places[part.name], one_place_distance[part.name] = (
+                place(sample),
+                ONE_PLACE_DISTANCE * sqrt(h) * scale,
+            )
+            thickness[part.name] = 2 * varies(sample) if varies else h * scale
+            if reference_shell.perfect.chart_samples() is not None:
+                charted[part.name] = ChartedShell(
+                    reference_shell.perfect, place, place.to_shell_frame, varies
+                )
+        places_of_contact = contact_places(
+            several.pairs, places, thickness, one_place_distance, charted
+        )
+        return {
+            part.name: [several.place(part).to_shell_frame(x) for x in places_of_contact[part.name]]
+            for part in several.parts
+        }
+
+    @property
+    def _all_are_held(self) -> bool:
+        """Whether each shell, or one that is joined to it, is held.
+
+        Halves do not see motions across their plane.
+        """
+        is_held = {part.name: part.section.boundary.fixes for part in self._several.parts}
+        pairs = [
+            tuple(self._several.shell_of(name) for name in edges) for edges in self._several.joints
+        ]
+        for _ in pairs:
+            for first, second in pairs:
+                if first in is_held and second in is_held:
+                    is_held[first] = is_held[second] = is_held[first] or is_held[second]
+        return all(is_held.values())
+
+
+def _rounded(offset: float) -> float:
+    """Return an offset over R, zero where it is rounding."""
+    return 0.0 if abs(offset) < ROUNDING else offset
