@@ -405,18 +405,22 @@ class InteractionTerm:
     def _cells_and_charged_edges(
         self, *, include_uncharged: bool = False
     ) -> tuple[MagnetisedShell, Ints, Ints]:
-        """The cells of all ranks, and their edges that are charged, or `may` be by any remanence;
-        collective.
+        """Return the cells of all ranks, and their charged edges by cell and number; collective.
+
+        With `include_uncharged`, edges that another remanence may charge are there too.
         """
         field_of_model = self_field(self._view)
         shape, (cells, edges) = (
             field_of_model.shape({}),
             field_of_model.chargeable if include_uncharged else field_of_model.edges,
         )
-        thickness_factor = shape.thick and (shape.thick[0], self._inputs_of_charges[2])
+        factor = shape.thickness_factor and (
+            shape.thickness_factor[0],
+            self._inputs_of_charges[2],
+        )
         r0, remanence = self._inputs_of_charges[0][self._cells.nodes], self._inputs_of_charges[1]
         everywhere = MagnetisedShell(
-            shape.element, r0, 0 * r0, shape.of_remanence, remanence, shape.h, thickness_factor
+            shape.element, r0, 0 * r0, shape.remanence_element, remanence, shape.h, factor
         )
         own_cells, comm = np.asarray(cells) + self._cells.own_range.start, self._comm
         return everywhere, gather_rows(comm, own_cells), gather_rows(comm, np.asarray(edges))
