@@ -248,9 +248,19 @@ def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -
         except subprocess.TimeoutExpired:
             return f"{names[0]} (no end)", True
         failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-        if failed or done.returncode not in (0, 1, 5):  # tests that fail, a crash; 5: no test has this name
+        assert done.returncode != 4, f"{done.stdout}\n{done.stderr}"  # a test of the record is not there any more
+        if failed or done.returncode not in (0, 1, 5):  # tests that fail, a crash; 5: none is collected
             return failed[0].split(" - ")[0].split(" ", 1)[1] if failed else f"{names[0]} (crash)", True
     return "", True
+
+
+def reaching_tests(mutant: Mutant, tests: Sequence[Executed]) -> list[Executed]:
+    """Return the tests that execute the line of a mutant, then the others of its module, each the shortest first.
+
+    The second may depend on the line too: what a process has made once, as a compiled form, it makes for no later test.
+    """
+    of_module = [test for test in tests if mutant.module in test.lines]
+    return sorted(of_module, key=lambda test: (mutant.line not in test.lines[mutant.module], test.seconds))
 
 
 def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str, str]:
@@ -265,7 +275,7 @@ def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str
         file = copy / PACKAGE / mutant.module
         text = file.read_bytes()
         file.write_bytes(text[: mutant.begin] + mutant.after.encode() + text[mutant.end :])
-        reaching = [test for test in tests if mutant.line in test.lines.get(mutant.module, ())]
+        reaching = reaching_tests(mutant, tests)
         every = True
         for suite, seconds in (("make test", FAST_SECONDS), ("make test-all", SLOW_SECONDS)):
             of_suite = [test for test in reaching if test.slow == (suite == "make test-all")]
