@@ -208,7 +208,7 @@ def drawn_mutants(count: int, seed: int, tests: Sequence[Executed]) -> Iterator[
         assert all((TOP / PACKAGE / place).exists() for place in places)
         of_kind = defaultdict[str, list[Mutant]](list)
         for module in sorted(executed):
-            if any(module == place or module.startswith(f"{place}/") for place in places):
+            if module.endswith(".py") and any(module == place or module.startswith(f"{place}/") for place in places):
                 source = (TOP / PACKAGE / module).read_bytes()
                 for mutant in Sites(module, source).mutants:
                     if mutant.line in executed[module]:
