@@ -233,7 +233,8 @@ def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -
         spent += sum(test.seconds for test in batch)
         limit = 120 + 10 * sum(test.seconds for test in batch)
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--timeout", f"{limit:.0f}"]
-        environment = {**os.environ, "PYTHONPATH": str(copy), "XDG_CACHE_HOME": str(cache)}
+        folders = os.pathsep.join([str(copy), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+        environment = {**os.environ, "PYTHONPATH": folders, "XDG_CACHE_HOME": str(cache)}
         names = [test.test for test in batch]
         try:
             done = subprocess.run(
