@@ -119,9 +119,12 @@ class Predictor:
                 note = ": ".join(filter(None, about))
                 return Seen(note=note, invalid=not isinstance(e, Lost) or isinstance(e, Outside))
             seen.values += [float(v) for v in readings.values]
-            sizes = [
-                float(each.number.gradient(x, None, {each.key: 1.0})[0]) for each in self.parameters
-            ]  # type: ignore[arg-type]
+            # the number of a key needs no scene
+            slopes_of_keys = (
+                each.number.gradient(x, None, {each.key: 1.0})  # type: ignore[arg-type]
+                for each in self.parameters
+            )
+            sizes = [float(slope[0]) for slope in slopes_of_keys]
             sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
             seen.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
             seen.curves = seen.curves or readings.curves
