@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 CHART = 2  # coordinates of a place in a chart
-BESIDE_CURVE = 1e-3  # of the element size, at gmsh's edges, beside which it makes smaller elements
+BESIDE_CURVE = 1e-2  # of the element size, at edges of gmsh, beside which it makes flat triangles
 FEWER = 0.7  # lines of a grid are nearer than places by up to this factor
 
 

@@ -14,6 +14,7 @@ from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import GREATEST, TableError, TableRows, column_size, read_rows
 from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.quantities.registry import QUANTITIES, endings
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import Expected, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import NAMES
@@ -353,15 +354,30 @@ def refuse_twice(header: str, of: str, before: Mapping[str, str], where: str) ->
     CaseError
         With both headers.
     """
-    alike = next((name for name in before if name == of or _one_fold(name, of)), None)
+    alike = next((name for name in before if quantity_of(name) == quantity_of(of)), None)
     if alike is not None:
         raise CaseError(
             f"{where}: {before[alike]} and {header} are one measurement in two columns: leave one out"
         )
 
 
-def _one_fold(of: str, other: str) -> bool:
-    return of in FOLDS and FOLDS[of] == FOLDS.get(other)
+def quantity_of(result: str) -> str:
+    """Return one name of what several results are, in units or without: of a fold its load.
+
+    Examples
+    --------
+    >>> quantity_of("w_mm"), quantity_of("tip_ux_mm"), quantity_of("omega2_3")
+    ('w_over_h', 'tip_ux', 'hertz_3')
+    """
+    if result in FOLDS:
+        return f"fold of {FOLDS[result]}"
+    if result.startswith("omega2_"):
+        return result.replace("omega2_", "hertz_")
+    for each in QUANTITIES.values():
+        if any(result == in_units.name for in_units in each.in_units):
+            return each.name
+    ending = next((ending for ending in endings() if result.endswith(f"_{ending}")), "")
+    return result.removesuffix(f"_{ending}")
 
 
 def table_of(

@@ -23,7 +23,7 @@ PLATE = {"geometry": "plate", "length": 1, "width": 0.5, **NU}
 CYLINDER = {"geometry": "cylinder", "radius": 1, "length": 2, **NU}
 CAP = {"geometry": "cap", "radius": 1, "polar": 60, **NU}
 TORUS = {"geometry": "torus", "radius": 1, "tube_radius": 0.3, **NU}
-EDGE = {"plate": "left", "cylinder": "bottom", "cap": "rim"}
+EDGE = {"plate": "left", "cylinder": "bottom", "cap": "rim", "disc": "rim"}
 
 
 def case(shell: dict[str, Any], points: dict[str, Any], size: float = 0.2, **keys: Any) -> Case:
@@ -163,6 +163,12 @@ REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
         {"A": polar(np.pi / 3 - 1e-5)},
         "none",
         "points.A: [0.86602, 0, 0.500009]: is 1e-05 from the edge rim at [0",
+    ),
+    (
+        {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+        {"A": [0.9992, 0, 0]},
+        "none",
+        "points.A: [0.9992, 0, 0]: is 0.0008 from the edge rim at [1, 0",
     ),
 ]
 
