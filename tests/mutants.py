@@ -303,10 +303,10 @@ def killer(copy: Path, cache: Path, tests: Sequence[Executed], seconds: float) -
         # a test of the record is not there any more
         assert done.returncode != 4, f"{done.stdout}\n{done.stderr}"
         # tests that fail, a crash; 5: none is collected
-        if failed or done.returncode not in (0, 1, 5):
-            return failed[0].split(" - ")[0].split(" ", 1)[
-                1
-            ] if failed else f"{names[0]} (crash)", True
+        if failed:
+            return failed[0].split(" - ")[0].split(" ", 1)[1], True
+        if done.returncode not in (0, 1, 5):
+            return f"{names[0]} (crash)", True
     return "", True
 
 
@@ -341,26 +341,26 @@ def tried(mutant: Mutant, tests: Sequence[Executed], kernels: Path) -> tuple[str
         )
         file = copy / PACKAGE / mutant.module
         text = file.read_bytes()
-        file.write_bytes(text[: mutant.begin] + mutant.after.encode() + text[mutant.end :])
+        mutated = text[: mutant.begin] + mutant.after.encode() + text[mutant.end :]
         reaching = reaching_tests(mutant, tests)
-        every = True
+        all_are_run = True
         for suite, seconds in (("make test", FAST_SECONDS), ("make test-all", SLOW_SECONDS)):
             of_suite = [test for test in reaching if test.slow == (suite == "make test-all")]
+            file.write_bytes(mutated)
             found, complete = killer(copy, cache, of_suite, seconds)
-            if found:
-                file.write_bytes(text)
+            while found:
                 killing_tests = [test for test in of_suite if test.test == found]
+                file.write_bytes(text)
                 false_alarm, _ = killer(copy, cache, killing_tests, seconds)
-                return (
-                    (found, suite) if not false_alarm else ("none", f"{found} fails without it too")
-                )
-            every &= complete
-    return (
-        "none",
-        f"all {len(reaching)} tests"
-        if every
-        else f"of {len(reaching)} tests those within the time",
-    )
+                if not false_alarm:
+                    return found, suite
+                file.write_bytes(mutated)  # the test fails without the mutant too: the next ones
+                of_suite = of_suite[of_suite.index(killing_tests[0]) + 1 :]
+                found, complete = killer(copy, cache, of_suite, seconds)
+            all_are_run &= complete
+    if all_are_run:
+        return "none", f"all {len(reaching)} tests"
+    return "none", f"of {len(reaching)} tests those within the time"
 
 
 def main() -> None:
