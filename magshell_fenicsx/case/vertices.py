@@ -14,7 +14,7 @@ from magshell_fenicsx.mesh.distinct import NEAR, SAME_PLACE, told_apart
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline
 
@@ -187,7 +187,7 @@ class Vertices:
             near = (
                 (vertices[i] == vertices[j]).all()
                 if vertices is not None
-                else apart < NEAR * self.size(places[i])
+                else apart < NEAR * self._size_of_elements(places[i], shape)
             )
             if near and not np.array_equal(places[i], places[j]):
                 self._refuse(
@@ -198,15 +198,11 @@ class Vertices:
                     NEAR,
                 )
 
-    def _refuse_beside_edges(
-        self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None
-    ) -> None:
+    def _refuse_beside_edges(self, name: str, shape: Grid | Shape, plane: Mirror | None) -> None:
         """See that a point is not beside an edge or a plane of symmetry, but on it or away from
         it."""
         chart, factor = self.points[name], NEAR if isinstance(shape, Grid) else BESIDE_CURVE
-        size = self.size(chart)
-        if isinstance(shape, Grid):
-            size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
+        size = self._size_of_elements(chart, shape)
         (place,) = self.drawn.embedding(chart[None])
         for side in plane.sides.values() if plane else ():
             off = float(side.beyond(place))
@@ -221,6 +217,15 @@ class Vertices:
                 self._refuse(
                     name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
                 )
+
+    def _size_of_elements(self, chart: Array, shape: Grid | Shape) -> float:
+        """Return the size of the elements at a place (2,): none is wider than the shape."""
+        if isinstance(shape, Grid):
+            return min(
+                self.size(chart),
+                *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)),
+            )
+        return min(self.size(chart), shape.area / shape.reach)
 
     def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which stands in `what`."""

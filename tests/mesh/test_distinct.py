@@ -121,6 +121,13 @@ def test_a_point_beside_an_edge_is_on_it(
     assert other.points["A"] == pytest.approx(one.points["A"], abs=1e-9)
 
 
+def test_elements_are_no_wider_than_the_shape() -> None:
+    """A point in the middle of a narrow strip's end is not beside its sides, whatever `mesh.size`."""
+    strip = {"geometry": "strip", "width": 0.2, "radius_to_thickness": 50, "poisson_ratio": 0}
+    patch = meshed(strip, {"A": [0.5, 0.05, 0]}, size=10)
+    assert patch.points["A"] == pytest.approx([0.5, 0.05], abs=1e-12)
+
+
 def test_two_names_of_a_place() -> None:
     """Points that differ by less than 1e-6 are one vertex."""
     patch = meshed(PLATE, {"A": [0.333, 0.25, 0], "B": [0.3330004, 0.2500004, 0]})
