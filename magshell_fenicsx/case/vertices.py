@@ -16,7 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.vertex_spacing import (
     MIN_VERTEX_DISTANCE,
     SAME_PLACE_TOLERANCE,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 CHART = 2  # coordinates of a place in a chart
-EDGE_DISTANCE = 1e-3  # over the element size: at gmsh's edges, beside which elements are smaller
+EDGE_DISTANCE = 1e-2  # over the element size: at gmsh's edges, beside which it makes flat triangles
 GRID_FACTOR = 0.7  # lines of a grid are nearer than places by up to this factor
 
 
@@ -197,7 +197,7 @@ class Vertices:
             near = (
                 (vertices[i] == vertices[j]).all()
                 if vertices is not None
-                else apart < MIN_VERTEX_DISTANCE * self.size(places[i])
+                else apart < MIN_VERTEX_DISTANCE * self._size_of_elements(places[i], shape)
             )
             if near and not np.array_equal(places[i], places[j]):
                 self._refuse(
@@ -208,17 +208,11 @@ class Vertices:
                     MIN_VERTEX_DISTANCE,
                 )
 
-    def _refuse_beside_edges(
-        self, name: str, shape: Chart | RimmedGrid, plane: Mirror | None
-    ) -> None:
+    def _refuse_beside_edges(self, name: str, shape: Grid | Shape, plane: Mirror | None) -> None:
         """Refuse a point beside an edge or a plane of symmetry, neither on it nor away from it."""
-        chart, factor = (
-            self.points[name],
-            MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else EDGE_DISTANCE,
-        )
-        size = self.size(chart)
-        if isinstance(shape, Grid):
-            size = min(size, *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)))
+        chart = self.points[name]
+        factor = MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else EDGE_DISTANCE
+        size = self._size_of_elements(chart, shape)
         (place,) = self.outline.embedding(chart[None])
         for side in plane.planes.values() if plane else ():
             off = float(side.signed_distance(place))
@@ -233,6 +227,15 @@ class Vertices:
                 self._refuse(
                     name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
                 )
+
+    def _size_of_elements(self, chart: Array, shape: Grid | Shape) -> float:
+        """Return the size of the elements at a place (2,): none is wider than the shape."""
+        if isinstance(shape, Grid):
+            return min(
+                self.size(chart),
+                *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)),
+            )
+        return min(self.size(chart), shape.area / shape.reach)
 
     def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which is in the words `what`."""

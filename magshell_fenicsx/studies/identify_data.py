@@ -20,6 +20,7 @@ from magshell_fenicsx.input.tables import (
     read_rows,
 )
 from magshell_fenicsx.platform.input_files import Files
+from magshell_fenicsx.quantities.registry import QUANTITIES, endings
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import NamesOnlyScene, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import NAMES
@@ -379,9 +380,8 @@ def refuse_twice(
     CaseError
         With both headers.
     """
-    duplicate = next(
-        (name for name in earlier_headers if name == result or _one_fold(name, result)), None
-    )
+    quantity = quantity_of(result)
+    duplicate = next((name for name in earlier_headers if quantity_of(name) == quantity), None)
     if duplicate is not None:
         raise CaseError(
             f"{location}: {earlier_headers[duplicate]} and {header} are one measurement in two "
@@ -389,8 +389,23 @@ def refuse_twice(
         )
 
 
-def _one_fold(result: str, other: str) -> bool:
-    return result in FOLDS and FOLDS[result] == FOLDS.get(other)
+def quantity_of(result: str) -> str:
+    """Return one name of what several results are, in units or without: of a fold its load.
+
+    Examples
+    --------
+    >>> quantity_of("w_mm"), quantity_of("tip_ux_mm"), quantity_of("omega2_3")
+    ('w_over_h', 'tip_ux', 'hertz_3')
+    """
+    if result in FOLDS:
+        return f"fold of {FOLDS[result]}"
+    if result.startswith("omega2_"):
+        return result.replace("omega2_", "hertz_")
+    for each in QUANTITIES.values():
+        if any(result == in_units.name for in_units in each.in_units):
+            return each.name
+    ending = next((ending for ending in endings() if result.endswith(f"_{ending}")), "")
+    return result.removesuffix(f"_{ending}")
 
 
 def table_of(

@@ -134,10 +134,12 @@ class Predictor:
                     note=note, invalid=not isinstance(e, LostResult) or isinstance(e, Outside)
                 )
             prediction.values += [float(v) for v in readings.values]
-            sizes = [
-                float(parameter.number.gradient(x, None, {parameter.key: 1.0})[0])
+            # the number of a key needs no scene
+            slopes_of_keys = (
+                parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
                 for parameter in self.parameters
-            ]  # type: ignore[arg-type]
+            )
+            sizes = [float(slope[0]) for slope in slopes_of_keys]
             sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
             prediction.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
             prediction.curves = prediction.curves or readings.curves

@@ -17,6 +17,7 @@ from scipy.optimize import brentq, fsolve
 from magshell_fenicsx import Case
 from magshell_fenicsx.public import run
 
+COARSE = "mesh.size=20 mm", "loading.points=1", "loading.volume_change=233000 mm^3"
 STRETCH = 1.19  # of the rubber at its pole, when it touches
 
 
@@ -72,8 +73,10 @@ def test_two_balloons() -> None:
     """The pressure at the end: that of the membrane under a plane to the order h/R = 0.01.
 
     The faces are half the deformed thickness from the mid-surfaces, which the plane is lower by.
+    The mesh is coarser than that of the case, and the balloons are blown up a little less.
     """
-    found = run(Case.load(CASES / "two_balloons.yaml"))
+    found = run(Case.load(CASES / "two_balloons.yaml", COARSE))
+    assert found.stopped is None
     last = found.rows[-1]
     volume, thin = float(last["volume_change"]) / 2, 0.005 / STRETCH**4
     p, radius = blown(volume, 0.5 - thin)

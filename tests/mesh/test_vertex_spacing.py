@@ -28,7 +28,7 @@ PLATE = {"geometry": "plate", "length": 1, "width": 0.5, **NU}
 CYLINDER = {"geometry": "cylinder", "radius": 1, "length": 2, **NU}
 CAP = {"geometry": "cap", "radius": 1, "polar": 60, **NU}
 TORUS = {"geometry": "torus", "radius": 1, "tube_radius": 0.3, **NU}
-EDGE = {"plate": "left", "cylinder": "bottom", "cap": "rim"}
+EDGE = {"plate": "left", "cylinder": "bottom", "cap": "rim", "disc": "rim"}
 
 
 def case(shell: dict[str, Any], points: dict[str, Any], size: float = 0.2, **keys: Any) -> Case:
@@ -126,6 +126,13 @@ def test_a_point_beside_an_edge_is_on_it(
     assert other.points["A"] == pytest.approx(one.points["A"], abs=1e-9)
 
 
+def test_elements_are_no_wider_than_the_shape() -> None:
+    """A point in the middle of a narrow strip's end is not beside its sides, whatever `mesh.size`."""
+    strip = {"geometry": "strip", "width": 0.2, "radius_to_thickness": 50, "poisson_ratio": 0}
+    patch = meshed(strip, {"A": [0.5, 0.05, 0]}, size=10)
+    assert patch.points["A"] == pytest.approx([0.5, 0.05], abs=1e-12)
+
+
 def test_two_names_of_a_place() -> None:
     """Points that differ by less than 1e-6 are one vertex."""
     patch = meshed(PLATE, {"A": [0.333, 0.25, 0], "B": [0.3330004, 0.2500004, 0]})
@@ -168,6 +175,12 @@ REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
         {"A": polar(np.pi / 3 - 1e-5)},
         "none",
         "points.A: [0.86602, 0, 0.500009]: is 1e-05 from the edge rim at [0",
+    ),
+    (
+        {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+        {"A": [0.9992, 0, 0]},
+        "none",
+        "points.A: [0.9992, 0, 0]: is 0.0008 from the edge rim at [1, 0",
     ),
 ]
 

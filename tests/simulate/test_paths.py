@@ -24,7 +24,7 @@ def events(found: Result) -> list[tuple[str, str, Any]]:
 @pytest.mark.slow
 def test_volume_snaps_back() -> None:
     """R/h = 1000, axisymmetric: k_d = 0.325723564, followed well past the snap-back in volume."""
-    found = result("snap_back.yaml")
+    found = result("snap_back.yaml", "loading.points=17")
     assert found.stopped is None
     assert found.knockdown == pytest.approx(0.325723564, rel=1e-6)
     volume, w = (

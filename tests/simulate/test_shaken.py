@@ -63,7 +63,6 @@ def test_a_kink_is_an_impulse() -> None:
     assert found["work"].max() > 0
 
 
-@pytest.mark.slow
 def test_drag_and_sine() -> None:
     history = f"{SMALL} + 0.01*(1 - cos(6*pi*t/{PERIOD}))"
     found = moved(history, drag=0.05 * BEAM, duration=PERIOD / 2, step=PERIOD / 300)

@@ -139,6 +139,8 @@ def test_two_plates_that_clap_conserve_energy(symmetry: str, shell: dict[str, An
 def test_the_work_of_a_rim_that_meets_the_other_plate() -> None:
     """A small plate is driven down by its rim onto the large one: the work of its mean force closes
     the balance.
+
+    Drag acts on the motion of the rim too.
     """
     small = {
         "shell": DISC | {"radius": "20 mm"},
@@ -146,7 +148,12 @@ def test_the_work_of_a_rim_that_meets_the_other_plate() -> None:
     }
     moves = [{"supports": ["high.rim"], "translation": ["0 mm", "0 mm", "-1 mm"]}]
     driven = {"kind": "edge", "name": "down", "moves": moves, "points": 1, "factor": 1e-4}
-    history = {"history": {"down": "0.0001 + (t/0.02)**2"}, "duration": 0.018, "points": 9}
+    history = {
+        "history": {"down": "0.0001 + (t/0.02)**2"},
+        "duration": 0.018,
+        "points": 9,
+        "drag": 20.0,
+    }
     moving = {key: value for key, value in THROWN.items() if key != "velocity"} | history
     shells = DISCS["shells"] | {"high": small}
     found = found_of(

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import pytest
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
@@ -31,7 +30,6 @@ def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
     return Case.from_source({**data, "solid": {"layers": layers}})
 
 
-@pytest.mark.slow
 def test_error_of_a_clamped_disc() -> None:
     """It is below the estimate, and that is below the tolerance."""
     case, told = plate({"tolerance": 0.02}), list[str]()

@@ -369,6 +369,16 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
             "applied and applied_mT are one measurement in two columns",
         ),
         (
+            "applied [mT],w_over_h,w [mm]\n5,-1,-0.8\n",
+            [],
+            "w_over_h and w are one measurement in two columns",
+        ),
+        (
+            "hertz_1 [Hz],omega2_1,shell.thickness [mm]\n10,1e-3,0.8\n",
+            ["shell.density=1100 kg/m^3"],
+            "hertz_1 and omega2_1 are one measurement in two columns",
+        ),
+        (
             f"{AT}5,9\n",
             ["identify.parameters={shell.youngs_modulus: {prior: -1 kPa, deviation: 1 kPa}}"],
             "youngs_modulus.prior: .*'-1 kPa': must be greater than or equal to 1",
