@@ -408,7 +408,9 @@ def identify(
 
     folder = chosen_folder(out, f"{case.stem}_identify")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = identify_parameters(case, data, set_ or [], folder, make_case=_shared, say=print_line)
+        done = identify_parameters(
+            case, data, set_ or [], folder, make_case=_shared, say=print_line
+        )
     print_line(f"results in {folder}/")
     if done.fit.ended != "converged":
         raise failure(f"stopped early: {done.fit.ended}", STOPPED)

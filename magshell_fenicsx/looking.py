@@ -93,7 +93,9 @@ def view(folder: Run) -> None:
         return
     with exit_codes(stopped=(OSError,)):
         file = report_of(folder)
-    print_line(f"{'opened' if open_in_browser(file) else 'no web browser found; the report is'} {file}")
+    print_line(
+        f"{'opened' if open_in_browser(file) else 'no web browser found; the report is'} {file}"
+    )
 
 
 @app.command()

@@ -142,7 +142,9 @@ def boundary(
     from magshell_fenicsx.studies.boundary_map import boundary_map
 
     overs = [over] if isinstance(over, str) else over
-    return boundary_map(file, overs, settings, out, comm, say, make_case=Case.from_source, start=start)
+    return boundary_map(
+        file, overs, settings, out, comm, say, make_case=Case.from_source, start=start
+    )
 
 
 def identify(

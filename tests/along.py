@@ -66,7 +66,9 @@ def along(
                 total += (mu[term.amplitude] if term.amplitude else 1.0) * part
         return total
 
-    return np.asarray(system._summed(system.at_state(State(u, dict(mu))).evaluate(total), constrained=False))
+    return np.asarray(
+        system._summed(system.at_state(State(u, dict(mu))).evaluate(total), constrained=False)
+    )
 
 
 def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:
@@ -128,10 +130,15 @@ def check_derivatives(
     """
     system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
     rough, moved, other = (
-        system.zero_at_supports(np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size])
+        system.zero_at_supports(
+            np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]
+        )
         for k in range(3)
     )
-    u, v = system.zero_at_supports(flat.ravel()[: system.size]) + 0.002 * h * rough, 1e-7 * h * moved
+    u, v = (
+        system.zero_at_supports(flat.ravel()[: system.size]) + 0.002 * h * rough,
+        1e-7 * h * moved,
+    )
     at = system.at_state(State(u, mu))
     entries = at.evaluate(term.entries)
     assert deep[0] < at.evaluate(term.penetration) < deep[1]

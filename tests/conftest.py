@@ -135,7 +135,11 @@ def hemisphere(
 
 def spherical(dimple: Dimple | None) -> Embedding:
     """The sphere with a dimple at its pole."""
-    return DeviatedEmbedding(sphere_embedding, sphere_embedding, (dimple,)) if dimple else sphere_embedding
+    return (
+        DeviatedEmbedding(sphere_embedding, sphere_embedding, (dimple,))
+        if dimple
+        else sphere_embedding
+    )
 
 
 def disc(size: float, *, half: bool = False) -> Midsurface:

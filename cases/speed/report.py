@@ -72,7 +72,10 @@ def compare(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
     lines, scale = [], 1.0
     if new["machine"] != old["machine"]:
         scale = median([ratio for (_, key), ratio in ratios.items() if key.endswith("_s")] or [1.0])
-        lines += [f"new: {describe_machine(new['machine'])}", f"old: {describe_machine(old['machine'])}"]
+        lines += [
+            f"new: {describe_machine(new['machine'])}",
+            f"old: {describe_machine(old['machine'])}",
+        ]
         lines.append(
             f"Not the same machine or versions: times are divided by their median ratio {scale:.3g}."
         )

@@ -44,9 +44,10 @@ def _docstrings(section: type) -> dict[str, str]:
     for key, statement in zip(definition.body, definition.body[1:], strict=False):
         if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
             continue
-        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-            if isinstance(text := statement.value.value, str):
-                docstrings[key.target.id] = inspect.cleandoc(text)
+        value = statement.value if isinstance(statement, ast.Expr) else None
+        text = value.value if isinstance(value, ast.Constant) else None
+        if isinstance(text, str):
+            docstrings[key.target.id] = inspect.cleandoc(text)
     return docstrings
 
 
@@ -205,9 +206,9 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
         if key in NO_KEYS:
             continue
         fields = models[0].model_fields if len(models) == 1 else ()
-        if len(models) < 2 and not below_names and isinstance(key, str):
-            if key not in {*fields, *_data_at(data, keys, dict)}:
-                continue  # of a union of values, or of a section and a list of it
+        may_be_tag = len(models) < 2 and not below_names and isinstance(key, str)
+        if may_be_tag and key not in {*fields, *_data_at(data, keys, dict)}:
+            continue  # of a union of values, or of a section and a list of it
         if below_names:
             keys.append(key)
             below_names = False

@@ -60,7 +60,9 @@ class GravityStep(BodyForceStep):
     kind: Literal["gravity"]
     direction: DirectionVector = Field(default=[0.0, 0.0, -1.0])
     """Its three components, of any length; by default down e3"""
-    acceleration: Annotated[float, over_size(ACCELERATION)] | None = Field(default=None, ge=-1e3, le=1e3)
+    acceleration: Annotated[float, over_size(ACCELERATION)] | None = Field(
+        default=None, ge=-1e3, le=1e3
+    )
     """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
 
     @property
@@ -72,7 +74,9 @@ class GravityStep(BodyForceStep):
         """The unit vector (3,)."""
         return unit(np.array(self.direction))
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         return [SymmetryConstraint(vectors=[self._along])]
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:

@@ -127,7 +127,11 @@ class Joined(KeyAbility[Sequence[JointSection]]):
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """Planes that cross each joint: its edges are their own mirror images."""
         names = [name for section in self.given for name in section.edges]
-        return [SymmetryConstraint(mirrors=lambda mirror: all(mirror.image_of_edge(n) == n for n in names))]
+        return [
+            SymmetryConstraint(
+                mirrors=lambda mirror: all(mirror.image_of_edge(n) == n for n in names)
+            )
+        ]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         scales = context.scales if any(section.stiffness for section in self.given) else None

@@ -234,7 +234,9 @@ def _leaves(section: LaminateSection, geometry: str) -> SymmetryConstraint:
     )
     if section.twists:
         return SymmetryConstraint(reason, mirrors=no_plane)
-    return SymmetryConstraint(reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside)
+    return SymmetryConstraint(
+        reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside
+    )
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:

@@ -237,7 +237,9 @@ class Step(Section):
         """What is often meant in another way, with the key; None if nothing is."""
         return None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """The symmetry that it leaves of a shell."""
         return []
 

@@ -306,7 +306,9 @@ class MeridianModel(Thin):
             ]
         return values
 
-    def with_numbers(self, of: "MeridianModel", numbers: SettableNumber, value: float) -> "MeridianModel":
+    def with_numbers(
+        self, of: "MeridianModel", numbers: SettableNumber, value: float
+    ) -> "MeridianModel":
         """The same model with the numbers of another one, which all evaluations put in place by
         that value.
         """

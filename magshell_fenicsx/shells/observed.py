@@ -173,7 +173,9 @@ class Observed:
     def volume_change(self, u: Vector, mu: Amplitudes | None = None) -> float:
         """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
         moving = self.system.moving
-        lids = moving.edge_pressure.swept_volume(mu) if mu and moving and moving.edge_pressure else 0.0
+        lids = (
+            moving.edge_pressure.swept_volume(mu) if mu and moving and moving.edge_pressure else 0.0
+        )
         return self.multiplicity * (
             self.system.at_state(State(u, dict(mu or {}))).integral(self._volume) + lids
         )

@@ -393,7 +393,9 @@ class ShellModel(Thin):
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(
-            self.kernels.compile("volume energy", volume), midsurface.points, midsurface.cells_of_point
+            self.kernels.compile("volume energy", volume),
+            midsurface.points,
+            midsurface.cells_of_point,
         )
         if loads.interaction:
             interacting.refuse_near()  # now that all is there which it reads
@@ -410,7 +412,8 @@ class ShellModel(Thin):
             return UnfoldedModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [
-            support_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane_vectors
+            support_along(self.V, 1, self._on_mirror, along)
+            for along in self.mirror.in_plane_vectors
         ]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)

@@ -230,7 +230,9 @@ class SolidModel(Observed):
         low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
         inside = (low < height - ROUNDING) & (height < high + ROUNDING)
         part = (height - low[inside]) / (high - low)[inside]
-        return EdgeCurve.from_facets(self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0))
+        return EdgeCurve.from_facets(
+            self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0)
+        )
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:
@@ -238,7 +240,9 @@ class SolidModel(Observed):
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [
-            support_along(self.V, 2, facets, along) for facets in self._faces for along in directions
+            support_along(self.V, 2, facets, along)
+            for facets in self._faces
+            for along in directions
         ]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:

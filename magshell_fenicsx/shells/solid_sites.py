@@ -200,7 +200,9 @@ def _on_facet(points: Array, facet: int) -> Array:
     return np.asarray(corners[0] + points @ (corners[1:3] - corners[0]))
 
 
-def _cells_at(body: BodyMesh, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _cells_at(
+    body: BodyMesh, facets: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Owned cells with one of these facets, and its number in each."""
     topology = body.mesh.topology
     links = topology.connectivity(2, 3)

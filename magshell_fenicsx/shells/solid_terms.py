@@ -156,7 +156,9 @@ class TermFactory:
             self.soft(of, of.soft, applied),
         ]
 
-    def soft(self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None) -> SolidTerm:
+    def soft(
+        self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None
+    ) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
         law, n0, *given = self._of_sheet(sheet, soft, applied)
@@ -173,7 +175,9 @@ class TermFactory:
         law, n0, *given = self._of_sheet(sheet, field.soft, applied)
         densities = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            densities[axis] = Density(sheet.induced_in_solid, (law, *self._constants(e), n0, *given))
+            densities[axis] = Density(
+                sheet.induced_in_solid, (law, *self._constants(e), n0, *given)
+            )
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
     def _of_sheet(
@@ -344,7 +348,9 @@ class TermFactory:
             )
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
-        return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER_FACE])
+        return Density(
+            on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER_FACE]
+        )
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points
@@ -388,7 +394,9 @@ class TermFactory:
             (None, None) if potential else (densities.following, densities.following_end)
         )
         of_faces = {
-            "pressure": Density(of, parameters, ON_FACE, QUADRATURE_DEGREE, "outer", faces[OUTER_FACE], work=work)
+            "pressure": Density(
+                of, parameters, ON_FACE, QUADRATURE_DEGREE, "outer", faces[OUTER_FACE], work=work
+            )
         }
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
@@ -396,7 +404,8 @@ class TermFactory:
             low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
             parts = {
                 "whole": low > MIDSURFACE_HEIGHT - ROUNDING,
-                "upper": (low < MIDSURFACE_HEIGHT - ROUNDING) & (high > MIDSURFACE_HEIGHT + ROUNDING),
+                "upper": (low < MIDSURFACE_HEIGHT - ROUNDING)
+                & (high > MIDSURFACE_HEIGHT + ROUNDING),
             }
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):

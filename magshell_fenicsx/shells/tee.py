@@ -166,7 +166,10 @@ class Tie:
         """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
         collective.
         """
-        H, u = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True), global_values(self._u)
+        H, u = (
+            np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True),
+            global_values(self._u),
+        )
         if self._turns and len(H):
             of_parts = np.zeros((len(H), PARTS, PARTS))
             upper = np.triu_indices(PARTS)

@@ -237,7 +237,9 @@ class EnergyFactory:
             for name, density in by_name.items()
         }
 
-    def _of_sheet(self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None) -> list[Parameter]:
+    def _of_sheet(
+        self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None
+    ) -> list[Parameter]:
         """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of
         the field.
         """

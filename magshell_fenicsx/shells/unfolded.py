@@ -58,7 +58,10 @@ class UnfoldedModes:
         assert isinstance(sector, Sector)
         self._folding = unfolding_of(sector, patch)
         half = self._as_half(
-            distribute(unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE)), self._model.system.comm)
+            distribute(
+                unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE)),
+                self._model.system.comm,
+            )
         )
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))
@@ -73,7 +76,9 @@ class UnfoldedModes:
         half, system = self.half, self._model.system
         whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
-            half.system.zero_at_supports(np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel())
+            half.system.zero_at_supports(
+                np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel()
+            )
         )
 
     def counts(self, state: State) -> Sequence[int]:

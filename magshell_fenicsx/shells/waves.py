@@ -169,7 +169,9 @@ class Waves:
 
     def numbers(self, state: State) -> NDArray[np.float64]:
         """(5, entries) of the matrices at the five m."""
-        of_nodes = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, self._nodes[:3]))
+        of_nodes = self._system.at_state(state).evaluate_forms(
+            lambda: self._entries(state, self._nodes[:3])
+        )
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
     def counts_of(self, values: NDArray[np.float64]) -> list[int]:

@@ -167,7 +167,9 @@ def larger(scene: Scene, mode: str) -> Scene:
     raise Stopped(f"no model has the mode {mode}: {why}")
 
 
-def leaving(stage: Stage, bifurcation: Record, goal: ContinuationGoal, scale: float, number: int) -> Records:
+def leaving(
+    stage: Stage, bifurcation: Record, goal: ContinuationGoal, scale: float, number: int
+) -> Records:
     """The records of the branch at a bifurcation in the model that has its mode; its value is the
     state at their end.
 

@@ -166,7 +166,9 @@ class Intervals:
         """The motion at a later time, which may be `known` already, and the step to go on with."""
         between = partial(self.scene.journal.check, known)
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
-            if now.t in self.marks and self.integrator.begins_anew(now.t):  # the acceleration after it
+            if now.t in self.marks and self.integrator.begins_anew(
+                now.t
+            ):  # the acceleration after it
                 now = self.integrator.begin(now.t, now.u, now.v, now)
             now, dt = advance(self.integrator, now, t, self.steps, dt, between)
         return now, dt
@@ -237,7 +239,9 @@ class Intervals:
         rest = Point(
             State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error
         )
-        made = integrator.factored_state or FactoredState(still, {}, 0.0, integrator.factorisation.habit)
+        made = integrator.factored_state or FactoredState(
+            still, {}, 0.0, integrator.factorisation.habit
+        )
         factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
         for part in (point, rest, factors)[len(points) :]:
             scene.journal.record(part)
@@ -253,6 +257,8 @@ class Intervals:
         ):  # beside a body factors belong to a whole step: each interval makes its own
             self.integrator.factored_state = None
         if last and last.s and not self.integrator.contact:
-            self.integrator.factor(FactoredState(last.state.u, dict(last.state.mu), last.s, last.habit))
+            self.integrator.factor(
+                FactoredState(last.state.u, dict(last.state.mu), last.s, last.habit)
+            )
         elif last:
             self.integrator.factorisation.habit = last.habit

@@ -22,7 +22,9 @@ CLOSE = 4.0  # of that: from so near a step leads past the first contact
 MOST = 40  # looks at a way
 
 
-def way_to_touch(scene: Scene, leave: Callable[[State], State], here: State, guess: State) -> StepEvent:
+def way_to_touch(
+    scene: Scene, leave: Callable[[State], State], here: State, guess: State
+) -> StepEvent:
     """Where shells meet that do not touch yet, and whether all that touch let go; collective.
 
     Of pairs that meet on the straight way between two states of a step the first one counts. A step

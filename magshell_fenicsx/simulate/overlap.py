@@ -82,5 +82,8 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     for number in np.unique(part)[1:]:
         own = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)
-        if surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf) < OVERLAP_DISTANCE * h:
+        if (
+            surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf)
+            < OVERLAP_DISTANCE * h
+        ):
             raise CaseError(TOO_NEAR)

@@ -350,7 +350,9 @@ class Read:
         mu = {
             name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()
         }
-        guess = self.scene.model.system.with_moved_supports(State((1 - part) * a.u + part * b.u, mu))
+        guess = self.scene.model.system.with_moved_supports(
+            State((1 - part) * a.u + part * b.u, mu)
+        )
         row = self.places.row(stage.newton.system, place)
         ended = stage.newton.solve(stage.enter(guess), self.places.name, row)
         state, comm = stage.leave(ended.state), self.scene.comm

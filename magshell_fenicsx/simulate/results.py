@@ -99,7 +99,9 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         by_normal = {"pole": -1 / scene.problem.material.h}
         return Functional(
-            scene.observe(state)["w_pole_over_h"], system.zero_at_supports(by_u), deflections=by_normal
+            scene.observe(state)["w_pole_over_h"],
+            system.zero_at_supports(by_u),
+            deflections=by_normal,
         )
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
@@ -175,7 +177,9 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
     way = rotation(problem.azimuth)[:, axis]
     e = force_unit(scene) * weights(scene.model, name, way, problem.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
-    return Functional(value, system.zero_at_supports(system.at_state(state).stiffness_along(e)), reaction=e)
+    return Functional(
+        value, system.zero_at_supports(system.at_state(state).stiffness_along(e)), reaction=e
+    )
 
 
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:

@@ -94,7 +94,9 @@ def build_meridian(problem: Problem) -> Meridian:
     }
     points = {name: span.locate_named(named[name], x) for name, x in problem.points.items()}
     pieces = [(piece.name, piece.ends) for piece in span.shell_meridians]
-    held = [name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS]
+    held = [
+        name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS
+    ]
     vertices = meridian_vertices(problem)
     return make_meridian(
         span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints
@@ -113,7 +115,11 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     solid = problem.body
     assert solid
     body = sweep(
-        on_first_rank(comm, problem.triangulated), problem.material.h, solid.layer_bounds, comm, factor
+        on_first_rank(comm, problem.triangulated),
+        problem.material.h,
+        solid.layer_bounds,
+        comm,
+        factor,
     )
     return SolidModel(
         body,
@@ -193,9 +199,9 @@ class Scene:
         faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
         stiff = self.model.contacts or faces
         options = (
-            NewtonOptions(
-                reuse_distance=0.0, patience=7, stiffnesses=faces, allows_kinks=True
-            ) if stiff else None
+            NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses=faces, allows_kinks=True)
+            if stiff
+            else None
         )
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: SolverJournal = NoJournal()
@@ -298,7 +304,9 @@ class Scene:
         self.refuse_foreign(state, more=True)
         model, surface = self.model, self.model.midsurface
         displacement = fem.Function(model.u.function_space, name="u")
-        displacement.x.array[:] = model.system.at_state(state).evaluate(lambda: model.u.x.array.copy())
+        displacement.x.array[:] = model.system.at_state(state).evaluate(
+            lambda: model.u.x.array.copy()
+        )
         given = self.problem.mesh_file
         if not (surface and given and given.user_mesh):
             return displacement

@@ -206,7 +206,9 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     limits = SearchLimits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
     descend = dents.descended if search.stable else None
-    found = further_solutions(path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage))
+    found = further_solutions(
+        path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage)
+    )
     for number, solution in enumerate(found, 1):
         point = stage.point(solution)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
@@ -223,7 +225,9 @@ def _rules(stage: Stage) -> AcceptanceRules:
         changed = of_its_own(scene, stage.leave(state))
         return State(state.u, {**state.mu, **changed.mu}) if changed else None
 
-    return AcceptanceRules(partial(passes, stage), own) if scene.model.touchings else AcceptanceRules()
+    return (
+        AcceptanceRules(partial(passes, stage), own) if scene.model.touchings else AcceptanceRules()
+    )
 
 
 class _Dents:

@@ -160,4 +160,6 @@ def staged(
         system = device = Device(system, held, scale)
     if curves:
         system = along = ParametrisedSystem(system, *curves)
-    return Stage(scene, scene.newton.for_system(system) if held or curves else scene.newton, device, along)
+    return Stage(
+        scene, scene.newton.for_system(system) if held or curves else scene.newton, device, along
+    )

@@ -147,7 +147,14 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
     driven = f"conjugate of {name}"
     stage = staged(scene, state, {**others, name: driven})
     path, start = stage.begin(driven, "arc", State(state.u, state.mu | {driven: q}), drive.first)
-    walked = Walked(followed(stage, path.with_step_options(steps), start, ContinuationGoal("limit", sense=drive.first)))
+    walked = Walked(
+        followed(
+            stage,
+            path.with_step_options(steps),
+            start,
+            ContinuationGoal("limit", sense=drive.first),
+        )
+    )
     for record in walked:
         yield replace(record, amplitude=name)
     return walked.end

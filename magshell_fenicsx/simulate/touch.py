@@ -221,7 +221,10 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     whole = [of_all_nodes(stage.scene, state) for state in (stage.leave(low.state), end)]
     x0 = model.r0.x.array[: model.system.size].reshape(-1, 3)
     x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
-    at, touchings = model.system.at_state(end), [t for t in model.touchings if isinstance(t, Touching)]
+    at, touchings = (
+        model.system.at_state(end),
+        [t for t in model.touchings if isinstance(t, Touching)],
+    )
     own = slice(*model.V.dofmap.index_map.local_range)
     undeformed, half = (each[own] for each in at.evaluate(touchings[0].halves))
     half = np.minimum(half, undeformed)
@@ -274,8 +277,12 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
     for field in model.fields:
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
-            ends.append((model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu))
-        if said := [each for each in model.system.comm.allgather(field.passed_through(*ends)) if each]:
+            ends.append(
+                (model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu)
+            )
+        if said := [
+            each for each in model.system.comm.allgather(field.passed_through(*ends)) if each
+        ]:
             raise PathStopped(said[0], low, final=True)
 
 

@@ -163,7 +163,9 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
-        spherical = isinstance(embedding, DeviatedEmbedding) and embedding.perfect is sphere_embedding
+        spherical = (
+            isinstance(embedding, DeviatedEmbedding) and embedding.perfect is sphere_embedding
+        )
         if (
             not spherical
             or not isinstance(shape, DiscShape)

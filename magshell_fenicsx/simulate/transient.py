@@ -75,9 +75,13 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     axes = model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
-    velocity = vector_function(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
+    velocity = (
+        vector_function(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
+    )
     return np.asarray(
-        model.system.zero_at_supports(np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size])
+        model.system.zero_at_supports(
+            np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
+        )
     )
 
 
@@ -279,7 +283,9 @@ class Moving(State):
     ground: Vector | None = None
 
 
-def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]) -> Records:
+def motion(
+    scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]
+) -> Records:
     """The records of a step in time; its return value is the state at its end.
 
     Parameters
@@ -425,7 +431,9 @@ def _watched(
 
     def beyond(now: Motion) -> float:
         return (
-            scene.observe(scene.model.system.with_moved_supports(State(now.u, now.mu)))[event.column]
+            scene.observe(scene.model.system.with_moved_supports(State(now.u, now.mu)))[
+                event.column
+            ]
             - event.value
         )
 
@@ -446,7 +454,9 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), branches)
 
 
-def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]) -> Records:
+def released(
+    scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]
+) -> Records:
     """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state
     at its end.
 

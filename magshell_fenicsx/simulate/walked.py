@@ -55,7 +55,9 @@ class Walked:
         self.end = yield from self._records
 
 
-def followed(stage: Stage, path: Path, start: Point, goal: ContinuationGoal, branches: int = 0) -> Records:
+def followed(
+    stage: Stage, path: Path, start: Point, goal: ContinuationGoal, branches: int = 0
+) -> Records:
     """The records of a walk, with instabilities that the reduced model excludes, and of branches.
 
     Each direction of the branch at the first bifurcation is followed for that number of steps, or
@@ -262,7 +264,9 @@ def _beyond(
 
 def _asking(path: Path, first: float, finest: float) -> Path:
     """The path in steps that end early, to look for a fold."""
-    return path.with_step_options(replace(path.options, first=first, smallest=max(finest, ASKED * first)))
+    return path.with_step_options(
+        replace(path.options, first=first, smallest=max(finest, ASKED * first))
+    )
 
 
 def _onward(stage: Stage, walk: ContinuationRun) -> ContinuationRun | None:

@@ -184,7 +184,9 @@ def test_at_zero() -> None:
     z, a = points.field(3), points.field(1)
     z.x.array[:], a.x.array[:] = 0.3, [1, 2, 3]
     W = a[0] * z[0] ** 2 / 2 + z[1] * z[2] * ufl.exp(z[0])
-    found = points.evaluate(point_hessian("zero", W, z, 1, BlockPairs(((0, 0),)), log, at_zero=True), 3)
+    found = points.evaluate(
+        point_hessian("zero", W, z, 1, BlockPairs(((0, 0),)), log, at_zero=True), 3
+    )
     assert found == pytest.approx(
         np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]])
     )

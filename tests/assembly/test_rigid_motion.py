@@ -21,7 +21,9 @@ def test_derivatives(mu: dict[str, float]) -> None:
     """Central differences of the places and of their first derivatives, in all pairs of amplitudes."""
     here = apply_motions(MOTIONS, mu, X)
     for name in mu:
-        low, high = (apply_motions(MOTIONS, {**mu, name: mu[name] + side * STEP}, X) for side in (-1, 1))
+        low, high = (
+            apply_motions(MOTIONS, {**mu, name: mu[name] + side * STEP}, X) for side in (-1, 1)
+        )
         np.testing.assert_allclose(here.slopes[name], (high.x - low.x) / (2 * STEP), atol=1e-9)
         for other in mu:
             slope = (high.slopes[other] - low.slopes[other]) / (2 * STEP)
@@ -36,7 +38,9 @@ def test_rigid() -> None:
     here, Q = apply_motions(MOTIONS, mu, X).x, total_rotation(MOTIONS, mu).x.T
     np.testing.assert_allclose(here - here[0], (X - X[0]) @ Q.T, atol=1e-14)
     np.testing.assert_allclose(Q @ Q.T, np.eye(3), atol=1e-15)
-    quarter = RigidMotion("d", np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
+    quarter = RigidMotion(
+        "d", np.zeros(3), np.array([0.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])
+    )
     np.testing.assert_allclose(
         apply_motions([quarter], {"d": 1.0}, np.array([[2.0, 0.0, 5.0]])).x, [[1.0, 1.0, 5.0]]
     )

@@ -184,7 +184,10 @@ def moved_caps(found: Result) -> list[float]:
     (fold,) = found.limit_points
     assert fold["kind"] == "fold"
     system, (state,) = found.scene.model.system, found.singular.values()
-    factors, mode = Factorisation(system.comm), system.zero_at_supports(np.cos(np.arange(system.size)))
+    factors, mode = (
+        Factorisation(system.comm),
+        system.zero_at_supports(np.cos(np.arange(system.size))),
+    )
     factors.factor(system.tangent(state.u, state.mu))
     for _ in range(4):  # inverse iterations
         mode = factors.solve(mode)

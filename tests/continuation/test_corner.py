@@ -91,9 +91,7 @@ def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
     assert [point.negative_pivots for point in folds] == [0, 1]
     assert folds[0].state.mu["load"] == pytest.approx(f(1 - 1 / np.sqrt(3)), rel=1e-8)
     # the penalty sets in over SOFT
-    assert folds[1].state.mu["load"] == pytest.approx(
-        f(X), rel=1e-4
-    )
+    assert folds[1].state.mu["load"] == pytest.approx(f(X), rel=1e-4)
     assert len(passed) < 60, "it does not creep"
     q, x = passed[-1][1].state.u
     assert passed[-1][0] == "target"

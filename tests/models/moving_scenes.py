@@ -32,7 +32,8 @@ CLAMPED = {"left": "clamped", "right": "clamped"}
 def move(name: str, *edges: str, shift: Any = NONE, turn: Any = NONE, centre: Any = NONE) -> Move:
     """A motion of edges; lengths over R, the rotation vector in radians."""
     return Move(
-        edges, RigidMotion(name, np.array(shift, float), np.array(turn, float), np.array(centre, float))
+        edges,
+        RigidMotion(name, np.array(shift, float), np.array(turn, float), np.array(centre, float)),
     )
 
 

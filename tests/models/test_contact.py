@@ -57,7 +57,10 @@ def test_derivatives(kind: str) -> None:
     model = scene(kind).model
     system, h = model.system, model.material.h
     rng = np.random.default_rng(4)
-    u, v = (system.zero_at_supports(size * h * rng.standard_normal(system.size)) for size in (0.01, 1e-6))
+    u, v = (
+        system.zero_at_supports(size * h * rng.standard_normal(system.size))
+        for size in (0.01, 1e-6)
+    )
     changed = []
     for approach in (0.1, 0.2) if kind == "varying thickness" else (0.3, 0.5):
         mu = dict.fromkeys(scene(kind).unloaded().mu, approach)

@@ -136,7 +136,9 @@ def test_tangent(kind: str) -> None:
     with a magnet.
     """
     system, rng, e = scene(kind).model.system, np.random.default_rng(2), 1e-5
-    u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
+    u, v = (
+        system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0)
+    )
     moved = []
     for size in (0.1, 0.7):
         mu = dict.fromkeys(scene(kind).unloaded().mu, size) | {"lambda_m": 2.0}

@@ -83,7 +83,9 @@ def test_two_caps_are_one_on_a_plane() -> None:
         seen, u = one.observe(state), state.u.reshape(-1, 3)
         image = np.where(lower[:, None], u[i], u[j] @ TURNED.T).ravel()
         mu = {**two.unloaded().mu, "w": w, touching.pair.setting: seen["contact_stiffness"] / 2}
-        outcome = two.newton.solve(State(two.model.system.zero_at_supports(image), mu), "w", PrescribedLoad("w", w))
+        outcome = two.newton.solve(
+            State(two.model.system.zero_at_supports(image), mu), "w", PrescribedLoad("w", w)
+        )
         assert outcome.converged, outcome.reason
         force = two.observe(outcome.state)["contact_force"] * two.model.force_unit
         assert force == pytest.approx(seen["reaction"] / h, rel=1e-3)

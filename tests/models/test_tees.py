@@ -136,7 +136,9 @@ def test_derivatives() -> None:
     system, mu = scene.model.system, scene.unloaded().mu
     (term,) = (each for each in system.terms if isinstance(each, Tee))
     rng = np.random.default_rng(0)
-    u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-3, 1.0))
+    u, v = (
+        system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-3, 1.0)
+    )
     at = system.at_state(State(u, mu))
     Kv = times([(1.0, at.evaluate(term.entries))], v)
     low, high = (system.forces(u + side * 1e-7 * v, mu, term.name) for side in (-0.5, 0.5))

@@ -83,7 +83,9 @@ def test_derivatives(seed: int) -> None:
         slid = u.reshape(-1, 3) + 0.7 * seed * h * np.outer(np.tanh(r[:, 1] / 0.2), [1, 0, 0])
         mu = mu | {term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.recut)}
         assert system.at_state(State(u, mu)).evaluate(lambda: len(term._pressed()[0].point)) > 2000
-    v = system.zero_at_supports(1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size))
+    v = system.zero_at_supports(
+        1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size)
+    )
     at = system.at_state(State(u, mu))
     entries = at.evaluate(term.entries)
     forces = [system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5)]
@@ -201,7 +203,9 @@ def test_the_material_around_a_point_does_not_touch_it() -> None:
     assert system.energies(0 * flattened(0.6, 0.0), mu)[touching().name] == 0
     assert system.energies(flattened(0.6, 0.0), mu)[touching().name] == 0
     at = system.at_state(State(0 * flattened(0.6, 0.0), mu))
-    assert np.isnan(at.evaluate(touching().least_gap))  # the farthest place of a ring is no nearest one
+    assert np.isnan(
+        at.evaluate(touching().least_gap)
+    )  # the farthest place of a ring is no nearest one
 
 
 def test_nearest_places() -> None:
@@ -257,7 +261,11 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
     assert isinstance(term, Mirrored)
     u = system.zero_at_supports(2e-3 * np.random.default_rng(3).standard_normal(system.size))
     at = system.at_state(State(u, scene.unloaded().mu))
-    facing, far, points = term._facing, term._far, at.evaluate(lambda: term._pressed() and term._points)
+    facing, far, points = (
+        term._facing,
+        term._far,
+        at.evaluate(lambda: term._pressed() and term._points),
+    )
     every, few = (
         at.evaluate(lambda least=least: facing.found(term._now(), far, points, least=least))
         for least in (0, 1)

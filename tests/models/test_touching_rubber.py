@@ -82,7 +82,9 @@ def test_gap_of_stretched_sheets() -> None:
     scene = sheets(laws=("koiter", "neo-hookean"), thick=1.5)
     model, r0 = scene.model, scene.model.r0.x.array.reshape(-1, 3)
     u = (r0 * [0.3, 0.2, 0.1]).ravel()
-    gap = model.system.at_state(State(u, scene.unloaded().mu)).evaluate(model.touchings[0].least_gap)
+    gap = model.system.at_state(State(u, scene.unloaded().mu)).evaluate(
+        model.touchings[0].least_gap
+    )
     assert gap == pytest.approx(1.1 * 1.25 * h - h / 2 - 0.75 * h / (1.3 * 1.2), abs=1e-14)
 
 
@@ -176,7 +178,9 @@ def test_derivatives_by_the_natural_stretch() -> None:
     load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]
     scene = ring(natural={"stretch": ["1.2 + 0.1*x", 0.9], "along": [0, 0, 1]}, loading=load)
     system, (term,), flat = scene.model.system, scene.model.touchings, flattened(scene).ravel()
-    u = system.zero_at_supports(flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size))
+    u = system.zero_at_supports(
+        flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size)
+    )
     slope, step = system.parameters["natural_stretch"].slopes[-1], 1e-6
     (twice,) = system.parameters["natural_stretch"].second_derivatives(
         system.parameters["natural_stretch"].constant

@@ -49,7 +49,9 @@ def sheets(factors: tuple[str | None, str | None], apart: float = h, thick: floa
 
 
 def gap_of(scene: Scene) -> float:
-    return float(scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.touchings[0].least_gap))
+    return float(
+        scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.touchings[0].least_gap)
+    )
 
 
 def test_gap_of_wedges() -> None:

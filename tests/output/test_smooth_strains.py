@@ -63,7 +63,9 @@ def test_polynomials_are_recovered_exactly(dimensions: int) -> None:
         np.repeat(np.arange(len(cells)), dimensions + 1),
         x[cells].reshape(-1, dimensions),
     )
-    to_corners = recovery.evaluation_matrix(cell, corners, np.tile(np.eye(dimensions + 1), (len(cells), 1)))
+    to_corners = recovery.evaluation_matrix(
+        cell, corners, np.tile(np.eye(dimensions + 1), (len(cells), 1))
+    )
     found = to_corners @ recovery.coefficients(field(samples))
     assert found[:, 0] == pytest.approx(field(corners), abs=1e-9)
 

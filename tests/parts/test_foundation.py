@@ -140,7 +140,8 @@ def test_tangent(symmetry: str) -> None:
     system, mu = scene.model.system, scene.unloaded().mu
     assert mu == {"foundation": pytest.approx(15.0)}
     u, v = (
-        system.zero_at_supports(1e-3 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(1e-3 * np.random.default_rng(i).standard_normal(system.size))
+        for i in range(2)
     )
 
     def along(stiffness: float) -> np.ndarray:

@@ -112,7 +112,9 @@ def test_in_opposite_orders() -> None:
     """
     orders = ["abcdef", "fedcba", "cfaebd"]
     with ThreadPoolExecutor(len(orders)) as pool:
-        for done in [pool.submit(compiler.compile_libraries, libraries(*order)) for order in orders]:
+        for done in [
+            pool.submit(compiler.compile_libraries, libraries(*order)) for order in orders
+        ]:
             done.result(timeout=60)
     assert all(library.is_compiled for library in libraries(*orders[0]))
 

@@ -48,7 +48,9 @@ def test_folders_of_kernels(tmp_path: Path, home: Path) -> None:
     sticky = folder(tmp_path / "sticky", 0o1777)
     assert disk_cache._cache_folders(sticky) == (sticky / f"user_{os.getuid()}",)
     assert (sticky / f"user_{os.getuid()}").stat().st_mode & 0o777 == 0o700
-    assert disk_cache._cache_folders(sticky / "fenics") == (sticky / "fenics",)  # nobody can move it away
+    assert disk_cache._cache_folders(sticky / "fenics") == (
+        sticky / "fenics",
+    )  # nobody can move it away
     assert disk_cache._cache_folders(folder(tmp_path / "open", 0o777)) == (own,)
     assert disk_cache._cache_folders(tmp_path / "open" / "fenics") == (own,)
     (tmp_path / "link").symlink_to(tmp_path / "open")

@@ -79,4 +79,8 @@ def test_only_named_points_have_the_unit_of_lengths() -> None:
 
 def test_force_has_one_symbol_in_all_spellings() -> None:
     force = quantity("force")
-    assert (force.ascii_symbol, force.latex, force.html) == ("F R/(2piD)", r"$F R/(2\pi D)$", "F R/(2πD)")
+    assert (force.ascii_symbol, force.latex, force.html) == (
+        "F R/(2piD)",
+        r"$F R/(2\pi D)$",
+        "F R/(2πD)",
+    )

@@ -25,7 +25,9 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
     u = np.zeros(toy.size)
     u[0] = 0.9
     path = Path(BorderedNewton(toy), "load", "load", StepOptions(0.03, 0.03, 1e-6))
-    walk = ContinuationRun(path, path.start(State(u, {"load": 0.9})), ContinuationGoal("target", [1.1]))
+    walk = ContinuationRun(
+        path, path.start(State(u, {"load": 0.9})), ContinuationGoal("target", [1.1])
+    )
     sentences = [
         (point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))
     ]

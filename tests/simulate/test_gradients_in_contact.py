@@ -239,7 +239,9 @@ def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     """The equilibrium of another scene, whose points are those of the state of the first one."""
     (one,), (same,), state = scene.model.touchings, other.model.touchings, last.point.state
     number = state.mu.get(one.pair.cuts, 0.0)
-    points, normals = scene.model.system.at_state(state).evaluate(lambda: one._cuts.points(number, one._now()))
+    points, normals = scene.model.system.at_state(state).evaluate(
+        lambda: one._cuts.points(number, one._now())
+    )
     area, its = (_area(one._cells, each._r0, points) for each in (one, same))
     same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
     return held_at(other, last, "lambda_m")

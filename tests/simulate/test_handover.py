@@ -136,7 +136,9 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
         assert scene
         assert scene.problem.included[0] == f"sector of {180 / m:g} degrees of the shell"
         assert scene.problem.azimuth == full.problem.azimuth
-        guess = full.model.system.zero_at_supports(_on_larger(scene.model, state.u, full.model).ravel())
+        guess = full.model.system.zero_at_supports(
+            _on_larger(scene.model, state.u, full.model).ravel()
+        )
         copies = scene.model.multiplicity / full.model.multiplicity
         volume = copies * scene.model.system.potential(state.u, state.mu, "pressure")
         row = PrescribedConjugate(full.model.system, "pressure", -volume)

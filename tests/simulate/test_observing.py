@@ -151,7 +151,9 @@ def rough_states(scene: Scene, count: int) -> list[State]:
     """States with rough displacements, each with other amplitudes and another history."""
     start, system, states = scene.unloaded(), scene.model.system, list[State]()
     for number in range(count):
-        u = system.zero_at_supports(1e-3 * np.random.default_rng(number).standard_normal(system.size))
+        u = system.zero_at_supports(
+            1e-3 * np.random.default_rng(number).standard_normal(system.size)
+        )
         mu = {name: 0.05 * (1 + i) * (number - 1.3) for i, name in enumerate(start.mu)}
         past = {
             name: (1.0 + number) * (value or 3.0) for name, (_, value) in system.history.items()

@@ -63,7 +63,9 @@ def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
     assert ahead.fraction == pytest.approx(0.499, abs=1e-3)
     alone = way_to_touch(stack, lambda state: state, lifted(stack), guess)
     assert (alone.fraction, alone.loses_forces) == (ahead.fraction, False)
-    assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == StepEvent(loses_forces=True)
+    assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == StepEvent(
+        loses_forces=True
+    )
 
 
 def test_a_step_on_which_one_lets_go_ends_before_another_meets(

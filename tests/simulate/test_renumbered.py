@@ -61,7 +61,8 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
         scene, own = scenes[value], alone[value]
         assert scene
         state = State(
-            own.model.system.zero_at_supports(u), {**own.unloaded().mu, "pressure": 0.8, "lambda_m": 0.002}
+            own.model.system.zero_at_supports(u),
+            {**own.unloaded().mu, "pressure": 0.8, "lambda_m": 0.002},
         )
         mine, theirs = (
             [

@@ -38,7 +38,9 @@ def test_of_the_meridian(kind: str) -> None:
             value = getattr(scene.problem.imperfections[key], number) + change
             other = Scene(scene.problem.with_values({f"shell.{key}.{number}": value}))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-            return find_fold(other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure").value
+            return find_fold(
+                other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure"
+            ).value
 
         by_folds = (8 * (value(0.005) - value(-0.005)) - (value(0.01) - value(-0.01))) / 0.06
         assert derivative == pytest.approx(by_folds, rel=1e-4), name
@@ -75,7 +77,9 @@ def test_beside_the_pole() -> None:
             sections = changed(scene.problem.imperfections, key, number, change)
             other = reshaped(scene, Along(_deviation(scene, sections, key), old, 1.0))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-            return find_fold(other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure").value
+            return find_fold(
+                other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure"
+            ).value
 
         ends = [value(n * step) for n in (-2, -1, 1, 2)]
         by_folds = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)

@@ -45,7 +45,9 @@ def crossings(
     the start again.
     """
     path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
-    walk = ContinuationRun(path, here, ContinuationGoal("points", [path.value(quantity, start)], quantity))
+    walk = ContinuationRun(
+        path, here, ContinuationGoal("points", [path.value(quantity, start)], quantity)
+    )
     return [
         point.state
         for _, (_, point) in zip(

@@ -76,7 +76,9 @@ def at_volume(scene: Scene, near: State) -> State:
     solution = scene.newton.solve(near, "pressure", volume)
     assert solution.converged
     system, state = scene.model.system, solution.state
-    last = BorderedMatrix(system, scene.newton.factor_at(state), state, "pressure", volume)  # to rounding
+    last = BorderedMatrix(
+        system, scene.newton.factor_at(state), state, "pressure", volume
+    )  # to rounding
     du, dp = last.solve(-system.residual(state.u, state.mu), -volume.residual(state))
     return state.with_(state.u + du, "pressure", state.mu["pressure"] + dp)
 

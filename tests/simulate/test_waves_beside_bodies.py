@@ -190,7 +190,8 @@ def on(meridian: Scene, other: Scene, record: Record, *, solve: bool) -> State:
     theta = np.arctan2(x[:, 1], x[:, 0])
     u = np.column_stack([U * np.cos(theta), U * np.sin(theta), W]).ravel()
     guess = State(
-        other.model.system.zero_at_supports(u[: other.model.system.size]), {**other.unloaded().mu, **state.mu}
+        other.model.system.zero_at_supports(u[: other.model.system.size]),
+        {**other.unloaded().mu, **state.mu},
     )
     if not solve:
         return guess

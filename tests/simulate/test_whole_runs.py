@@ -178,7 +178,9 @@ def test_numbers(name: str) -> None:
                 slope = float(slope.within(np.ones(len(slope.forces), dtype=bool))[0])
             total += slope * value * parts[key]
         expected = (results[1][of] - results[-1][of]) / (2 * STEP)
-        assert total == pytest.approx(expected, rel=EXACT[name], abs=1e-6 * abs(each.value_in_unit)), of
+        assert total == pytest.approx(
+            expected, rel=EXACT[name], abs=1e-6 * abs(each.value_in_unit)
+        ), of
 
 
 @pytest.mark.slow

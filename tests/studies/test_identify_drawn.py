@@ -30,7 +30,9 @@ def posterior() -> Posterior:
     smooth = Smooth(0, np.abs(X[:, None] - X), 2, 1.0, 0.3)
     start, free = np.zeros(J.shape[1]), np.full(J.shape[1], np.inf)
     measured = Measured(data, np.zeros(len(J), dtype=int), np.array([NOISE]), start, free, smooth)
-    return fit_posterior(lambda x: (J @ x, J), measured, start, np.ones(J.shape[1]), 20, lambda *_: None)
+    return fit_posterior(
+        lambda x: (J @ x, J), measured, start, np.ones(J.shape[1]), 20, lambda *_: None
+    )
 
 
 @pytest.mark.parametrize(("count", "error"), [(20, 0.13), (40, 0.1)])

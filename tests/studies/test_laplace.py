@@ -216,7 +216,9 @@ class Blurred:
         r = np.sqrt(3) * np.abs(self.X[:, None] - self.X) / self.LENGTH
         return self.S**2 * ((1 + r) * np.exp(-r) + 1e-8 * np.eye(25))
 
-    def fit(self, truth: Array, seed: int, deviation: float, length: float, noise: float) -> Posterior:
+    def fit(
+        self, truth: Array, seed: int, deviation: float, length: float, noise: float
+    ) -> Posterior:
         data = self.J @ truth + NOISE * np.random.default_rng(seed).normal(size=40)
         smooth = Smooth(0, np.abs(self.X[:, None] - self.X), 1, deviation, length)
         group = np.zeros(40, dtype=np.int64)
@@ -250,7 +252,9 @@ def test_the_strength_that_makes_data_most_likely() -> None:
         prior = fit.measured.field
         assert prior
 
-        def density(s: float, length: float, noise: float, data: Array = fit.measured.data) -> float:
+        def density(
+            s: float, length: float, noise: float, data: Array = fit.measured.data
+        ) -> float:
             other = Blurred()
             other.S, other.LENGTH = s, length  # type: ignore[misc]
             covariance = own.J @ other.K @ own.J.T + noise**2 * np.eye(40)

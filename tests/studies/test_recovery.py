@@ -71,12 +71,18 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
 
     with contextlib.suppress(Enough):
         scipy.optimize.minimize(
-            watched, vary.start_values, jac=True, method="L-BFGS-B", options={"maxiter": 80, "ftol": 0.0}
+            watched,
+            vary.start_values,
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": 80, "ftol": 0.0},
         )
     assert min(misfits) < 1e-6 * misfits[0]
     last_numeric_axis = np.linspace(0, 1, 11)
     assert vary.controls
-    weights = vary.controls.weights(np.column_stack([last_numeric_axis, 0 * last_numeric_axis, 0 * last_numeric_axis]))
+    weights = vary.controls.weights(
+        np.column_stack([last_numeric_axis, 0 * last_numeric_axis, 0 * last_numeric_axis])
+    )
     found, wanted = (weights @ vary.vectors(x) for x in (best, known))
     away = np.linalg.norm(found - wanted, axis=1)
     assert away[last_numeric_axis > 0.35].max() < 0.015

@@ -344,7 +344,9 @@ def _batches(carrier: Carrier, density: Density | None) -> Iterable[EntityBatch]
             basix.CellType.interval, density.quadrature or carrier.rule
         )
         every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
-        yield EntityBatch((every,), EntityRule((X,), (), weights), np.zeros((len(every) * len(X), 2)))
+        yield EntityBatch(
+            (every,), EntityRule((X,), (), weights), np.zeros((len(every) * len(X), 2))
+        )
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)

@@ -352,7 +352,9 @@ class OwnTerm:
             self.mirrored(Y0_PLANE) and turns,
             self.name + (" or what it observes" if self.observed else ""),
         )
-        return SymmetryConstraint(None if shared else f"the energy {name} does not share it", (), mirrors, name)
+        return SymmetryConstraint(
+            None if shared else f"the energy {name} does not share it", (), mirrors, name
+        )
 
     @property
     def digest(self) -> str:

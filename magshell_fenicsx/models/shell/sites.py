@@ -123,7 +123,10 @@ class Site:
             fill(self._u, self._jets(batch, u))
             fill(self._r0, placements[number])
             fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
-            contraction, blocks = self._contractions[batch.rule], HessianBlocks(batch, self._coupled)
+            contraction, blocks = (
+                self._contractions[batch.rule],
+                HessianBlocks(batch, self._coupled),
+            )
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
             if self._replaced and self._prestress:
@@ -170,7 +173,13 @@ class Kernel:
     """The point Hessian of one term on a site."""
 
     def __init__(
-        self, name: str, density: Density, points: PointStorage, batches: list[EntityBatch], *, of_v: bool
+        self,
+        name: str,
+        density: Density,
+        points: PointStorage,
+        batches: list[EntityBatch],
+        *,
+        of_v: bool,
     ) -> None:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches

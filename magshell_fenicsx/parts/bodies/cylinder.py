@@ -48,11 +48,16 @@ class Cylinder(Distance):
 
     @property
     def lines(self) -> list[Array]:
-        return [self.centre + line @ frame_along(self.axis).T for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)]
+        return [
+            self.centre + line @ frame_along(self.axis).T
+            for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)
+        ]
 
     @property
     def solid(self) -> Solid:
-        return drawn_bodies.cylinder(self.radius, 2 * HALF_DRAWN_EXTENT).transformed(frame_along(self.axis), self.centre)
+        return drawn_bodies.cylinder(self.radius, 2 * HALF_DRAWN_EXTENT).transformed(
+            frame_along(self.axis), self.centre
+        )
 
     @property
     def held(self) -> Sequence[Array]:

@@ -61,7 +61,10 @@ class Rod(Distance):
     @property
     def lines(self) -> list[Array]:
         middle = self.end - HALF_DRAWN_EXTENT * self.along
-        return [middle + line @ frame_along(self.along).T for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)]
+        return [
+            middle + line @ frame_along(self.along).T
+            for line in cylinder_lines(self.radius, 2 * HALF_DRAWN_EXTENT)
+        ]
 
     @property
     def solid(self) -> Solid:

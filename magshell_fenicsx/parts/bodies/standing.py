@@ -129,7 +129,11 @@ class Pressed:
         """Elements that show the ring of a contact, and a small body."""
         x, y = map(float, self.place)
         finer, size = sqrt(fit.h), self.size
-        small = [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)] if size < finer else []
+        small = (
+            [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)]
+            if size < finer
+            else []
+        )
         return [DiscFeature((x, y), self.reach, RING * finer / fit.refinement, growth), *small]
 
 

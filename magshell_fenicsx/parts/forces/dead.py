@@ -225,7 +225,9 @@ class DeadSection(PathStep):
     def step(self, change: float | None, now: Now) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         R, span = context.shell.reference, outline.meridian
         fixed = [load for load in self.loads if not load.varies]
         forces = [
@@ -253,13 +255,18 @@ class DeadSection(PathStep):
         around = (
             all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
         )
-        if span and not (around and all(scalar_is_axisymmetric(text, span, R) for text in potentials)):
+        if span and not (
+            around and all(scalar_is_axisymmetric(text, span, R) for text in potentials)
+        ):
             why = why or "a load differs around e3"
         energies = [
             potential(f"potential_{i}", text, np.eye(3), context.scales)
             for i, text in enumerate(potentials)
         ]
-        return [SymmetryConstraint(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
+        return [
+            SymmetryConstraint(why, vectors, mirrors),
+            *(energy.leaves(outline) for energy in energies),
+        ]
 
     def named_points(self) -> list[str]:
         return [load.at for load in self.loads if load.at]
@@ -350,7 +357,10 @@ def _mirrored_formula(
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False
     values, images = (
-        np.stack([formula_function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
+        np.stack(
+            [formula_function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])],
+            axis=-1,
+        )
         for each, places in ((load, x), (other, image))
     )
     return equal_to_rounding(values if load.vector is None else values @ mirror.reflection, images)

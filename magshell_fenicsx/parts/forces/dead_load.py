@@ -193,7 +193,9 @@ def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
     """A load as the model takes it; `name` is for its energy, if it has one."""
     mirror = modelled.mirror
-    shared = mirror is not None and (load.edge is None or mirror.image_of_edge(load.edge) == load.edge)
+    shared = mirror is not None and (
+        load.edge is None or mirror.image_of_edge(load.edge) == load.edge
+    )
     Q, scales = rotation(modelled.turn), context.scales
     E, t, R = scales.E, scales.h, scales.R
     if load.potential is not None:
@@ -238,7 +240,9 @@ def _over(load: DeadLoadSection) -> str | None:
 def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
     """The load of a formula in the model's frame; a pressure is against the normal."""
     if load.vector is not None:
-        return FormulaVectors([formula_function(v) for v in load.vector], Q, length, factor, vectors=True)
+        return FormulaVectors(
+            [formula_function(v) for v in load.vector], Q, length, factor, vectors=True
+        )
     assert load.pressure is not None
     return InwardPressure(FormulaVectors([formula_function(load.pressure)], Q, length, factor))
 

@@ -83,10 +83,16 @@ class IndentationSection(PathStep):
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
             )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         place = self.place_on(step, context, outline)
         reason = "the force is not at the pole" if tilted(place) else None
-        return [SymmetryConstraint(reason, [place], lambda mirror: bool(abs(mirror.signed_distance(place)) < ROUNDING))]
+        return [
+            SymmetryConstraint(
+                reason, [place], lambda mirror: bool(abs(mirror.signed_distance(place)) < ROUNDING)
+            )
+        ]
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array:
         at, geometry, key = self.at, context.shell.geometry, step.key

@@ -56,9 +56,9 @@ class BodyMeasures:
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
         nodes, normals = places_in_body(self._V)
-        z = self._body.at_nodes(self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness)[
-            self._V.dofmap.list
-        ]
+        z = self._body.at_nodes(
+            self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
+        )[self._V.dofmap.list]
         field = fem.Function(
             fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,)))
         )

@@ -183,7 +183,9 @@ class TimeSection(Step):
                 except ValueError as e:
                     raise ValueError(f"{key}.history.{name}: {level}: {e}") from None
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         if not self.velocity:
             return []
         given, R = vector_function(self.velocity), context.shell.reference
@@ -193,7 +195,11 @@ class TimeSection(Step):
             return equal_to_rounding(given(R * x) @ S, given(R * mirror.image(x)))
 
         turns = outline.meridian and vector_is_axisymmetric(self.velocity, outline.meridian, R)
-        return [SymmetryConstraint(None if turns else "the initial velocity differs around e3", (), keeps)]
+        return [
+            SymmetryConstraint(
+                None if turns else "the initial velocity differs around e3", (), keeps
+            )
+        ]
 
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Key and text of each time with a unit."""

@@ -58,7 +58,9 @@ def without_potential(
         if not isinstance(condition, Held):
             return False
         axes = list(condition.components)
-        return len(axes) == 2 or bool(np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE)
+        return len(axes) == 2 or bool(
+            np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE
+        )
 
     return tuple(name for name in names if not has(name))
 

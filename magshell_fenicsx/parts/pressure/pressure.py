@@ -67,7 +67,9 @@ class PressureSection(PathStep):
                 f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells"
             )
 
-    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def leaves(
+        self, step: ProgrammeStep, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         return [
             *super().leaves(step, context, outline),
             patch_constraint(f"{step.key}.on", self.on or (), context.shell),

@@ -166,7 +166,10 @@ def with_growth(
     """A parameter with the derivatives of a contact by it among its own."""
 
     def twice(q: object) -> Sequence[Derivative]:
-        return [*grows.differentiate_slopes(q), *([ByGrowth(of, add, 2)] if q is grows.constant else [])]
+        return [
+            *grows.differentiate_slopes(q),
+            *([ByGrowth(of, add, 2)] if q is grows.constant else []),
+        ]
 
     return replace(grows, slopes=[*grows.slopes, ByGrowth(of, add)], differentiate_slopes=twice)
 

@@ -85,7 +85,10 @@ class Images:
         """Numbers (copies, n) of the places (n, 3) of all copies, which share those on their
         planes.
         """
-        images, extent = [image.apply(x[on_planes]) for image in self.images], np.ptp(x, axis=0).max()
+        images, extent = (
+            [image.apply(x[on_planes]) for image in self.images],
+            np.ptp(x, axis=0).max(),
+        )
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
             for before in range(k - 1, -1, -1):

@@ -175,7 +175,10 @@ class Touching(ContactTerm):
         field = {"thickness": self._shape.thickness, "r0": self._shape.r0}.get(name)
         if field is None:
             return None
-        now, weights = self._present(), Weights(self._of_copies(global_values(direction)), energy, force)
+        now, weights = (
+            self._present(),
+            Weights(self._of_copies(global_values(direction)), energy, force),
+        )
         if name == "thickness":
             of_cells = self._comm.allreduce(self._in_modelled(by_factor(now, weights)))
             return field, of_cells[self._shape.own, :, None]
@@ -200,8 +203,15 @@ class Touching(ContactTerm):
         first = of_group[joined.group]
         second = np.where(several[joined.group], first / (BLUR * self._h), bend[joined.group])
         weight = joined.weight * self._points.weight[global_values.point] / 2
-        order = np.argsort(self._points.cell[global_values.point] * number + global_values.cell, kind="stable")
-        at, first, second, weight = global_values.of(order), first[order], second[order], weight[order]
+        order = np.argsort(
+            self._points.cell[global_values.point] * number + global_values.cell, kind="stable"
+        )
+        at, first, second, weight = (
+            global_values.of(order),
+            first[order],
+            second[order],
+            weight[order],
+        )
         keys = self._points.cell[at.point] * number + at.cell
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         rows, columns, values = list[Longs](), list[Longs](), list[Array]()

@@ -213,7 +213,9 @@ def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]
     step = 1e-7 * h
     ahead, back = (State(state.u + way * step * v, state.mu) for way in (1, -1))
     energies = [sum(scene.energies(each).values()) for each in (ahead, back)]
-    residuals = [system.zero_at_supports(system.residual(each.u, each.mu)) for each in (ahead, back)]
+    residuals = [
+        system.zero_at_supports(system.residual(each.u, each.mu)) for each in (ahead, back)
+    ]
     slope = system.residual(state.u, state.mu) @ v
     assert slope == pytest.approx((energies[0] - energies[1]) / (2 * step), rel=1e-6)
     Kv = system.zero_at_supports(csr(system.tangent(state.u, state.mu)) @ v)
@@ -413,9 +415,9 @@ def test_ridges_that_are_highest_between_nodes() -> None:
     scene = Scene(Case.from_source(data))
     (touching,) = scene.model.touchings
     assert scene.model.axisymmetric
-    assert scene.model.system.at_state(scene.unloaded()).evaluate(touching.least_gap) == pytest.approx(
-        0.2 * 0.03, rel=1e-2
-    )
+    assert scene.model.system.at_state(scene.unloaded()).evaluate(
+        touching.least_gap
+    ) == pytest.approx(0.2 * 0.03, rel=1e-2)
 
 
 @pytest.mark.slow

@@ -200,7 +200,9 @@ def test_derivatives(edges: list[str]) -> None:
         model, mu = scene.model, scene.unloaded().mu
         assert model.axisymmetric
         system, rng = model.system, np.random.default_rng(0)
-        u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
+        u, v = (
+            system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0)
+        )
         K = system.tangent(u, mu)
         x, product = K.createVecs()
         x.setArray(v)

@@ -34,7 +34,9 @@ DIPOLE = [
 
 
 def formulas(*texts: str, turn: float = 0.0, d: float = 2.0) -> FormulasInSpace:
-    return FormulasInSpace([formula_with_derivatives(text.format(d=d)) for text in texts], rotation(turn))
+    return FormulasInSpace(
+        [formula_with_derivatives(text.format(d=d)) for text in texts], rotation(turn)
+    )
 
 
 def linear() -> FormulasInSpace:

@@ -48,7 +48,8 @@ def test_derivatives(file: str, symmetry: str, size: float) -> None:
     """
     system = scene(file, f"symmetry={symmetry}").model.system
     u, v = (
-        system.zero_at_supports(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(size * np.random.default_rng(i).standard_normal(system.size))
+        for i in range(2)
     )
     mu = dict.fromkeys(("lambda_m", "pressure"), 0.0) | SHIFTED
 

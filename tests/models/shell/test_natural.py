@@ -182,7 +182,8 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
     )
     system = ms.Scene(case).model.system
     u, v = (
-        system.zero_at_supports(size * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(size * np.random.default_rng(i).standard_normal(system.size))
+        for i in range(2)
     )
     mu = dict(BOTH)
 

@@ -43,7 +43,8 @@ def panel(size: float = 0.5) -> Midsurface:
     points = {"pole": np.array([0.5, 0.5])}
     grid = Grid((0.0, 0.0), (1.0, 1.0), size)
     return distribute(
-        grid_mesh(grid, points, RevolvedEmbedding(StraightProfile((1.0, 0.0), (1.0, 1.0)), 1.0)), MPI.COMM_SELF
+        grid_mesh(grid, points, RevolvedEmbedding(StraightProfile((1.0, 0.0), (1.0, 1.0)), 1.0)),
+        MPI.COMM_SELF,
     )
 
 
@@ -64,7 +65,8 @@ def box(angle: float) -> Midsurface:
     points = {"pole": fold(np.array([[1.0, 1.0]]))[0]}
     halves = {"left half": chart.nodes[chart.cells].mean(axis=1)[:, 0] < 0}
     return distribute(
-        PatchMesh(nodes, chart.cells, space_embedding, chart.edges, points, patches=halves), MPI.COMM_SELF
+        PatchMesh(nodes, chart.cells, space_embedding, chart.edges, points, patches=halves),
+        MPI.COMM_SELF,
     )
 
 
@@ -118,7 +120,10 @@ def test_tangent(name: str) -> None:
     u, v = model.system.zero_at_supports(u), model.system.zero_at_supports(v)
     step = 1e-6
     R = [model.system.residual(u + s * v, MU) for s in (step, -step)]
-    slope, exact = (R[0] - R[1]) / (2 * step), model.system.zero_at_supports(along(model.system, u, MU, v))
+    slope, exact = (
+        (R[0] - R[1]) / (2 * step),
+        model.system.zero_at_supports(along(model.system, u, MU, v)),
+    )
     assert np.abs(slope - exact).max() < 1e-5 * np.abs(exact).max()
 
 
@@ -212,7 +217,9 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
 def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
     """Deflection of a cantilever of length 1 under a small end force, over F/(E h_ref)."""
     surface = distribute(
-        grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, plane_embedding),
+        grid_mesh(
+            Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, plane_embedding
+        ),
         MPI.COMM_SELF,
     )
     force = 1e-9

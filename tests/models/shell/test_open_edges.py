@@ -66,7 +66,9 @@ def times(tangent: Tangent, v: Array) -> Array:
         return np.array(y.array_r)
 
     return (
-        product(tangent.K) + product(tangent.N) if isinstance(tangent, SkewedTangent) else product(tangent)
+        product(tangent.K) + product(tangent.N)
+        if isinstance(tangent, SkewedTangent)
+        else product(tangent)
     )
 
 
@@ -86,7 +88,10 @@ def work(of: ms.Scene, u: Array, v: Array) -> float:
         U, Us, Ws = r[0], ufl.grad(r)[0, 0], ufl.grad(r)[1, 0]
         return 2 * pi * unit * fem.assemble_scalar(fem.form((w[1] * Us - w[0] * Ws) * U * dx))
     if isinstance(model, SolidModel):
-        F, ds = ufl.Identity(3) + ufl.grad(model.u), face_measure(domain, [model.body.faces[OUTER_FACE]])
+        F, ds = (
+            ufl.Identity(3) + ufl.grad(model.u),
+            face_measure(domain, [model.body.faces[OUTER_FACE]]),
+        )
         n = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(domain)
         return unit * fem.assemble_scalar(fem.form(ufl.dot(w, n) * ds(1)))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 10})

@@ -240,7 +240,8 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     loads = Loads(own=(OwnTerm("own", of, parameters),))
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
     model_u, v = (
-        system.zero_at_supports(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2)
+        system.zero_at_supports(1e-2 * np.random.default_rng(i).standard_normal(system.size))
+        for i in range(2)
     )
     step = 1e-3
     slope = (

@@ -56,7 +56,8 @@ def test_a_plane_nearly_across_the_fibres_is_no_mirror() -> None:
     """1e-3 rad off, of which the cosine is 1 to 5e-7; exactly along and across it is one."""
     plies = Laminate(CROSS.matrices(1.0), np.array([2.0, 0.0, 0.0]))
     assert [
-        plies.mirrored(Mirror.with_normal(np.array(n))) for n in ([1, 0, 0], [0, 1, 0], [1, 1e-3, 0])
+        plies.mirrored(Mirror.with_normal(np.array(n)))
+        for n in ([1, 0, 0], [0, 1, 0], [1, 1e-3, 0])
     ] == [True, True, False]
     of_meridians = Laminate(CROSS.matrices(1.0), None)
     planes = [

@@ -27,7 +27,9 @@ def hemisphere(
 
 def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> BodyMesh:
     """A disc of radius 1."""
-    patch = triangulate(DiscShape(1.0, half), lambda x: size, {"pole": np.zeros(2)}, plane_embedding)
+    patch = triangulate(
+        DiscShape(1.0, half), lambda x: size, {"pole": np.zeros(2)}, plane_embedding
+    )
     return sweep(patch, h, layers, MPI.COMM_SELF)
 
 

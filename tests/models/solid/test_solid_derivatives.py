@@ -55,7 +55,9 @@ def model(request: pytest.FixtureRequest) -> SolidModel:
 
 
 def displacement(model: SolidModel) -> np.ndarray:
-    return model.system.zero_at_supports(2e-3 * np.random.default_rng(0).standard_normal(model.system.size))
+    return model.system.zero_at_supports(
+        2e-3 * np.random.default_rng(0).standard_normal(model.system.size)
+    )
 
 
 def test_tangent_is_that_of_the_forms_and_symmetric(model: SolidModel) -> None:
@@ -113,5 +115,7 @@ def test_the_outer_face_of_an_annulus() -> None:
     body = body_of(
         {"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "thickness": 0.1}, 0.3
     )
-    area = fem.form(fem.Constant(body.mesh, 1.0) * face_measure(body.mesh, [body.faces[OUTER_FACE]])(1))
+    area = fem.form(
+        fem.Constant(body.mesh, 1.0) * face_measure(body.mesh, [body.faces[OUTER_FACE]])(1)
+    )
     assert fem.assemble_scalar(area) == pytest.approx(0.75 * np.pi, rel=1e-3)

@@ -52,9 +52,9 @@ def test_gap_of_a_stretched_disc() -> None:
         known = model.contacts["a_ball"][0]
         mu = {"a_ball": 0.0} | ({"natural_stretch": 1.0} if grown else {})
         state = State(u, mu)
-        assert model.system.at_state(state).evaluate(lambda known=known: known.gap) == pytest.approx(
-            0.1 - H / 2 * factor
-        )
+        assert model.system.at_state(state).evaluate(
+            lambda known=known: known.gap
+        ) == pytest.approx(0.1 - H / 2 * factor)
 
 
 @pytest.mark.slow
@@ -121,7 +121,7 @@ def test_balloon_under_a_plate() -> None:
     stretch = r[near, 0] / r0[near, 0]
     assert stretch > 1.2
     pressing = scene.model.contacts[next(iter(scene.model.contacts))][0]
-    assert model.system.at_state(state).evaluate(lambda: float(pressing.gap.min())) == pytest.approx(
-        0, abs=1.01e-3 * 0.05
-    )
+    assert model.system.at_state(state).evaluate(
+        lambda: float(pressing.gap.min())
+    ) == pytest.approx(0, abs=1.01e-3 * 0.05)
     assert r[pole, 1] == pytest.approx(1.4 - 0.025 / stretch**2, abs=2e-3 * 0.05)

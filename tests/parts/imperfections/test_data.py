@@ -39,7 +39,9 @@ def made(shell: dict[str, Any], folder: Path = Path(), **item: Any) -> Case:
 
 
 def read(case: Case) -> ImperfectionGeometry:
-    return case.shell.imperfections[0].geometry(reference_shell_of(case.shell), "shell.imperfections.0")
+    return case.shell.imperfections[0].geometry(
+        reference_shell_of(case.shell), "shell.imperfections.0"
+    )
 
 
 def places(drawn: Outline, count: int) -> tuple[Array, Array]:

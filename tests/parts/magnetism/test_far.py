@@ -39,7 +39,9 @@ def two_bowls() -> tuple[MagnetisedShell, NDArray[np.intp]]:
     upper = r0[..., 2].mean(axis=1) > 0
     r0[upper, :, 2] += 0.6
     remanence = np.broadcast_to([0.6, 0.0, 0.8], r0.shape)
-    return MagnetisedShell(element, r0, 0 * r0, element, np.array(remanence), H), upper.astype(np.intp)
+    return MagnetisedShell(element, r0, 0 * r0, element, np.array(remanence), H), upper.astype(
+        np.intp
+    )
 
 
 def charged() -> tuple[InteractingCharges, Array]:

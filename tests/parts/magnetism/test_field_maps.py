@@ -155,7 +155,10 @@ def test_files_picture_and_report(tmp_path: Path) -> None:
     (
         out / "fields" / f"map_across_{points - 1:04d}.vtu"
     ).unlink()  # that point is written again if a run goes on
-    assert FieldSeries(out / "fields", about, "", run.rows, ["box", "across"]).complete_points == points - 1
+    assert (
+        FieldSeries(out / "fields", about, "", run.rows, ["box", "across"]).complete_points
+        == points - 1
+    )
 
 
 def test_a_file_gives_back_its_grid(tmp_path: Path) -> None:

@@ -179,7 +179,9 @@ def bent(model: Any, tmp_path: Path) -> tuple[Scene, Vector]:
     )
     x, y, z = scene.model.r0.x.array.reshape(-1, 3).T
     u = [0.01 * np.sin(5 * y + z), 0.02 * np.cos(6 * x), 0.03 * np.sin(7 * x + 3 * y + 5 * z)]
-    return scene, scene.model.system.zero_at_supports(np.column_stack(u).ravel()[: scene.model.system.size])
+    return scene, scene.model.system.zero_at_supports(
+        np.column_stack(u).ravel()[: scene.model.system.size]
+    )
 
 
 def test_derivatives(bent: tuple[Scene, Vector]) -> None:

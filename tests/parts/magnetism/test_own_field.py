@@ -331,7 +331,9 @@ def test_slopes_of_a_reading(kind: str) -> None:
     """By the displacement and the amplitudes: central differences of the reading."""
     here = scene(kind)
     rng, system = np.random.default_rng(3), here.model.system
-    u, v = (system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (2e-4, 1.0))
+    u, v = (
+        system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (2e-4, 1.0)
+    )
     mu = {**here.unloaded().mu, "lambda_m": 0.4}
     room = next(room for room in SEEN if "hall_Bx" in room.differentiable(here.model.loads))
     for column in ("hall_Bx", "hall_Bz"):

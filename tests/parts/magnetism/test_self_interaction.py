@@ -56,7 +56,9 @@ def test_a_prism(model: Any, tmp_path: Path, h: float, polar: float) -> None:
     """The energy of a strip magnetised across or along itself is N/2 Br² V/mu_0, 1e-3."""
     scene = alone(tmp_path / "strip.msh", h, polar)
     (term,) = (each for each in scene.model.system.terms if each.name == "interaction")
-    found = scene.model.system.at_state(State(scene.model.zero(), {"interaction": 1.0})).evaluate(term.energy)
+    found = scene.model.system.at_state(State(scene.model.zero(), {"interaction": 1.0})).evaluate(
+        term.energy
+    )
     N = demagnetising(2.5, 0.5, h / 2) if polar == 0 else demagnetising(0.5, h / 2, 2.5)
     exact = BR**2 / (MU_0 * 1e6) * N / 2 * 5.0 / 5.0**2  # of E h R²
     assert found == pytest.approx(exact, rel=1e-3)
@@ -74,7 +76,9 @@ def test_a_closed_sphere(R_over_h: float, error: float) -> None:
     ].reshape(-1, 3)
     none, count = np.zeros(0, dtype=np.intp), len(shape.r0)
     near = SingularPairs(shape, corners, none, none, range(count), MPI.COMM_WORLD)
-    charged = InteractingCharges(shape, np.zeros(count, dtype=np.intp), none, none, MPI.COMM_WORLD, near)
+    charged = InteractingCharges(
+        shape, np.zeros(count, dtype=np.intp), none, none, MPI.COMM_WORLD, near
+    )
     found = charged.evaluate(shape.r0, range(count))[0]
     h = 1 / R_over_h
     volume = 4 * np.pi / 3 * ((1 + h / 2) ** 3 - (1 - h / 2) ** 3)
@@ -89,7 +93,9 @@ def bent(scene: Scene) -> tuple[Vector, Array]:
         [np.cos(2 * y + x), np.sin(2 * x), np.cos(2 * x - 1.5 * y)],
     ]
     u, v = (
-        scene.model.system.zero_at_supports(np.column_stack(each).ravel()[: scene.model.system.size])
+        scene.model.system.zero_at_supports(
+            np.column_stack(each).ravel()[: scene.model.system.size]
+        )
         for each in both
     )
     return u, v
@@ -221,7 +227,9 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
         (w / step, bend + c * step * v)
         for c, w in ((1, 2 / 3), (-1, -2 / 3), (2, -1 / 12), (-2, 1 / 12))
     ]
-    change = sum(w * system.at_state(State(each.ravel(), at)).evaluate(term.energy) for w, each in moved)
+    change = sum(
+        w * system.at_state(State(each.ravel(), at)).evaluate(term.energy) for w, each in moved
+    )
     assert change == pytest.approx(gradient(half, bend.ravel()) @ v.ravel(), rel=1e-6)
     slope = sum(w * gradient(half, each.ravel()) for w, each in moved)
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
