@@ -8,7 +8,7 @@ them when a path accepts it. Theory: docs/theory.md, equilibrium and continuatio
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -52,6 +52,27 @@ Setting: TypeAlias = tuple[SettableNumber, float]
 DENSE_DIFFERENCE_STEP = 1e-5
 
 
+@dataclass(frozen=True)
+class SystemVariables:
+    """What varies in a system besides u.
+
+    Attributes
+    ----------
+    parameters
+        Free parameters of terms, by name.
+    moving
+        Prescribed displacement E(mu) of nodes among the supported ones. Increments of u are zero
+        there, and whatever u holds there is replaced by E(mu).
+    history
+        History variables, stored in a state next to its load parameters: name -> the number in the
+        terms, and its value where a state has none.
+    """
+
+    parameters: Mapping[str, FreeParameter] = field(default_factory=dict)
+    moving: PrescribedMotion | None = None
+    history: Mapping[str, Setting] = field(default_factory=dict)
+
+
 class FiniteElementSystem:
     """Sum of terms for a displacement u with supports.
 
@@ -69,14 +90,8 @@ class FiniteElementSystem:
         Computes the tangent with the same supports, instead of the terms' forms.
     gradients
         Computes the residual, instead of the terms' forms.
-    parameters
-        Free parameters of terms, by name.
-    moving
-        Prescribed displacement E(mu) of nodes among the supported ones. Increments of u are zero
-        there, and whatever u holds there is replaced by E(mu).
-    history
-        History variables, stored in a state next to its load parameters: name -> the number in the
-        terms, and its value where a state has none.
+    variables
+        What varies besides u.
 
     Attributes
     ----------
@@ -99,21 +114,21 @@ class FiniteElementSystem:
         length: float,
         assembler: TangentAssembler | None = None,
         gradients: ResidualAssembler | None = None,
-        parameters: Mapping[str, FreeParameter] | None = None,
-        moving: PrescribedMotion | None = None,
-        history: Mapping[str, Setting] | None = None,
+        variables: SystemVariables | None = None,
     ) -> None:
+        variables = variables or SystemVariables()
+        moving = variables.moving
         V = u.function_space
         self.u, self.terms, self.length = u, terms, length
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
         self._set_supports(V, supports)
-        self.parameters = parameters or {}
+        self.parameters = variables.parameters
         self.moving, self.edge_pressure = moving, moving.edge_pressure if moving else None
         self._angle_terms = [t for t in terms if isinstance(t, AngleTerm)]
         reference_angles = {t.turn: (t, 0.0) for t in self._angle_terms}
-        self.history: dict[str, Setting] = {**(history or {}), **reference_angles}
+        self.history: dict[str, Setting] = {**variables.history, **reference_angles}
         constants = {name: parameter.constant for name, parameter in self.parameters.items()}
         settings = {name: (number, float(number.value)) for name, number in constants.items()}
         self._settings = settings | self.history

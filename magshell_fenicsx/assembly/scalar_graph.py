@@ -254,38 +254,35 @@ class ScalarGraph:
 
     def _scalar_operation(self, e: Expr) -> Callable[..., int]:
         """Return the operation that an expression applies to each component."""
-        if isinstance(e, classes.Sum):
-            return self.add
-        if isinstance(e, classes.Product):
-            return self.times
-        if isinstance(e, classes.Division):
-            return self.divide
-        if isinstance(e, classes.Power):
-            return self.power
-        if isinstance(e, classes.Conditional):
-            return self.pick
-        if isinstance(e, classes.Abs):
-            return lambda a: self.pick(self.node("<", a, self.zero), self.minus(a), a)
-        if isinstance(e, classes.MinValue):
-            return lambda a, b: self.pick(self.node("<", a, b), a, b)
-        if isinstance(e, classes.MaxValue):
-            return lambda a, b: self.pick(self.node(">", a, b), a, b)
-        if isinstance(e, classes.NotCondition):
-            return lambda a: self.node("!", a)
+        if type(e) in (simple := self._simple_operations()):
+            return simple[type(e)]
         if type(e) in COMPARISONS:
             name = COMPARISONS[type(e)]
             return lambda a, b: self.node(name, a, b)
         if isinstance(e, classes.MathFunction):
             name = {"ln": "log"}.get(e._name, e._name)
             return lambda a: self.node(name, a)
-        if isinstance(e, classes.Atan2):
-            return lambda a, b: self.node("atan2", a, b)
         if isinstance(e, classes.BesselJ | classes.BesselY):
             name = "jn" if isinstance(e, classes.BesselJ) else "yn"
             return lambda order, x: self.node(name, order, x)
         raise NotImplementedError(
             f"an energy at points has {type(e).__name__}, which is no function of numbers"
         )
+
+    def _simple_operations(self) -> dict[type, Callable[..., int]]:
+        """Return the operation of each class of expressions that has one alone."""
+        return {
+            classes.Sum: self.add,
+            classes.Product: self.times,
+            classes.Division: self.divide,
+            classes.Power: self.power,
+            classes.Conditional: self.pick,
+            classes.Abs: lambda a: self.pick(self.node("<", a, self.zero), self.minus(a), a),
+            classes.MinValue: lambda a, b: self.pick(self.node("<", a, b), a, b),
+            classes.MaxValue: lambda a, b: self.pick(self.node(">", a, b), a, b),
+            classes.NotCondition: lambda a: self.node("!", a),
+            classes.Atan2: lambda a, b: self.node("atan2", a, b),
+        }
 
     # --- derivatives --------------------------------------------------------------------------
 
@@ -444,10 +441,8 @@ class ScalarGraph:
             case "tan":
                 slope = self.add(self.one, times(node, node))
                 return slope, times(number(2.0), times(node, slope))
-            case "sinh":
-                return self.node("cosh", x), node
-            case "cosh":
-                return self.node("sinh", x), node
+            case "sinh" | "cosh":
+                return self.node("cosh" if name == "sinh" else "sinh", x), node
             case "tanh":
                 slope = self.add(self.one, self.minus(times(node, node)))
                 return slope, times(number(-2.0), times(node, slope))

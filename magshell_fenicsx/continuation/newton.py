@@ -28,6 +28,7 @@ from magshell_fenicsx.continuation.snes import (
     LatestTangent,
     NewtonOptions,
     SnesCallbacks,
+    SolveOptions,
     make_snes,
 )
 from magshell_fenicsx.continuation.system import (
@@ -154,28 +155,19 @@ class BorderedNewton:
             A longer step, in lengths, ends the solve early, and so do steps that lead astray: see
             `Iterates.stops_early`.
         """
-        result = self._run_snes(
-            self._full_steps,
-            guess,
-            name,
-            row,
-            stress,
-            reuse_distance,
-            max_step,
-            extrapolating=self._tangent.may_extrapolate,
-        )
+        options = SolveOptions(stress, reuse_distance, max_step)
+        extrapolating = replace(options, extrapolating=self._tangent.may_extrapolate)
+        result = self._run_snes(self._full_steps, guess, name, row, extrapolating)
         if not result.converged and self._callbacks.extrapolating:
             leads_away = result.reason in (DIVERGED, GUESS_TOO_FAR)
             if not leads_away or self._callbacks.is_misled_by_extrapolation():
-                result = self._run_snes(
-                    self._full_steps, guess, name, row, stress, reuse_distance, max_step
-                )
+                result = self._run_snes(self._full_steps, guess, name, row, options)
         if result.converged or result.reason == HIDDEN_BY_ROUNDING:
             return result
         if not (search and self._line_search):
             return result
         other_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(
-            self._line_search, guess, name, row, stress
+            self._line_search, guess, name, row, SolveOptions(stress, searched=True)
         )
         return other_result if other_result.converged else result
 
@@ -197,13 +189,13 @@ class BorderedNewton:
                 State(state.u, {**state.mu, **softer}),
                 name,
                 row,
-                relative_tolerance=SOFT_FACES_TOLERANCE,
+                SolveOptions(relative_tolerance=SOFT_FACES_TOLERANCE),
             )
             state, iterations = result.state, iterations + result.iterations
             if not result.converged:
                 return None
         hard_guess = guess.with_(state.u, name, state.mu[name])
-        result = self._run_snes(self._full_steps, hard_guess, name, row)
+        result = self._run_snes(self._full_steps, hard_guess, name, row, SolveOptions())
         if not result.converged:
             return None
         return replace(result, iterations=iterations + result.iterations)
@@ -214,27 +206,11 @@ class BorderedNewton:
         guess: State,
         name: str,
         row: ConstraintRow,
-        stress: Sequence[WeightedDisplacement] = (),
-        reuse_distance: float = 0.0,
-        max_step: float = np.inf,
-        *,
-        extrapolating: bool = False,
-        relative_tolerance: float = 0.0,
+        options: SolveOptions,
     ) -> NewtonResult:
-        """Run SNES from a guess; see `SnesCallbacks.begin` for the parameters."""
+        """Run SNES from a guess."""
         callbacks = self._callbacks
-        callbacks.begin(
-            guess,
-            name,
-            row,
-            stress,
-            snes.getTolerances()[2],
-            searched=snes is self._line_search,
-            reuse_distance=reuse_distance,
-            max_step=max_step,
-            extrapolating=extrapolating,
-            relative_tolerance=relative_tolerance,
-        )
+        callbacks.begin(guess, name, row, snes.getTolerances()[2], options)
         callbacks.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()

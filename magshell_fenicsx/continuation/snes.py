@@ -235,6 +235,30 @@ def factor_with_lag(
     return not needs_inertia or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
 
 
+@dataclass(frozen=True)
+class SolveOptions:
+    """How one solve runs.
+
+    Attributes
+    ----------
+    stress, reuse_distance, max_step
+        See `BorderedNewton.solve`.
+    searched
+        Whether a line search shortens the steps.
+    extrapolating
+        Whether forces of dense terms may be extrapolated.
+    relative_tolerance
+        See `Iterates`.
+    """
+
+    stress: Sequence[WeightedDisplacement] = ()
+    reuse_distance: float = 0.0
+    max_step: float = np.inf
+    searched: bool = False
+    extrapolating: bool = False
+    relative_tolerance: float = 0.0
+
+
 class SnesCallbacks:
     """The callbacks of SNES in a solve: function, Jacobian, linear solver, test of convergence.
 
@@ -262,44 +286,26 @@ class SnesCallbacks:
         guess: State,
         name: str,
         row: ConstraintRow,
-        stress: Sequence[WeightedDisplacement],
         tolerance: float,
-        *,
-        searched: bool = False,
-        reuse_distance: float = 0.0,
-        max_step: float = np.inf,
-        extrapolating: bool = False,
-        relative_tolerance: float = 0.0,
+        options: SolveOptions,
     ) -> None:
-        """Begin a solve.
-
-        Parameters
-        ----------
-        guess, name, row, stress, reuse_distance, max_step
-            As in `BorderedNewton.solve`.
-        searched
-            Whether a line search shortens the steps.
-        extrapolating
-            Whether forces of dense terms may be extrapolated.
-        relative_tolerance
-            As in `Iterates`.
-        """
+        """Begin a solve from a guess on which `row` shall hold, with mu the amplitude `name`."""
         # the extrapolation: whether the present residual uses it, the largest step since forces
         # were computed, and the steps with computed forces
-        self.extrapolating, self._is_extrapolated, self._largest_step = extrapolating, False, 0.0
-        self._computed_steps = list[float]()
-        self._tolerance, self._reuse_distance = tolerance, reuse_distance
+        self.extrapolating, self._is_extrapolated = options.extrapolating, False
+        self._largest_step, self._computed_steps = 0.0, list[float]()
+        self._tolerance, self._reuse_distance = tolerance, options.reuse_distance
         self._guess, self._name, self._row = guess, name, row
-        self._stress, self._has_stress = stress, bool(stress)
-        options = self._options
+        self._stress, self._has_stress = options.stress, bool(options.stress)
+        newton, has_coordinates = self._options, bool(self._system.coordinates)
         self._iterates = Iterates(
-            largest=min(options.largest_step, max_step),
-            patience=LINE_SEARCH_PATIENCE if searched else options.patience,
-            searched=searched,
+            largest=min(newton.largest_step, options.max_step),
+            patience=LINE_SEARCH_PATIENCE if options.searched else newton.patience,
+            searched=options.searched,
             # the force of a body is stiff
-            kinks=options.has_onsets or extrapolating or bool(self._system.coordinates),
-            stops_early=max_step < np.inf,
-            relative_tolerance=relative_tolerance,
+            kinks=newton.has_onsets or options.extrapolating or has_coordinates,
+            stops_early=options.max_step < np.inf,
+            relative_tolerance=options.relative_tolerance,
         )
         self.matrix = self._chord = self._state = self._next = None
         # PETSc's state counters of the vectors x and f to which `_next` belongs

@@ -108,6 +108,29 @@ class FactoredState:
     habit: int
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What a moving shell is held by and touches.
+
+    Attributes
+    ----------
+    moving_amplitudes
+        Amplitudes that are positions and move.
+    device
+        Amplitudes that are unknown, since their conjugates are held at the end of each step; None:
+        all are loads.
+    supports
+        Supports that move.
+    contact
+        Contacts, with which the balance of energy is checked in each step.
+    """
+
+    moving_amplitudes: Collection[str] = ()
+    device: Device | None = None
+    supports: MovingSupports | None = None
+    contact: AveragedContact | None = None
+
+
 class Integrator:
     """Makes steps in time; factors are kept while they serve.
 
@@ -124,15 +147,8 @@ class Integrator:
         c, force per mass and velocity.
     viscous
         Forces that depend on the strain's history.
-    moving_amplitudes
-        Amplitudes that are positions and move.
-    device
-        Amplitudes that are unknown, since their conjugates are held at the end of each step; None:
-        all are loads.
-    supports
-        Supports that move.
-    contact
-        Contacts, with which the balance of energy is checked in each step.
+    surroundings
+        What the shell is held by and touches.
 
     Attributes
     ----------
@@ -150,17 +166,17 @@ class Integrator:
         rho: float,
         drag: float = 0.0,
         viscous: ViscousForces | None = None,
-        moving_amplitudes: Collection[str] = (),
-        device: Device | None = None,
-        supports: MovingSupports | None = None,
-        contact: AveragedContact | None = None,
+        surroundings: Surroundings | None = None,
     ) -> None:
+        surroundings = surroundings or Surroundings()
+        device = surroundings.device
         self.system, self.mass, self.loads = system, mass, loads
         self.drag, self.viscous = drag, viscous
         self.parameters = AlphaParameters.from_spectral_radius(rho)
-        self.supports, self.contact, self._total_energy = supports, contact, np.nan
+        self.supports, self.contact = surroundings.supports, surroundings.contact
+        self._total_energy = np.nan
         self.device, self._free = device, tuple(device.names) if device else ()
-        self._driven = frozenset({*moving_amplitudes, *self._free})
+        self._driven = frozenset({*surroundings.moving_amplitudes, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         # the matrix of a step, with the pattern of the tangent, which contact of shells changes

@@ -14,7 +14,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem, SystemVariables
 from magshell_fenicsx.assembly.free_parameters import (
     FreeParameter,
     PlacementAmplitudes,
@@ -31,7 +31,7 @@ from magshell_fenicsx.models.shell.edges import FOLD
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
-from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.forces.meridian_loads import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
@@ -53,7 +53,7 @@ from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+    from magshell_fenicsx.parts.contact.meridian_contact import MeridianTouching
     from magshell_fenicsx.shells.tee import MeridianTee
 
 Array = NDArray[np.float64]
@@ -258,7 +258,7 @@ class MeridianModel(Thin):
         rule = factory.carrier.contact_rule
         self.touchings = []
         if loads.pairs:
-            from magshell_fenicsx.parts.touching.on_meridian import touchings
+            from magshell_fenicsx.parts.contact.meridian_contact import touchings
 
             curves = self.r0, self.u, meridian.patches, self.material.h, rule
             faces = self.thickness, factory.law_of_cells.thins, factory.natural
@@ -278,9 +278,7 @@ class MeridianModel(Thin):
             held,
             pattern,
             self.material.h,
-            parameters=parameters,
-            moving=moves,
-            history=stiffnesses,
+            variables=SystemVariables(parameters, moves, stiffnesses),
         )
         self._volume = begun()
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem, SystemVariables
 from magshell_fenicsx.assembly.free_parameters import FreeParameter, PlacementAmplitudes
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
@@ -44,7 +44,7 @@ from magshell_fenicsx.models.shell.parameters import (
 from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place, places
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
-from magshell_fenicsx.parts.forces.dead_load import (
+from magshell_fenicsx.parts.forces.load_vectors import (
     SurfaceMeasures,
     assemble_dead_loads,
     patch_entries,
@@ -78,7 +78,7 @@ from magshell_fenicsx.shells.terms import EnergyFactory
 from magshell_fenicsx.shells.unfolded import UnfoldedModes
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.touching.touching import Touching
+    from magshell_fenicsx.parts.contact.surface_contact import Touching
 
 
 class ShellModel(Thin):
@@ -321,7 +321,7 @@ class ShellModel(Thin):
             ]
         meeting: Sequence[Touching] = ()
         if loads.pairs:
-            from magshell_fenicsx.parts.touching.building import touchings
+            from magshell_fenicsx.parts.contact.model_surface import touchings
 
             of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
             thick = carrier.contact_rule, factor, factory.law_of_cells.thins
@@ -386,9 +386,7 @@ class ShellModel(Thin):
             material.h,
             fast,
             gradients,
-            parameters,
-            self.moving,
-            stiffnesses,
+            SystemVariables(parameters, self.moving, stiffnesses),
         )
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
@@ -429,9 +427,7 @@ class ShellModel(Thin):
                 system.length,
                 fast,
                 system.gradients,
-                system.parameters,
-                self.moving,
-                system.history,
+                SystemVariables(system.parameters, self.moving, system.history),
             )
         )
 

@@ -16,7 +16,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem, SystemVariables
 from magshell_fenicsx.assembly.free_parameters import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
@@ -37,7 +37,7 @@ from magshell_fenicsx.models.shell.patterns import (
     places_in_body,
 )
 from magshell_fenicsx.models.solid.densities import MooneyRivlin
-from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
+from magshell_fenicsx.parts.forces.load_vectors import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.loads import Loads, moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
@@ -265,8 +265,7 @@ class SolidModel(Observed):
             self._pattern,
             self.material.h,
             fast,
-            parameters=parameters,
-            moving=moving,
+            variables=SystemVariables(parameters, moving),
         )
 
 

@@ -16,7 +16,7 @@ from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
-from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.continuation.transient import Integrator, Surroundings
 
 Array = NDArray[np.float64]
 MASS = np.diag([1.0, 2.0])
@@ -165,7 +165,11 @@ def swung(rho: float, steps: int, end: float) -> Motion:
     system = Pendulum()
     device = Device(system, {"tension": 0.0}, {"tension": 1.0})
     integrator = Integrator(
-        system, matrix(BOB), lambda t, before: {"tension": 0.0}, rho, device=device
+        system,
+        matrix(BOB),
+        lambda t, before: {"tension": 0.0},
+        rho,
+        surroundings=Surroundings(device=device),
     )
     along = np.array([np.cos(ANGLE), np.sin(ANGLE)])
     now = integrator.begin(0.0, 1.01 * of(ANGLE), SPIN * along + 0.3 * of(ANGLE))
@@ -206,7 +210,11 @@ def test_a_body_pressed_on_with_a_force() -> None:
     system, force = Pendulum(), 0.7
     device = Device(system, {"body": -force}, {"body": 1.0})  # dPi/dd = d - y
     integrator = Integrator(
-        system, matrix(BOB), lambda t, before: {"tension": 0.0, "body": 0.0}, 1.0, device=device
+        system,
+        matrix(BOB),
+        lambda t, before: {"tension": 0.0, "body": 0.0},
+        1.0,
+        surroundings=Surroundings(device=device),
     )
     now = integrator.begin(0.0, np.zeros(2), np.zeros(2))
     assert now.mu["body"] == pytest.approx(force)
