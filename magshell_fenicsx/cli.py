@@ -305,7 +305,7 @@ def study(
 
 
 @app.command()
-def ensemble(
+def ensemble(  # noqa: PLR0913 - what a user gives
     case: CaseFile,
     samples: Annotated[int, typer.Option(min=1, metavar="N", help="number of samples")],
     seed: Annotated[

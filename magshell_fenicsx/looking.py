@@ -31,7 +31,7 @@ app = Commands()
 
 
 @app.command()
-def plot(
+def plot(  # noqa: PLR0913 - what a user gives
     folders: Runs,
     point: Annotated[
         int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")

@@ -169,7 +169,7 @@ def identify(
     )
 
 
-def run(
+def run(  # noqa: PLR0913 - what a user gives
     case: Given,
     out: Path | str | None = None,
     comm: MPI.Comm | None = None,

@@ -78,7 +78,7 @@ class Shell:
         If a geometry or a key is none that a shell has, or `unit` seems to be forgotten.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what a user gives
         self,
         surface: mesh.Mesh | str,
         *,

@@ -21,7 +21,7 @@ from magshell_fenicsx.continuation.fold import (
     times_tangent,
 )
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, dot, max_abs
 
 Kind = Literal["fold", "bifurcation"]
 # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
@@ -136,6 +136,26 @@ class CurveRow:
     value: Callable[[Vector, float, float], float]
 
 
+@dataclass(frozen=True)
+class DifferenceSystem:
+    """The system at one value of p in a difference by p.
+
+    Attributes
+    ----------
+    weight
+        Of its residual in the difference.
+    system, mu
+        The system, and all its amplitudes.
+    is_same_p
+        Whether p is that of the state, where the residual is known.
+    """
+
+    weight: float
+    system: System
+    mu: Amplitudes
+    is_same_p: bool
+
+
 class AugmentedRows:
     """The rows of Newton's step at a state of a boundary.
 
@@ -146,7 +166,7 @@ class AugmentedRows:
     tangent
         The augmented tangent at the state.
     difference
-        Weights and values of p of a difference by p.
+        The systems of a difference by p.
     scales
         Changes of the amplitude and of p that count as of order one.
 
@@ -167,18 +187,12 @@ class AugmentedRows:
         state: State,
         name: str,
         tangent: AugmentedTangent,
-        family: SystemFamily,
-        p: float,
-        difference: Sequence[tuple[float, float]],
+        difference: Sequence[DifferenceSystem],
         scales: tuple[float, float],
     ) -> None:
         self._kind, self._scales, self._mixed_size = kind, scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
-        value = {name: state.mu[name]}
-        self._difference = [
-            (weight, family.solver_at(q).system, {**family.amplitudes(q), **value})
-            for weight, q in difference
-        ]
+        self._difference = difference
         v, u, mu = tangent.v, state.u, state.mu
         self._R = system.residual(u, mu)
         self.w_R, self.t_R = tangent.solve(self._R)
@@ -189,31 +203,22 @@ class AugmentedRows:
         self.v, self.unstable = v, tangent.unstable
         self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
-        R_p, self.K_p_v = self._derivatives_by_p(
-            [p == q for _, q in difference], d, forward, backward
-        )
+        R_p, self.K_p_v = self._derivatives_by_p(d, forward, backward)
         self.w_p, self.t_p = tangent.solve(R_p)
 
     def _derivatives_by_p(
-        self, is_here: Sequence[bool], d: float, forward: Vector, backward: Vector
+        self, d: float, forward: Vector, backward: Vector
     ) -> tuple[Vector, Vector]:
-        """Return R_p and K_p v.
-
-        Parameters
-        ----------
-        is_here
-            Whether a value of p is that of the state: R is known there, ahead at u + d v and back
-            at u - d v.
-        """
+        """Return R_p and K_p v from the residuals ahead, at u + d v, and back, at u - d v."""
         u, v, R_p, K_p_v = self._state.u, self._tangent.v, 0.0 * self._R, 0.0 * self._R
-        for is_same_p, (weight, system, mu) in zip(is_here, self._difference, strict=True):
-            R_p += weight * (self._R if is_same_p else system.residual(u, mu))
-            K_v = (
-                (forward - backward) / (2 * d)
-                if is_same_p
-                else times_tangent(system, State(u, mu), v)
-            )
-            K_p_v += weight * K_v
+        for each in self._difference:
+            if each.is_same_p:
+                R, K_v = self._R, (forward - backward) / (2 * d)
+            else:
+                R = each.system.residual(u, each.mu)
+                K_v = times_tangent(each.system, State(u, each.mu), v)
+            R_p += each.weight * R
+            K_p_v += each.weight * K_v
         return R_p, K_p_v
 
     def set_residual(self, residual: Vector) -> None:
@@ -292,8 +297,7 @@ class AugmentedRows:
         )
         by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * d))) - dot(comm, w, self.K_mu_v)
         loads = [
-            weight * other.load(state.u, amplitudes, name)
-            for weight, other, amplitudes in self._difference
+            each.weight * each.system.load(state.u, each.mu, name) for each in self._difference
         ]
         load_p = np.asarray(np.sum(loads, axis=0))
         by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)

@@ -19,6 +19,7 @@ from magshell_fenicsx.continuation.augmented import (
     BoundaryPoint,
     CurveRow,
     CurveVector,
+    DifferenceSystem,
     Kind,
     NoSystem,
     SystemFamily,
@@ -501,16 +502,18 @@ class Boundary:
         if self.m:
             family = cast(SymmetryBreakingSystems, self.family)
             return SymmetryBreakingRows(newton, state, self.name, b, self.m, family, p, difference)
+        tangent, load = AugmentedTangent(newton, state, b), {self.name: state.mu[self.name]}
+        systems = [
+            DifferenceSystem(
+                weight,
+                self.family.solver_at(q).system,
+                {**self.family.amplitudes(q), **load},
+                is_same_p=p == q,
+            )
+            for weight, q in difference
+        ]
         return AugmentedRows(
-            self.kind,
-            newton.system,
-            state,
-            self.name,
-            AugmentedTangent(newton, state, b),
-            self.family,
-            p,
-            difference,
-            self.scales,
+            self.kind, newton.system, state, self.name, tangent, systems, self.scales
         )
 
     def _counts(

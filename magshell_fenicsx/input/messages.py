@@ -122,10 +122,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         problem,
     )
     if kind == "string_pattern_mismatch":
-        if NAME_PATTERN_PART in error["ctx"]["pattern"]:
-            problem = "must be a letter, then letters, digits and _"
-        else:
-            problem = "must be a number with a unit"
+        is_name = NAME_PATTERN_PART in error["ctx"]["pattern"]
+        name_rule, number_rule = "a letter, then letters, digits and _", "a number with a unit"
+        problem = f"must be {name_rule if is_name else number_rule}"
     if own_key := re.match(r"(\w+(\.[^.:]+)+): ", problem):  # of a rule between sections
         keys = own_key[1].split(".")
         location = tuple(int(key) if key.isdecimal() else key for key in keys)
@@ -141,12 +140,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
-        keys = location[:-1] if isinstance(location[-1], int) else location
-        field = _section_at(keys, source.data, case)[1] or case.model_fields[str(location[0])]
-        models = [m for m in _models(field.annotation) if _tag_key([m])]
-        tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
-        problem = "is missing" if tag is None else shown_value(tag)
-        return f"{place}: {key}.{_tag_key(models)}: {problem}; allowed: {', '.join(tags)}"
+        return f"{place}: {key}.{_tag_problem(error, location, source, case)}"
     if kind in ("model_type", "model_attributes_type"):
         return f"{place}: {key}: {shown_value(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
@@ -160,6 +154,17 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     if text_in_case:  # limits are those of the number that the text became
         text = f"{shown_value(text_in_case)} is {value:.6g}"
     return f"{place}: {key}: {text}: {problem}{meaning}"
+
+
+def _tag_problem(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
+    """Return the key that tells the sections of a union apart, what is wrong there, and what is
+    allowed."""
+    keys = location[:-1] if isinstance(location[-1], int) else location
+    field = _section_at(keys, source.data, case)[1] or case.model_fields[str(location[0])]
+    models = [m for m in _models(field.annotation) if _tag_key([m])]
+    tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
+    problem = "is missing" if tag is None else shown_value(tag)
+    return f"{_tag_key(models)}: {problem}; allowed: {', '.join(tags)}"
 
 
 def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:

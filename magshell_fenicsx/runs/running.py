@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -162,7 +162,37 @@ class StoppableJournal:
         self._watch.check(limited=not is_known)
 
 
-def run(
+@dataclass(frozen=True)
+class RunOutput:
+    """Where a run reports, and what may stop it.
+
+    Attributes
+    ----------
+    comm
+        Communicator of all ranks.
+    say, tell
+        Print a line, and a status that the next one replaces.
+    watch
+        Records requests to stop.
+    start
+        Beginning of the run, in seconds of `time.perf_counter`.
+    pictures
+        Whether pictures are drawn.
+    """
+
+    comm: MPI.Comm
+    say: Say
+    tell: Say
+    watch: Watch
+    start: float
+    pictures: bool
+
+    def report(self, what: str) -> None:
+        """Tell what is done, with the time."""
+        self.tell(status_line(what, time.perf_counter() - self.start))
+
+
+def run(  # noqa: PLR0913 - what a user gives
     problem: Problem,
     out: Path | str | None = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
@@ -183,34 +213,33 @@ def run(
         raise CaseError(
             "out: a run is known again by what it writes of its case: give the problem a 'document'"
         )
-    watch = Watch(comm, start, time_limit, signals=out is not None)
     has_listener = tell is not None
-    say, tell = (
-        (say, tell or _print_nothing) if comm.rank == 0 else (_print_nothing, _print_nothing)
-    )
-    is_plain = is_plain_output(comm.size)
-    progress = _kernel_progress(say, tell, start, keeps_first=is_plain)
+    if comm.rank != 0:
+        say, tell = _print_nothing, _print_nothing
+    watch = Watch(comm, start, time_limit, signals=out is not None)
+    output = RunOutput(comm, say, tell or _print_nothing, watch, start, pictures)
+    progress = _kernel_progress(output, keeps_first=is_plain_output(comm.size))
     with reporting_progress_to(progress) if has_listener else nullcontext():
         if pictures and folder and comm.rank == 0:
             from magshell_fenicsx.output.pictures.rendering import library
 
             library()  # before anything is solved: there may be no compiler
         if folder is None:
-            return _run(problem, None, comm, say, tell, watch, start, pictures, resume=False)
+            return _run(problem, None, output, resume=False)
         with locked_folder(folder, comm, make=not resume):
             open_folder(folder, problem.document, comm, resume, overwrite)
-            return _run(problem, folder, comm, say, tell, watch, start, pictures, resume=resume)
+            return _run(problem, folder, output, resume=resume)
 
 
-def _kernel_progress(say: Say, tell: Say, start: float, *, keeps_first: bool) -> Say:
+def _kernel_progress(output: RunOutput, *, keeps_first: bool) -> Say:
     """Return a function that reports how far kernels are.
 
     If `keeps_first`, the first report is a line that stays: a pipe gets a status late.
     """
-    first_reports = iter([say] if keeps_first else [])
+    first_reports = iter([output.say] if keeps_first else [])
 
     def report(what: str) -> None:
-        next(first_reports, tell)(status_line(what, time.perf_counter() - start))
+        next(first_reports, output.tell)(status_line(what, time.perf_counter() - output.start))
 
     return report
 
@@ -219,32 +248,64 @@ def _print_nothing(line: str) -> None:
     """Print nothing."""
 
 
-def _run(
-    problem: Problem,
-    folder: Path | None,
-    comm: MPI.Comm,
-    say: Say,
-    tell: Say,
-    watch: Watch,
-    start: float,
-    pictures: bool,
-    *,
-    resume: bool,
-) -> Result:
-    """Run a problem in a prepared folder; `start` is in seconds of `time.perf_counter`."""
-
-    def report(what: str) -> None:
-        tell(status_line(what, time.perf_counter() - start))
-
+def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bool) -> Result:
+    """Run a problem in a prepared folder; collective."""
+    comm, say = output.comm, output.say
     empty_checkpoint = b""
     if folder:
         write = partial(checkpoint.empty_content, problem.document)
         empty_checkpoint = access_disk(comm, write, "cannot be read")
+    result = _unloaded_result(problem, folder if resume else None, output)
+    scene, mesh = result.scene, result.adapted
+    _say_what_is_solved(scene, comm, say)
+    files = None
+    if folder:
+        mesh_content = mesh.to_json() if mesh else None
+        files = RunFiles(folder, scene, empty_checkpoint, resume=resume, mesh=mesh_content)
+    if files and files.complete_points:
+        output = replace(output, start=output.start - files.elapsed)
+        say(f"resuming after {files.complete_points} points")
+    interruption: RuntimeError | None = None
+    scene.progress = progress = RunProgress(scene, output.tell, output.start)
+    with output.watch:
+        scene.journal = StoppableJournal(NoJournal(), output.watch)
+        try:
+            _follow(result, files, output, progress)
+            _conclude(result, say)
+        except (Stopped, NoEigenpair) as e:
+            result.stopped = str(e)
+        except (Interrupted, DiskError) as e:
+            interruption, result.stopped = e, str(e)
+        if files and folder and files.journal:
+            result.replayed = files.journal.replayed
+            interruption = _write_results(result, files, folder, output, progress, interruption)
+    if interruption:
+        is_resumable = files is not None and files.journal is not None
+        hint = ""
+        if is_resumable:
+            hint = f"; the results so far are in {folder}/, and --resume continues from there"
+        result.stopped = f"{interruption}{hint}"
+    return result
+
+
+def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -> Result:
+    """Return the result before the first point, with the scene; collective.
+
+    Parameters
+    ----------
+    folder
+        Of the run that is resumed, which may have a mesh.
+
+    Raises
+    ------
+    CaseError, MeshError
+        With the place in the case.
+    """
     try:
-        problem = with_modes(problem, comm)
-        mesh = _mesh_for_tolerance(problem, folder if resume else None, comm, say, report)
-        report("mesh and kernels")
-        scene = mesh.choice.scene(problem, comm) if mesh else Scene(problem, comm)
+        problem = with_modes(problem, output.comm)
+        mesh = _mesh_for_tolerance(problem, folder, output.comm, output.say, output.report)
+        output.report("mesh and kernels")
+        scene = mesh.choice.scene(problem, output.comm) if mesh else Scene(problem, output.comm)
         if problem.gradients is not None:
             from magshell_fenicsx.runs.gradients import refuse_unknown
 
@@ -253,47 +314,31 @@ def _run(
         raise type(e)(problem.document.placed(str(e))) from None
     if mesh and mesh.branch:
         scene.meshed = mesh.branch.choice.applied
-    result = Result(scene, scene.unloaded(), adapted=mesh)
-    _say_what_is_solved(scene, comm, say)
-    files = None
-    if folder:
-        mesh_content = mesh.to_json() if mesh else None
-        files = RunFiles(folder, scene, empty_checkpoint, resume=resume, mesh=mesh_content)
-    if files and files.complete_points:
-        start -= files.elapsed
-        say(f"resuming after {files.complete_points} points")
-    interruption: RuntimeError | None = None
-    scene.progress = progress = RunProgress(scene, tell, start)
-    with watch:
-        scene.journal = StoppableJournal(NoJournal(), watch)
-        try:
-            _follow(result, files, say, progress, start, watch)
-            _conclude(result, say)
-        except (Stopped, NoEigenpair) as e:
-            result.stopped = str(e)
-        except (Interrupted, DiskError) as e:
-            interruption, result.stopped = e, str(e)
-        if files and folder and files.journal:
-            result.replayed = files.journal.replayed
-            try:
-                files.write_summary(summary(result, time.perf_counter() - start))
-                if not interruption:  # an interrupted run draws no pictures
-                    progress.doing("modes and pictures")
-                    _write_after_run(result, folder, comm, say, pictures)
-                    # again, with the time of the pictures
-                    files.write_summary(summary(result, time.perf_counter() - start))
-                playable = pictures and not interruption
-                access_disk(comm, partial(write_report, folder, playable=playable))
-            except DiskError as e:
-                interruption = interruption or e
-            files.close(complete=not interruption and not result.stopped)
-    if interruption:
-        is_resumable = files is not None and files.journal is not None
-        hint = ""
-        if is_resumable:
-            hint = f"; the results so far are in {folder}/, and --resume continues from there"
-        result.stopped = f"{interruption}{hint}"
-    return result
+    return Result(scene, scene.unloaded(), adapted=mesh)
+
+
+def _write_results(
+    result: Result,
+    files: RunFiles,
+    folder: Path,
+    output: RunOutput,
+    progress: RunProgress,
+    interruption: RuntimeError | None,
+) -> RuntimeError | None:
+    """Write what follows the path, and return what interrupted the run, if anything did."""
+    pictures = output.pictures and not interruption  # an interrupted run draws none
+    try:
+        files.write_summary(summary(result, time.perf_counter() - output.start))
+        if not interruption:
+            progress.doing("modes and pictures")
+            _write_after_run(result, folder, output.comm, output.say, pictures)
+            # again, with the time of the pictures
+            files.write_summary(summary(result, time.perf_counter() - output.start))
+        access_disk(output.comm, partial(write_report, folder, playable=pictures))
+    except DiskError as e:
+        interruption = interruption or e
+    files.close(complete=not interruption and not result.stopped)
+    return interruption
 
 
 def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:
@@ -448,10 +493,8 @@ def _barrier(result: Result) -> float | None:
 def _follow(
     result: Result,
     files: RunFiles | None,
-    say: Say,
+    output: RunOutput,
     progress: RunProgress,
-    start: float,
-    watch: Watch,
 ) -> None:
     """Compute the path of a scene and write it point by point; collective."""
     scene, row_maker = result.scene, RowMaker(result.scene)
@@ -460,11 +503,10 @@ def _follow(
             if files.journal is None:
                 files.begin()
             assert files.journal
-            scene.journal = StoppableJournal(
-                files.journal, watch
-            )  # before the first solve of a step
+            # before the first solve of a step
+            scene.journal = StoppableJournal(files.journal, output.watch)
         result.path_history.add(record)
-        row = row_maker.row(record, time.perf_counter() - start)
+        row = row_maker.row(record, time.perf_counter() - output.start)
         number = len(result.rows)
         result.rows.append(row)
         if record.label == SOLUTION:
@@ -483,7 +525,7 @@ def _follow(
         replayed = files is not None and len(result.rows) <= files.complete_points
         progress.accepted(row, is_known=replayed)
         if not replayed:
-            say(_line(row))
+            output.say(_line(row))
 
 
 def _line(row: Row) -> str:

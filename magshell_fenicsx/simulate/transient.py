@@ -19,15 +19,15 @@ from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, dot, max_abs
-from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.continuation.transient import Integrator, Surroundings
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.bodies.contact import Pressing
-from magshell_fenicsx.parts.course import SnapSection
+from magshell_fenicsx.parts.bodies.body_contact import Pressing
+from magshell_fenicsx.parts.step_control import SnapSection
 from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection, level_in
-from magshell_fenicsx.parts.touching.in_steps import InSteps, looks_of_step
+from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection, level_in
+from magshell_fenicsx.parts.contact.time_averaging import TimeAveragedContact, samples_of_step
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.meridian_chart import vector_function
 from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
@@ -203,7 +203,7 @@ class Pressings:
         self,
         system: FiniteElementSystem,
         pressings: Mapping[str, Pressing],
-        between: Sequence[InSteps],
+        between: Sequence[TimeAveragedContact],
     ) -> None:
         self._system, self._pressings, self._between = system, list(pressings.values()), between
         self.names = frozenset(pressings)
@@ -237,15 +237,15 @@ class Pressings:
         ):
             pressing.average(low, high, part)
         for contact, u, v in zip(self._between, before.of_shells, after.of_shells, strict=True):
-            contact.looks = ()
-            contact.looks = looks_of_step(contact, u, v, part)
+            contact.samples = ()
+            contact.samples = samples_of_step(contact, u, v, part)
 
     def use_state_forces(self) -> None:
         """Take the present forces again."""
         for pressing in self._pressings:
             pressing.present()
         for contact in self._between:
-            contact.looks = ()
+            contact.samples = ()
 
     def penetration_message(self, begin: State, end: State) -> str:
         """Which shells pass through each other in a step."""
@@ -322,7 +322,7 @@ def motion(
                 carried,
             )
         pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
-        between = scene.model.touchings
+        between = scene.model.shell_contacts
         touching = Pressings(system, pressings, between) if pressings or between else None
         integrator = Integrator(
             system,
@@ -331,10 +331,7 @@ def motion(
             load.rho_inf,
             drag,
             viscous,
-            load.drives,
-            device,
-            ground,
-            touching,
+            Surroundings(load.drives, device, ground, touching),
         )
         return integrator, integrator.begin(0.0, u, v)
 

@@ -11,7 +11,7 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.section import si_size
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.multi_shell import ShellPose
-from magshell_fenicsx.models.shell.controls import ByControls, Controls
+from magshell_fenicsx.models.shell.control_points import ByControls, Controls
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -193,7 +193,7 @@ class ControlPointField(Bounded):
     """The values (n, components) of a scalar field at points, of which each place has the mean.
 
     They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a
-    field is a formula, with the weights of `models.shell.controls`: it needs no file, and its
+    field is a formula, with the weights of `models.shell.control_points`: it needs no file, and its
     symmetry is recognised by its values.
 
     Attributes

@@ -1,6 +1,6 @@
 """The results of a design's case and their gradients by its variables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -78,27 +78,14 @@ def evaluate(
 
     `known` is of the case before.
     """
-    lost_reason, named_sections = "", variables.case.design.named_results
-    records, history, remarks = list[Record](), History(), list[str]()
     try:
         scene = scene_cache.of(case.problem(variables.smooth), comm)
-        for result in results:
-            if result != MASS and result not in targets:
-                refuse_no_result(scene, [result], named_sections[result], extra_results=[MASS])
-        for record in follow_alone(scene, remark=remarks.append):
-            records.append(record)
-            history.add(record)
-            if _enough(records, results):
-                break
+        _refuse_missing_results(scene, variables, results, targets)
+        path = _follow_until_enough(scene, results)
     except MeshError as e:
         return DesignEvaluation(note=f"no shell: {e}")
-    except Stopped as e:
-        lost_reason = str(e)
-    lost_reason = lost_reason or next((text for text in remarks if text.startswith(BEYOND)), "")
-    evaluation, notes = (
-        DesignEvaluation(),
-        [f"the path is lost: {lost_reason}"] if lost_reason else [],
-    )
+    evaluation = DesignEvaluation()
+    notes = [f"the path is lost: {path.lost_reason}"] if path.lost_reason else []
 
     def slope(gradients: Mapping[str, float | FieldGradient]) -> list[float]:
         return [float(v) for v in variables.gradient(x, scene, gradients)]
@@ -106,44 +93,91 @@ def evaluate(
     try:
         for result in results:
             if result == MASS:
-                of_mass = mass(scene)
-                scalar_keys = [
-                    name for name in variables.names if name in WITH_MASS or "shell." in name
-                ]
-                evaluation.values[result] = of_mass.value
-                evaluation.gradients[result] = slope(
-                    {name: derivative(of_mass, name) for name in scalar_keys if of_mass.forms}
-                )
+                _add_mass(evaluation, scene, variables, slope)
                 continue
-            if lost_reason and result not in FOLDS:
+            if path.lost_reason and result not in FOLDS:
                 return DesignEvaluation(note=notes[0])
-            if result in LOWEST:
-                adjoints = _lowest(scene, records, result, history.begins)
-                notes.append(
-                    "lowest: "
-                    + ", ".join(
-                        f"{mode or 'mode'} at {adjoint_of_mode.value_in_unit:.6g}"
-                        for mode, adjoint_of_mode in adjoints
-                    )
-                )
-            else:
-                refuse_moving(scene, records[-1], targets.get(result, result))
-                adjoints = [adjoint_at_end(scene, history, targets.get(result, result))]
-                notes += [f"{result}: {kind}" for kind, _ in adjoints if kind]
-            (evaluation.values[result], evaluation.gradients[result]), *others = [
+            adjoints, note = _adjoints(scene, path, result, targets)
+            notes += [note] if note else []
+            values = [
                 (
                     adjoint_of_mode.value_in_unit,
                     slope({name: derivative(adjoint_of_mode, name) for name in variables.names}),
                 )
                 for _, adjoint_of_mode in adjoints
             ]
+            evaluation.values[result], evaluation.gradients[result] = values[0]
             if result in LOWEST:
-                evaluation.beside[result] = others
+                evaluation.beside[result] = values[1:]
     except (LostResult, FoldLost) as e:
         return DesignEvaluation(note="; ".join([f"no {result}: {e}", *notes]))
     for target in targets.values():
-        evaluation.seen[DISTANCE] = distances(scene, records[-1].point.state, target)[1]
+        evaluation.seen[DISTANCE] = distances(scene, path.records[-1].point.state, target)[1]
     return replace(evaluation, note="; ".join(notes))
+
+
+@dataclass
+class _Path:
+    """The records of a path as far as results need it, and why it was lost, if it was."""
+
+    records: list[Record] = field(default_factory=list)
+    history: History = field(default_factory=History)
+    lost_reason: str = ""
+
+
+def _refuse_missing_results(
+    scene: Scene, variables: Variables, results: Sequence[str], targets: Mapping[str, Target]
+) -> None:
+    named_sections = variables.case.design.named_results
+    for result in results:
+        if result != MASS and result not in targets:
+            refuse_no_result(scene, [result], named_sections[result], extra_results=[MASS])
+
+
+def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _Path:
+    """Follow the path of a scene as far as the results need it; collective."""
+    path, remarks = _Path(), list[str]()
+    try:
+        for record in follow_alone(scene, remark=remarks.append):
+            path.records.append(record)
+            path.history.add(record)
+            if _enough(path.records, results):
+                break
+    except Stopped as e:
+        path.lost_reason = str(e)
+    remarks_on_end = (text for text in remarks if text.startswith(BEYOND))
+    path.lost_reason = path.lost_reason or next(remarks_on_end, "")
+    return path
+
+
+def _add_mass(
+    evaluation: DesignEvaluation,
+    scene: Scene,
+    variables: Variables,
+    slope: Callable[[Mapping[str, float | FieldGradient]], list[float]],
+) -> None:
+    """Add the mass of the shell, with its gradient, to an evaluation."""
+    functional = mass(scene)
+    keys = [name for name in variables.names if name in WITH_MASS or "shell." in name]
+    derivatives = {name: derivative(functional, name) for name in keys if functional.forms}
+    evaluation.values[MASS], evaluation.gradients[MASS] = functional.value, slope(derivatives)
+
+
+def _adjoints(
+    scene: Scene, path: _Path, result: str, targets: Mapping[str, Target]
+) -> tuple[list[tuple[str, Adjoint]], str]:
+    """Return the adjoints of a result, or of its lowest modes, and a note about them."""
+    if result in LOWEST:
+        adjoints = _lowest(scene, path.records, result, path.history.begins)
+        modes = (
+            f"{mode or 'mode'} at {adjoint_of_mode.value_in_unit:.6g}"
+            for mode, adjoint_of_mode in adjoints
+        )
+        return adjoints, f"lowest: {', '.join(modes)}"
+    target = targets.get(result, result)
+    refuse_moving(scene, path.records[-1], target)
+    kind, adjoint = adjoint_at_end(scene, path.history, target)
+    return [(kind, adjoint)], f"{result}: {kind}" if kind else ""
 
 
 def _lowest(

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.controls import Controls
+from magshell_fenicsx.models.shell.control_points import Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
 from magshell_fenicsx.problem.formulas import THICKNESS

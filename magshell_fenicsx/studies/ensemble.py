@@ -71,7 +71,7 @@ class Ensemble:
         return sum(row["status"] != "found" for row in self.rows)
 
 
-def ensemble(
+def ensemble(  # noqa: PLR0913 - what a user gives
     file: Path | str,
     settings: Sequence[str] = (),
     *,

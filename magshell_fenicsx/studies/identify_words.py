@@ -16,8 +16,20 @@ UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 
 def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
     """Describe the results of an identification in sentences."""
-    measured = posterior.measured
-    lines, keys = list[str](), list(content["parameters"])
+    lines = _sentences_of_parameters(content)
+    if content["remanence"]:
+        lines += words(content["remanence"])
+    return [
+        *lines,
+        *_sentences_of_correlations(list(content["parameters"]), posterior),
+        *_sentences_of_noise(content, table),
+        *_warnings(content, posterior, table),
+        *_sentences_of_predictions(content),
+    ]
+
+
+def _sentences_of_parameters(content: dict[str, Any]) -> list[str]:
+    lines = list[str]()
     for key, entry in content["parameters"].items():
         unit = f" {entry['unit']}" if entry["unit"] else ""
         lines.append(
@@ -26,14 +38,23 @@ def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
         )
         if entry["prior"] and entry["deviation"] > PRIOR * entry["prior"]["deviation"]:
             lines.append(f"{key}: the data add little to its prior")
-    if content["remanence"]:
-        lines += words(content["remanence"])
+    return lines
+
+
+def _sentences_of_correlations(keys: list[str], posterior: Posterior) -> list[str]:
+    lines = list[str]()
     for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
-        if abs(c := float(posterior.correlation[i, j])) > HIGH_CORRELATION:
+        correlation = float(posterior.correlation[i, j])
+        if abs(correlation) > HIGH_CORRELATION:
             lines.append(
                 f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation "
-                f"{c:+.4f}"
+                f"{correlation:+.4f}"
             )
+    return lines
+
+
+def _sentences_of_noise(content: dict[str, Any], table: MeasuredTable) -> list[str]:
+    lines = list[str]()
     for header, entry in content["noise"].items():
         how = "estimated" if entry["estimated"] else "given"
         lines.append(
@@ -41,24 +62,36 @@ def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
         )
     for header, count in table.missing.items():
         lines.append(f"{header}: rows without a number, left out: {count}")
+    return lines
+
+
+def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
+    """Warn of a misfit beyond the noise, of rough bands, and of a fit that has not converged."""
+    measured, lines = posterior.measured, list[str]()
     if not np.isnan(measured.noise).any():
-        square = float((((measured.data - posterior.y) / posterior.noise[table.column]) ** 2).sum())
-        if scipy.stats.chi2.sf(square, max(len(measured.data), 1)) < UNLIKELY:
+        deviations = (measured.data - posterior.y) / posterior.noise[table.column]
+        chi_squared = float((deviations**2).sum())
+        if scipy.stats.chi2.sf(chi_squared, max(len(measured.data), 1)) < UNLIKELY:
             lines.append(
                 f"warning: the misfit is {content['misfit_over_noise']:.3g} times the noise: the "
-                "model does not "
-                "describe these data, or their noise is larger; leave it out to have it estimated"
+                "model does not describe these data, or their noise is larger; leave it out to "
+                "have it estimated"
             )
     bent, lost_count = content["normal"]["difference"], content["normal"]["lost"]
     if bent > NORMAL or lost_count:
         nowhere = f", and at {lost_count} such places nothing is predicted" if lost_count else ""
         lines.append(
             f"warning: at the ends of the bands the misfit differs by {100 * bent:.0f} % from its "
-            f"parabola{nowhere}: "
-            "the bands are rough"
+            f"parabola{nowhere}: the bands are rough"
         )
     if content["ended"] != "converged":
         lines.append(f"warning: the fit has not converged: {content['ended']}")
+    return lines
+
+
+def _sentences_of_predictions(content: dict[str, Any]) -> list[str]:
+    """Describe what is predicted, and the next measurement that narrows a band most."""
+    lines = list[str]()
     for entry in content["predicted"]:
         place = f" at {entry['at']:g}" if entry["at"] != "end" else ""
         if "note" in entry:
@@ -68,7 +101,8 @@ def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
             f"{entry['result']}{place} = {entry['value']:.6g} {entry['unit']}".rstrip()
             + f" predicted, 95 % between {entry['low']:.6g} and {entry['high']:.6g}"
         )
-    if best := content["next"]:
+    best = content["next"]
+    if best:
         place = "" if best["at"] == "end" else f" at {best['at']:g}"
         lines.append(
             f"next: {best['result']}{place} narrows {best['parameter']} most: "

@@ -59,7 +59,7 @@ class Study:
         return sum(row["result"] is None for row in self.rows)
 
 
-def study(
+def study(  # noqa: PLR0913 - what a user gives
     file: Path | str,
     over: Sequence[str],
     settings: Sequence[str] = (),

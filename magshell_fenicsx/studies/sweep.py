@@ -91,7 +91,7 @@ class Sweep:
         return sum(outcome.stopped is not None for outcome in self.outcomes)
 
 
-def sweep(
+def sweep(  # noqa: PLR0913 - what a user gives
     file: Path | str,
     over: Sequence[str],
     settings: Sequence[str] = (),

@@ -4,6 +4,8 @@ loading device.
 The device holds a pendulum's rod, which is a constraint, or a body on a spring that is pressed on.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -78,17 +80,8 @@ def test_same_motion_as_petsc() -> None:
     ) -> None:
         f.setArray(MASS @ a.array_r + toy.residual(u.array_r.copy(), {"load": load(t)}))
 
-    def jacobian(
-        ts: PETSc.TS,
-        t: float,
-        u: PETSc.Vec,
-        v: PETSc.Vec,
-        a: PETSc.Vec,
-        sv: float,
-        sa: float,
-        J: PETSc.Mat,
-        P: PETSc.Mat,
-    ) -> None:
+    def jacobian(ts: PETSc.TS, *arguments: Any) -> None:
+        _, u, _, _, _, sa, _, P = arguments  # t, u, v, a, shifts by v and a, J, P
         P.setValues(range(2), range(2), toy.hessian(u.array_r.copy()) + sa * MASS)
         P.assemble()
 

@@ -7,7 +7,7 @@ python3 calculix.py pinched --read pinched.dat
 
 import argparse
 import re
-from itertools import pairwise
+from itertools import pairwise, product
 from math import cos, pi, sin
 from pathlib import Path
 
@@ -19,19 +19,22 @@ PROBLEMS = {
 }
 
 
+def numbered_nodes(n: int, m: int) -> dict[tuple[int, int, int], int]:
+    """Return the number of each node (i, j, k) of n times m cells with 20 nodes."""
+    number: dict[tuple[int, int, int], int] = {}
+    for a, b in product(range(n), range(m)):
+        for i, j in product(range(2 * a, 2 * a + 3), range(2 * b, 2 * b + 3)):
+            for k in {0: (0, 1, 2), 1: (0, 2)}.get(i % 2 + j % 2, ()):
+                number.setdefault((i, j, k), len(number) + 1)
+    return number
+
+
 def written(problem: str, n: int, m: int, steps: int) -> str:
     """The input; nodes are at half steps (i, j) around and along, k = 0, 1, 2 through the
     thickness.
     """
     R, L, h, E, nu, held, end, _ = PROBLEMS[problem]
-    number: dict[tuple[int, int, int], int] = {}
-    for a in range(n):
-        for b in range(m):
-            for i in range(2 * a, 2 * a + 3):
-                for j in range(2 * b, 2 * b + 3):
-                    levels = {0: (0, 1, 2), 1: (0, 2)}.get(i % 2 + j % 2, ())
-                    for k in levels:
-                        number.setdefault((i, j, k), len(number) + 1)
+    number = numbered_nodes(n, m)
     out = ["*NODE"]
     for (i, j, k), node in number.items():
         r, t = R + h * (k - 1) / 2, pi / 2 * i / (2 * n)

@@ -28,7 +28,14 @@ from magshell_fenicsx.parts.magnetism.magnetised_cells import (
     NodalDerivatives,
 )
 from magshell_fenicsx.parts.magnetism.multipole_expansion import MultipoleExpansion
-from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Pairs, Points, Stiffness
+from magshell_fenicsx.parts.magnetism.pairs import (
+    NO_IMAGES,
+    Copies,
+    PairLimits,
+    Pairs,
+    Points,
+    Stiffness,
+)
 from magshell_fenicsx.parts.magnetism.singular_pairs import CHARGE_TOLERANCE, SingularPairs
 from magshell_fenicsx.parts.magnetism.stacked_faces import StackedFaces
 from magshell_fenicsx.parts.magnetism.tree import Octree
@@ -273,17 +280,8 @@ class InteractingCharges:
             nodes, own_cells, has_rule & self._of_different_parts[own_cells.start : own_cells.stop]
         )
         has_rule &= ~is_stacked
-        rules = self._pairs.rules(
-            nodes,
-            own_cells,
-            has_rule,
-            least_distances,
-            h=self._h,
-            space=MIN_DISTANCE,
-            above_tolerance=ABOVE_TOLERANCE,
-            flat=BESIDE_SINE,
-            worst=too_near,
-        )
+        limits = PairLimits(self._h, MIN_DISTANCE, ABOVE_TOLERANCE, BESIDE_SINE, too_near)
+        rules = self._pairs.rules(nodes, own_cells, has_rule, least_distances, limits)
         if rules is None:
             raise PartsTooNear
         rules[is_stacked] = len(DEGREES) - 1

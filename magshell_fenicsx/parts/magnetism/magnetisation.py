@@ -14,8 +14,8 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.controls import ByControls, Controls
-from magshell_fenicsx.models.shell.patterns import (
+from magshell_fenicsx.models.shell.control_points import ByControls, Controls
+from magshell_fenicsx.models.shell.spatial_fields import (
     Components,
     Inside,
     Pattern,
@@ -35,7 +35,7 @@ from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.part import Account, Context, Modelled
+from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.shape.meridian_chart import (
     field_is_axisymmetric,
     scalar_is_axisymmetric,
@@ -248,24 +248,12 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
         span = outline.meridian and replace(outline.meridian, shell_meridians=meridians)
         if not (span and field_is_axisymmetric(fields[-1], span, smooth=False)):
             reasons.append(f"the remanence of {name} differs around e3")
-    if remanent.components and not (
-        outline.meridian and vector_is_axisymmetric(remanent.components, outline.meridian)
-    ):
-        reasons.append("the formula of the remanence differs around e3")
-    if formulas and not (
-        outline.meridian and vector_is_axisymmetric(formulas, outline.meridian, in_space=True)
-    ):
-        reasons.append("the formula of the applied field differs around e3")
-    if isinstance(magnetic.susceptibility, str) and not (
-        outline.meridian and scalar_is_axisymmetric(magnetic.susceptibility, outline.meridian)
-    ):
-        reasons.append("the susceptibility differs around e3")
     sources = values(context) if magnetic.applied.sources or rotates_as_whole else []
-    if sources and not (
-        outline.meridian
-        and all(field_is_axisymmetric(field, outline.meridian) for field in sources)
-    ):
-        reasons.append("the field of a source differs around e3")
+    reasons += [
+        f"{what} differs around e3"
+        for what, is_axisymmetric in _axisymmetry_of_formulas(magnetic, outline, sources).items()
+        if not is_axisymmetric
+    ]
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         reasons.append("the gradient of the applied field is not diag(a, a, b)")
 
@@ -311,6 +299,33 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
             mirrors,
         )
     ]
+
+
+def _axisymmetry_of_formulas(
+    magnetic: MagneticSection, outline: Outline, sources: Sequence[Callable[[Array], Array]]
+) -> dict[str, bool]:
+    """Return for each formula, and for the sources, whether it is the same around e3."""
+    meridian = outline.meridian
+    remanence = magnetic.remanent.components if magnetic.remanent else None
+    applied = magnetic.applied.components if magnetic.applied.beside else None
+    is_axisymmetric = dict[str, bool]()
+    if remanence:
+        is_axisymmetric["the formula of the remanence"] = bool(
+            meridian and vector_is_axisymmetric(remanence, meridian)
+        )
+    if applied:
+        is_axisymmetric["the formula of the applied field"] = bool(
+            meridian and vector_is_axisymmetric(applied, meridian, in_space=True)
+        )
+    if isinstance(magnetic.susceptibility, str):
+        is_axisymmetric["the susceptibility"] = bool(
+            meridian and scalar_is_axisymmetric(magnetic.susceptibility, meridian)
+        )
+    if sources:
+        is_axisymmetric["the field of a source"] = bool(
+            meridian and all(field_is_axisymmetric(field, meridian) for field in sources)
+        )
+    return is_axisymmetric
 
 
 def _at_places(pattern: Pattern, x: Array) -> Array:

@@ -184,6 +184,31 @@ class Stiffness:
         return bsr_array((blocks, self.columns, self.starts), self.shape)
 
 
+@dataclass(frozen=True)
+class PairLimits:
+    """Limits by which a pair of cells has a rule.
+
+    Attributes
+    ----------
+    h
+        Thickness over R: nearer cells are too near.
+    space
+        Least distance over size that is counted.
+    above_tolerance
+        Distance over a cell's radius: what is so near to its middle is above or below the cell.
+    flat
+        Sine of the angle up to which a cell is beside another, not above it.
+    worst
+        Distance over size below which cells are too near.
+    """
+
+    h: float
+    space: float
+    above_tolerance: float
+    flat: float
+    worst: float
+
+
 class Pairs:
     """The compiled functions for pairs of cells with nodes (cells, k, 3); collective to make."""
 
@@ -325,12 +350,7 @@ class Pairs:
         own_cells: range,
         has_rule: NDArray[np.uint8],
         least_distances: Array,
-        *,
-        h: float,
-        space: float,
-        above_tolerance: float,
-        flat: float,
-        worst: float,
+        limits: PairLimits,
     ) -> NDArray[np.int8] | None:
         """Return (own cells, cells) the number of the rule of each pair, -1 without one.
 
@@ -342,16 +362,6 @@ class Pairs:
             (own cells, cells) 1 for the pairs that have a rule.
         least_distances
             (rules,) the distance over the size of cells from which each rule is precise.
-        h
-            Thickness over R: nearer cells are too near.
-        space
-            Least distance over size that is counted.
-        above_tolerance
-            Distance over a cell's radius: what is so near to its middle is above or below the cell.
-        flat
-            Sine of the angle up to which a cell is pattern another, not above it.
-        worst
-            Distance over size below which cells are too near.
         """
         centre = nodes.mean(axis=1)
         normal = np.cross(nodes[:, 1] - nodes[:, 0], nodes[:, 2] - nodes[:, 0])
@@ -363,13 +373,13 @@ class Pairs:
         too_near = self._lib.rules(
             *sizes,
             *arrays,
-            h,
-            space,
-            above_tolerance,
-            flat,
+            limits.h,
+            limits.space,
+            limits.above_tolerance,
+            limits.flat,
             len(least_distances),
             p(least_distances),
-            worst,
+            limits.worst,
             p(rule_numbers),
         )
         return None if too_near else rule_numbers

@@ -9,10 +9,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, OrInMemory, Section, in_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.course import Target
-from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled, Offer
+from magshell_fenicsx.parts.step_control import Target
+from magshell_fenicsx.parts.ability import Ability, Context, Formulas, Modelled, Offer
 from magshell_fenicsx.parts.path_step import LoadStep
-from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.observables import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -77,16 +77,19 @@ def _components(
             return value if value is None else checked_list(value)
         if not value:
             raise ValueError("a mapping names at least one patch")
-        for name, patch_value in value.items():
-            if any(
-                isinstance(v, str) and per_length(v) is v
-                for v in (patch_value if isinstance(patch_value, list) else [patch_value])
-            ):
-                raise ValueError(f"{name}: of a patch numbers, no formulas")
+        _refuse_formulas_of_patches(value)
         return {name: checked_list(patch_value) for name, patch_value in value.items()}
 
     kind = Number | Annotated[list[Number], Field(min_length=numbers, max_length=numbers)]
     return BeforeValidator(read, json_schema_input_type=kind | dict[str, kind] | None)
+
+
+def _refuse_formulas_of_patches(value_of_patch: dict[str, Any]) -> None:
+    """Check that patches have numbers, with or without a unit."""
+    for name, value in value_of_patch.items():
+        values = value if isinstance(value, list) else [value]
+        if any(isinstance(v, str) and per_length(v) is v for v in values):
+            raise ValueError(f"{name}: of a patch numbers, no formulas")
 
 
 MAX_CURVATURE = 1e6  # of a natural shape by formula, over 1/R
@@ -270,7 +273,7 @@ class NaturalSeen(Seen):
         return tuple(loads.natural.amplitudes) if loads.natural else ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.patterns import (
+        from magshell_fenicsx.models.shell.spatial_fields import (
             by_patch,
         )  # the solver takes long to import
 
