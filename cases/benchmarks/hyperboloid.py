@@ -19,7 +19,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grading import Grading, LineFeature
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.models import carriers
+from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.problem.problem import meridian_vertices
@@ -82,7 +82,7 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     model = MeridianModel(meridian, problem.material, 4, conditions, problem.loads)
     waves, carrier = model.excluded_modes.waves, model.factory.carrier
     v = ufl.TestFunction(waves.V)
-    along = carriers.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
+    along = domains.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
     form = np.pi * carrier.over_area()(
         -ufl.dot(kin.normal(carrier.j0), along)
     )  # of the pressure E h/R

@@ -1,7 +1,13 @@
-"""From a case to what must be built for it, without building anything: the parts added up."""
+"""Planner: makes the `Problem` of a case, without building anything.
+
+A case has sections, units and a programme. Here the symmetry that its parts preserve chooses the
+part of the shell that is modelled; loads, bodies, imperfections and formulas choose the sizes of
+elements; and what the parts of the case bring is added up to the loads of one model. docs/theory.md
+has the sizes and the symmetry.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
@@ -11,21 +17,30 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.case_variants import case_with_values, perfect_case
 from magshell_fenicsx.case.contact_mesh_size import ContactPlace
+from magshell_fenicsx.case.modelled_part import (
+    ModelledPart,
+    edge_conditions,
+    modelled_part,
+    symmetry_constraints,
+)
 from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, on_features
 from magshell_fenicsx.input.expressions import formula, formula_group
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Grading, SquaresFeature
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
-from magshell_fenicsx.mesh.mirror import ROUNDING, Y0_PLANE, Mirror, Sector, rotation
+from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
 from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
+from magshell_fenicsx.models.shell.adaptive_sampling import Leaves
+from magshell_fenicsx.parts.ability import Modelled
+from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.bodies.body_setup import Pressed, body_leaves, contacts
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import (
@@ -35,13 +50,13 @@ from magshell_fenicsx.parts.imperfections.symmetry import (
     leaves,
     spots,
 )
-from magshell_fenicsx.parts.laminate import Laminated, laminate_of
+from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
-from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
+    PlacedFormulas,
     adaptive_cells,
     case_formulas,
     formula_refinements,
@@ -55,23 +70,15 @@ from magshell_fenicsx.problem.model_description import describe_model
 from magshell_fenicsx.problem.problem import Document, PendingModes, Problem, solid_body_of
 from magshell_fenicsx.problem.surface_names import refuse_unfit_ends, surface_terms
 from magshell_fenicsx.shape.outline import Chart, Outline, reference_shell_of
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
 from magshell_fenicsx.shape.shell_sections import MeshSurface
-from magshell_fenicsx.shape.symmetry_constraint import (
-    SymmetryConstraint,
-    common_mirror,
-    common_sector,
-    energy_without_mirror,
-    points_constraint,
-    shape_constraint,
-    unit,
-    why_not_axisymmetric,
-)
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, why_not_axisymmetric
 
 Array = NDArray[np.float64]
-SHORTEST = 0.05  # size of elements at the tip of a sector, over the largest
-FAR_FROM_ONE = (
-    50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
-)
+MIN_SIZE_AT_TIP = 0.05  # size of elements at the tip of a sector, over the largest
+# times the radius, or a part of it: a surface as long as that hints at another unit
+MAX_EXTENT_OVER_RADIUS = 50.0
+StepsAtPlaces = dict[str, tuple[ProgrammeStep, Array]]  # by name of a step; places (3,) over R
 
 
 def make_problem(
@@ -79,13 +86,21 @@ def make_problem(
     terms: Sequence[OwnTerm] = (),
     plane: Mirror | None = None,
     smooth: Collection[str] = (),
-    met: Sequence[Array] = (),
+    contact_places: Sequence[Array] = (),
 ) -> Problem:
-    """The problem of a case, with its user-defined energies and `terms`; its half at a plane that
-    is `own_mirror`, if given.
+    """Return the problem of a case.
 
-    Formulas of the keys in `smooth` are known to have no details that samples do not show. Other
-    shells touch it at the places `met` (3,), over R.
+    Parameters
+    ----------
+    terms
+        User-defined energies besides those of the case.
+    plane
+        Mirror plane of the half to be modelled, see `modelled_part.own_mirror`; None lets the case
+        choose.
+    smooth
+        Keys whose formulas are known to have no details between samples.
+    contact_places
+        Places (3,) over R where other shells touch it.
 
     Raises
     ------
@@ -94,175 +109,128 @@ def make_problem(
     MeshError
         If the meridian has no such edge or point.
     """
-    case = case.with_terms([*case.own_terms, *terms]) if terms else case
-    terms = case.own_terms
-    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
-    if several := case.several:
-        material = replace(
-            material, shells=several.materials, laws=several.laws, laminates=several.laminates
-        )
-    ground = reference_shell_of(case.shell)
-    perfect = ground.perfect
-    imperfections = flaws(case.imperfections, ground)
-    context, last = case.context, {step.name: step for step in case.programme}
-    still = {*imperfections} - {
-        key for step in last.values() for key in step.load.multiplies(step, context)
-    }
-    drawn = imperfect(perfect, imperfections, 0.0, still)
-    ground = replace(ground, imperfect=drawn)
-    standing = case.bodies, case.approaches, {step.name for step in case.programme}
-    at_place = {
-        name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()
-    }
-    places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
-    sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
-    for section in context.abilities:
-        section.refuse_unfit_values(context, sample)
-    formulas = case_formulas(context)
-    narrow = [
-        None if each.spec.key in smooth else adaptive_cells(each.formulas, drawn)
-        for each in formulas
-    ]
-    drawn = (
-        drawn.with_samples(narrow_places([leaves for leaves in narrow if leaves]))
-        if formulas
-        else drawn
+    if terms:
+        case = case.with_terms([*case.own_terms, *terms])
+    shell = _ImperfectShell.of(case)
+    load_places = _load_places(case, shell.outline)
+    for section in case.context.abilities:
+        section.refuse_unfit_values(case.context, shell.sample)
+    formulas = _ResolvedFormulas.of(case, shell.outline, smooth)
+    outline = formulas.sampled(shell.outline)
+    refuse_unfit_formulas(
+        formulas.formulas, outline.sample() if formulas.formulas else shell.sample
     )
-    refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
-    energies = surface_terms(context, terms)
-    parts = _left(case, drawn, energies)
-    parts += leaves(imperfections, perfect, one_by_one=bool(case.patches))
-    parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
-    axisymmetric, plane = (False, plane) if plane else _symmetry(case, drawn, parts)
-    half = plane is not None
-    turn, beyond = 0.0, plane
-    if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
-        turn, beyond = (
-            plane.azimuth,
-            Sector.from_azimuth(0.0, plane.waves) if isinstance(plane, Sector) else Y0_PLANE,
-        )
-    points = named_points(case, drawn, turn, beyond)
-    under = dict[str, str]()
-    for name, (step, place) in places.items():
-        chart = on_features(step.load.chart_of(place, drawn, turn, half=half), drawn, points)
-        candidates = (point for point in ("pole", *under.values()) if point in points)
-        same = (point for point in candidates if np.array_equal(points[point], chart))
-        under[name] = next(same, name.replace("force", "load"))
-        points[under[name]] = chart
-    for step in case.programme:
-        if step.name in under:
-            step.load.refuse_unfit_place(step, context, drawn, points[under[step.name]])
-    loaded: list[Loaded] = [
-        (points[at], [step.load]) for step in case.programme for at in step.load.named_points()
-    ]
-    for point in dict.fromkeys(under.values()):
-        loaded.append(
-            (points[point], [step.load for step in case.programme if under.get(step.name) == point])
-        )
-    local = (
-        [] if isinstance(case.shell, MeshSurface) else spots(imperfections.items(), perfect, turn)
+    energies = surface_terms(case.context, case.own_terms)
+    constraints = _constraints(case, shell, outline, energies)
+    part = modelled_part(case, outline, constraints, plane)
+    points = _VertexPoints.of(case, load_places, outline, part)
+    mesh = _mesh_plan(case, shell, outline, part, points, formulas, contact_places)
+    modelled = _modelled(case, shell, part, mesh, points)
+    loads = replace(
+        _loads(case, modelled),
+        own=tuple(term.turned(part.turn) for term in energies),
+        contacts=mesh.bodies,
     )
-    wide = [flaw for flaw in imperfections.values() if flaw.centre is None]
-    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[SquaresFeature]()
-    bodies = contacts(*standing, replace(ground, turn=turn))
-    stood = replace(ground, imperfect=drawn)
-    touched = [
-        Pressed.by(c, (step.load for step in case.programme if step.name == c.amplitude), stood)
-        for c in bodies
-    ]
-    if not (axisymmetric or case.mesh.size):
-        varying, everywhere = imperfection_refinements(wide, perfect, turn, material.h)
-        varying += formula_refinements(formulas, narrow, drawn, turn, material.h)
-        varying = [each.finer(case.mesh.refinement) for each in varying]
-    facing = [ContactPlace(chart_of(rotation(turn) @ x, drawn, half=half)) for x in met]
-    shown: list[Refined] = [*local, *touched, *facing]
-    size = grading(
-        context, drawn, material.h, shown, everywhere, loaded, varying, local=bool(local)
+    problem = _problem(case, shell, part, mesh, modelled, loads, constraints)
+    refuse_duplicate_names(problem)
+    return problem
+
+
+def _modelled(
+    case: Case,
+    shell: "_ImperfectShell",
+    part: ModelledPart,
+    mesh: "_MeshPlan",
+    points: "_VertexPoints",
+) -> Modelled:
+    """Return the modelled part as abilities and steps know it, with fields in its frame."""
+    imperfections, turn = shell.imperfections, part.turn
+    return Modelled(
+        outline=mesh.outline,
+        turn=turn,
+        mirror=part.mirror,
+        plane=part.plane,
+        axisymmetric=part.axisymmetric,
+        vertices=points.of_steps,
+        within={
+            name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()
+        },
+        deviations={
+            key: in_frame(geometry.deviation, turn) for key, geometry in imperfections.items()
+        },
     )
-    drawn = imperfect(perfect, imperfections, turn, still)
-    shape = drawn.chart(beyond, size)
-    if isinstance(beyond, Sector) and not isinstance(shape, Grid):  # a ring has no tip
-        size = towards_tip(size, beyond)
-        shape = drawn.chart(beyond, size)
-    if (
-        isinstance(shape, Grid) and beyond and not isinstance(beyond, Sector)
-    ):  # what a point needs, its image needs too
-        images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
-        x, y = ((*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2))
-        shape = replace(shape, movable_lines=(x, y))
-    rims = different(local)
-    if isinstance(beyond, Sector) and any(
-        joint.edges[1] in (case.shells or ()) for joint in case.joints
-    ):
-        raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
-    if rims and isinstance(beyond, Sector):
-        raise CaseError(
-            f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: "
-            "half"
-        )
-    shape = _matched(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
-    span = drawn.meridian if axisymmetric else None
-    if not axisymmetric:
-        Vertices.of_case(case, points, drawn, size, turn).refuse_near(shape, beyond)
-    conditions = edge_conditions(case.boundary, turn)
+
+
+def _problem(
+    case: Case,
+    shell: "_ImperfectShell",
+    part: ModelledPart,
+    mesh: "_MeshPlan",
+    modelled: Modelled,
+    loads: Loads,
+    constraints: list[SymmetryConstraint],
+) -> Problem:
+    """Return the problem of a case from its part, its mesh and its loads."""
+    context, outline = case.context, mesh.outline
+    conditions = edge_conditions(case.boundary, part.turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
-    if beyond:
-        conditions = {name: c for name, c in conditions.items() if name not in beyond.removed_edges}
-        conditions |= dict.fromkeys(beyond.planes, "symmetry")
-    within = {name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()}
-    deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in imperfections.items()}
-    modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
-    all_loads = replace(
-        _loads(case, modelled), own=tuple(term.turned(turn) for term in energies), contacts=bodies
+    conditions = part.conditions(conditions)
+    meridian = outline.meridian if part.axisymmetric else None
+    if meridian:
+        refuse_unfit_ends([name for name in meridian.names if name], mesh.points, conditions, loads)
+    included, left_out = describe_model(
+        context, loads, part.name(case.model), part.plane, mesh.rim_count
     )
-    if span:
-        refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
-    model = "meridian" if axisymmetric else f"{part_of(plane)} {case.model}"
-    included, left_out = describe_model(context, all_loads, model, plane, len(rims))
-    included += [f"{key}: {flaw.account}" for key, flaw in imperfections.items() if flaw.account]
-    sample = sample if len(sample) else drawn.sample()
-    problem = Problem(
+    included += [
+        f"{key}: {imperfection.account}"
+        for key, imperfection in shell.imperfections.items()
+        if imperfection.account
+    ]
+    included += [f"own energy: {term.name}" for term in case.own_terms]
+    places = shell.sample if len(shell.sample) else outline.sample()
+    unknowns = 0.0
+    if not meridian:
+        unknowns = unknowns_of(context, _cells(mesh.shape, mesh.size, part.plane))
+    return Problem(
         context=context,
         mesh=case.mesh,
         body=solid_body_of(context),
-        material=replace(material, laminate=laminate_of(case.shell, turn)),
-        loads=all_loads,
+        material=replace(shell.material, laminate=laminate_of(case.shell, part.turn)),
+        loads=loads,
         conditions=conditions,
-        meridian=span,
-        mirror=beyond,
-        azimuth=turn,
-        turns=why_not_axisymmetric(parts) is None,
-        shape=shape,
-        embedding=drawn.embedding if span else drawn.embedding_of(shape),
-        normal=None if isinstance(case.shell, MeshSurface) else drawn.normal,
-        points=points,
-        size=size,
-        included=[*included, *(f"own energy: {term.name}" for term in terms)],
+        meridian=meridian,
+        mirror=part.mirror,
+        azimuth=part.turn,
+        turns=why_not_axisymmetric(constraints) is None,
+        shape=mesh.shape,
+        embedding=outline.embedding if meridian else outline.embedding_of(mesh.shape),
+        normal=None if isinstance(case.shell, MeshSurface) else outline.normal,
+        points=mesh.points,
+        size=mesh.size,
+        included=included,
         left_out=left_out,
-        thickness=_thickness(case, turn),
+        thickness=_thickness(case, part.turn),
         length=case.shell.reference,
-        within=within,
+        within=modelled.within,
         supports=supports,
-        reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
-        body_contacts=tuple((each.size, each.reach) for each in touched),
-        warnings=_warnings(case, sample),
+        reactions=bool(loads.moves) if case.reactions is None else case.reactions,
+        body_contacts=tuple((region.size, region.reach) for region in mesh.contact_regions),
+        warnings=_warnings(case, places),
         lambda_m=case.lambda_m,
-        unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, plane)),
+        unknowns=unknowns,
         patched=bool(case.patches),
         stability=case.stability,
         frequencies=case.frequencies,
         gradients=case.gradients,
         output=case.output,
-        pending_modes=_awaited(case),
+        pending_modes=_pending_modes(case),
         document=document_of(case),
         remade=lambda values: make_problem(case_with_values(case, values)),
     )
-    refuse_duplicate_names(problem)
-    return problem
 
 
 def document_of(case: Case) -> Document:
-    """What a run writes of a case."""
+    """Return the document of a case, which a run writes."""
     return Document(
         data=case.model_dump(mode="json", exclude_none=True),
         name=case.file_name,
@@ -271,139 +239,405 @@ def document_of(case: Case) -> Document:
     )
 
 
-def _awaited(case: Case) -> PendingModes | None:
-    """The modes of the perfect shell, or of several perfect ones together, that are still to be
-    computed.
+def _pending_modes(case: Case) -> PendingModes | None:
+    """Return the modes of the perfect shell that are still to be computed; None without.
+
+    Of several shells they are those of the perfect ones together.
     """
     several = case.several
     parts = list(several.parts) if several else []
-    awaiting = [
+    shell_cases = [part.case for part in parts] or [case]
+    pending_sections = [
         (i, key, section)
-        for i, own in enumerate([part.case for part in parts] or [case])
-        for key, section in own.imperfections.items()
+        for i, shell_case in enumerate(shell_cases)
+        for key, section in shell_case.imperfections.items()
         if isinstance(section, ModesSection) and section.pending_modes
     ]
+    if not pending_sections:
+        return None
 
-    def given(modes: tuple[Mode, ...]) -> Problem:
-        for i, key, section in awaiting:
+    def with_modes(modes: tuple[Mode, ...]) -> Problem:
+        for i, key, section in pending_sections:
+            name_and_place = (parts[i].name, several.place(parts[i])) if several else ()
             try:
-                section.become(
-                    modes, *((parts[i].name, several.place(parts[i])) if several else ())
-                )
+                section.become(modes, *name_and_place)
             except ValueError as e:
                 raise CaseError(parts[i].refused(f"shell.{key}.{e}")) from None
-        made = make_problem(case.with_shells(several.parts) if several else case)
+        problem = make_problem(case.with_shells(several.parts) if several else case)
 
-        def again(values: Mapping[str, Any]) -> Problem:
-            other = made.with_values(values)
+        def remade(values: Mapping[str, Any]) -> Problem:
+            other = problem.with_values(values)
             return other.pending_modes.with_modes(modes) if other.pending_modes else other
 
-        return replace(made, remade=again)
+        return replace(problem, remade=remade)
 
-    count = max((len(section.amplitudes) for _, _, section in awaiting), default=0)
-    return PendingModes(count, lambda: make_problem(perfect_case(case)), given) if count else None
-
-
-def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[SymmetryConstraint]:
-    """What each part of a case leaves of its symmetry."""
-    context = case.context
-    return [
-        shape_constraint(case.shell, drawn),
-        *(leaves for section in context.abilities for leaves in section.leaves(context, drawn)),
-        *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
-        points_constraint(case.points.values(), case.shell.reference, drawn),
-        *(term.leaves(drawn) for term in energies),
-    ]
-
-
-def _loads(case: Case, modelled: Modelled) -> Loads:
-    """What the parts of a case add to the loads of its model."""
-    context, last = case.context, {step.name: step for step in case.programme}
-    named = {
-        *last,
-        *(name for step in case.programme for name in (*step.load.drives, *step.load.hold)),
-    }
-    fields: dict[str, Any] = {}
-    for added in (
-        *(kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in named),
-        *(step.load.adds(step, context, modelled) for step in last.values()),
-        *(section.adds(context, modelled) for section in context.abilities),
-    ):
-        for name, value in added.items():
-            before = fields.get(name)
-            if isinstance(value, dict):
-                fields[name] = {**(before or {}), **value}
-            else:
-                fields[name] = (
-                    (*(before or ()), *value) if isinstance(value, tuple) else before or value
-                )
-    return Loads(**fields)
-
-
-def _warnings(case: Case, places: Array) -> tuple[str, ...]:
-    """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way,
-    in words."""
-    context = case.context
-    abilities = (part.warning(context, places) for part in context.abilities)
-    steps = (step.load.warning(step) for step in case.programme)
-    return tuple(said for said in (*abilities, *steps, _wrong_unit(case, places)) if said)
-
-
-def _wrong_unit(case: Case, places: Array) -> str | None:
-    """What hints at another unit of a mesh file's coordinates, in words; None without."""
-    extent = float(np.ptp(places, axis=0).max())
-    if not isinstance(case.shell, MeshSurface) or 1 / FAR_FROM_ONE <= extent <= FAR_FROM_ONE:
+    count = max(len(section.amplitudes) for _, _, section in pending_sections)
+    if not count:
         return None
-    key = "unit" if case.shell.with_units else "radius"
-    return (
-        f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: "
-        f"is shell.{key} right?"
-    )
+    return PendingModes(count, lambda: make_problem(perfect_case(case)), with_modes)
 
 
-def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
-    """The conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
-    terms: dict[EdgeCondition, Condition] = {
-        "hinged": "simply supported",
-        "symmetry": "plane",
-        "clamped": "clamped",
-        "simply supported": "simply supported",
-        "free": "free",
-    }
-    return {
-        name: Held(tuple(_turned(c.components, turn))) if isinstance(c, HeldSection) else terms[c]
-        for name, c in boundary.conditions().items()
-    }
+@dataclass(frozen=True)
+class _ImperfectShell:
+    """The undeformed shell of a case with its imperfections, in the frame of the case.
+
+    Attributes
+    ----------
+    reference
+        The shell that imperfections and bodies are placed on; its `imperfect` outline has the
+        imperfections that do not grow.
+    imperfections
+        Key of each imperfection below `shell` -> its geometry.
+    constant
+        Keys of those that do not grow.
+    material
+        Its material, that of several shells by patch; without plies.
+    sample
+        Places (n, 3) all over it; none of a mesh file, which is read later.
+    """
+
+    reference: ReferenceShell
+    imperfections: Mapping[str, ImperfectionGeometry]
+    constant: Collection[str]
+    material: Material
+    sample: Array
+
+    @classmethod
+    def of(cls, case: Case) -> "_ImperfectShell":
+        """Return the shell of a case."""
+        material, reference = _material(case), reference_shell_of(case.shell)
+        imperfections = flaws(case.imperfections, reference)
+        last_steps = {step.name: step for step in case.programme}
+        growing = {
+            key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
+        }
+        constant = {*imperfections} - growing
+        outline = _imperfect_outline(reference.perfect, imperfections, constant, 0.0)
+        sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else outline.sample()
+        reference = replace(reference, imperfect=outline)
+        return cls(reference, imperfections, constant, material, sample)
+
+    @property
+    def perfect(self) -> Outline:
+        """Outline without imperfections."""
+        return self.reference.perfect
+
+    @property
+    def outline(self) -> Outline:
+        """Outline with the imperfections that do not grow."""
+        return self.reference.imperfect
+
+    def turned_outline(self, turn: float) -> Outline:
+        """Return the outline in a frame turned about e3 (rad)."""
+        return _imperfect_outline(self.perfect, self.imperfections, self.constant, turn)
+
+    @property
+    def without_centre(self) -> list[ImperfectionGeometry]:
+        """Imperfections that are everywhere."""
+        return [geometry for geometry in self.imperfections.values() if geometry.centre is None]
 
 
-def imperfect(
+def _material(case: Case) -> Material:
+    """Return the material of a case, that of several shells by patch; without plies."""
+    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
+    if several := case.several:
+        return replace(
+            material, shells=several.materials, laws=several.laws, laminates=several.laminates
+        )
+    return material
+
+
+def _imperfect_outline(
     perfect: Outline,
     imperfections: Mapping[str, ImperfectionGeometry],
+    constant: Collection[str],
     turn: float,
-    still: Collection[str],
 ) -> Outline:
-    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have
-    their cells.
+    """Return the outline with the imperfections that do not grow, in a frame turned about e3 (rad).
+
+    All imperfections have their cells, those that grow too.
     """
     if not imperfections:
         return perfect
-    circles = (
-        tuple(flaw.reach for flaw in imperfections.values() if flaw.rim) if perfect.disc else ()
+    geometries = imperfections.values()
+    circles: tuple[float, ...] = ()
+    if perfect.disc:
+        circles = tuple(geometry.reach for geometry in geometries if geometry.rim)
+    deviations = tuple(
+        in_frame(geometry.deviation, turn)
+        for key, geometry in imperfections.items()
+        if key in constant
     )
-    shown = min((flaw.size for flaw in imperfections.values()), default=inf)
-    return perfect.deviated(
-        tuple(
-            in_frame(imperfections[key].deviation, turn) for key in imperfections if key in still
-        ),
-        circles,
-        shown,
-    )
+    return perfect.deviated(deviations, circles, min(geometry.size for geometry in geometries))
 
 
-def _matched(
+def _load_places(case: Case, outline: Outline) -> StepsAtPlaces:
+    """Return the steps whose load is at one place, with the place; the last one of each name."""
+    places: StepsAtPlaces = {}
+    for name, step in {step.name: step for step in case.programme}.items():
+        place = step.load.place_on(step, case.context, outline)
+        if place is not None:
+            places[name] = step, place
+    return places
+
+
+@dataclass(frozen=True)
+class _ResolvedFormulas:
+    """Formulas of a case, with cells so small that samples in them show what each formula does.
+
+    Attributes
+    ----------
+    cells
+        For each formula the division of the surface, see `adaptive_cells`; None of a smooth one.
+    """
+
+    formulas: Sequence[PlacedFormulas]
+    cells: Sequence[Leaves | None]
+
+    @classmethod
+    def of(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
+        """Return the formulas of a case; those of the keys in `smooth` have no narrow details."""
+        formulas = case_formulas(case.context)
+        cells = [
+            None if each.spec.key in smooth else adaptive_cells(each.formulas, outline)
+            for each in formulas
+        ]
+        return cls(formulas, cells)
+
+    def sampled(self, outline: Outline) -> Outline:
+        """Return an outline among whose samples are places with narrow details of the formulas."""
+        if not self.formulas:
+            return outline
+        return outline.with_samples(narrow_places([cells for cells in self.cells if cells]))
+
+
+def _constraints(
+    case: Case, shell: _ImperfectShell, outline: Outline, energies: Sequence[OwnTerm]
+) -> list[SymmetryConstraint]:
+    """Return the symmetry that each part of a case preserves, imperfections and bodies included."""
+    one_by_one = bool(case.patches)
+    constraints = symmetry_constraints(case, outline, energies)
+    constraints += leaves(shell.imperfections, shell.perfect, one_by_one=one_by_one)
+    constraints += [body_leaves(contact) for contact in _body_contacts(case, shell.reference)]
+    return constraints
+
+
+def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[Contact, ...]:
+    """Return the contacts of a case with rigid bodies, in the frame of a reference shell."""
+    driven = {step.name for step in case.programme}
+    return contacts(case.bodies, case.approaches, driven, reference)
+
+
+@dataclass(frozen=True)
+class _VertexPoints:
+    """Points of a case at which its mesh has vertices.
+
+    Attributes
+    ----------
+    charts
+        Name -> chart (2 | 3,).
+    of_steps
+        Name of a step whose load is at one place -> name of the point there.
+    """
+
+    charts: dict[str, Array]
+    of_steps: dict[str, str]
+
+    @classmethod
+    def of(
+        cls, case: Case, load_places: StepsAtPlaces, outline: Outline, part: ModelledPart
+    ) -> "_VertexPoints":
+        """Return the named points of a case, and those of loads at one place.
+
+        Raises
+        ------
+        CaseError
+            If a named point is not on the surface, or there is no room for a load.
+        """
+        charts = named_points(case, outline, part.turn, part.mirror)
+        of_steps = dict[str, str]()
+        for name, (step, place) in load_places.items():
+            chart = step.load.chart_of(place, outline, part.turn, half=part.is_symmetric)
+            chart = on_features(chart, outline, charts)
+            candidates = (point for point in ("pole", *of_steps.values()) if point in charts)
+            at_same_place = (point for point in candidates if np.array_equal(charts[point], chart))
+            of_steps[name] = next(at_same_place, name.replace("force", "load"))
+            charts[of_steps[name]] = chart
+        for step in case.programme:
+            if step.name in of_steps:
+                chart = charts[of_steps[step.name]]
+                step.load.refuse_unfit_place(step, case.context, outline, chart)
+        return cls(charts, of_steps)
+
+    def concentrated_loads(self, case: Case) -> list[Loaded]:
+        """Return the charts of concentrated loads, each with the loads there."""
+        loads: list[Loaded] = [
+            (self.charts[point], [step.load])
+            for step in case.programme
+            for point in step.load.named_points()
+        ]
+        for point in dict.fromkeys(self.of_steps.values()):
+            loads_there = [
+                step.load for step in case.programme if self.of_steps.get(step.name) == point
+            ]
+            loads.append((self.charts[point], loads_there))
+        return loads
+
+
+@dataclass(frozen=True)
+class _MeshPlan:
+    """What is meshed, and how finely, in the model's frame.
+
+    Attributes
+    ----------
+    outline
+        The shell with the imperfections that do not grow.
+    shape
+        What is triangulated.
+    size
+        Element sizes over the chart.
+    points
+        Name -> chart (2 | 3,) of a vertex.
+    bodies
+        Contacts with rigid bodies.
+    contact_regions
+        Where these press.
+    rim_count
+        Number of different rims besides the pole's.
+    """
+
+    outline: Outline
+    shape: Chart | RimmedGrid
+    size: Grading
+    points: dict[str, Array]
+    bodies: tuple[Contact, ...]
+    contact_regions: Sequence[Pressed]
+    rim_count: int
+
+
+def _mesh_plan(
+    case: Case,
+    shell: _ImperfectShell,
+    outline: Outline,
+    part: ModelledPart,
+    points: _VertexPoints,
+    formulas: _ResolvedFormulas,
+    contact_places: Sequence[Array],
+) -> _MeshPlan:
+    """Return what is meshed for a part of a shell.
+
+    Parameters
+    ----------
+    outline
+        The shell in the frame of the case, whose samples show the formulas.
+    contact_places
+        Places (3,) over R where other shells touch it.
+    """
+    local: list[LocalImperfection] = []
+    if not isinstance(case.shell, MeshSurface):
+        local = spots(shell.imperfections.items(), shell.perfect, part.turn)
+    bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
+    sampled_shell = replace(shell.reference, imperfect=outline)
+    contact_regions = [
+        Pressed.by(
+            contact,
+            (step.load for step in case.programme if step.name == contact.amplitude),
+            sampled_shell,
+        )
+        for contact in bodies
+    ]
+    charted_places = [
+        ContactPlace(chart_of(rotation(part.turn) @ x, outline, half=part.is_symmetric))
+        for x in contact_places
+    ]
+    varying, largest = _size_limits(case, shell, outline, part, formulas)
+    refined: list[Refined] = [*local, *contact_regions, *charted_places]
+    size = grading(
+        case.context,
+        outline,
+        shell.material.h,
+        refined,
+        largest,
+        points.concentrated_loads(case),
+        varying,
+        local=bool(local),
+    )
+    turned_outline = shell.turned_outline(part.turn)
+    shape, size = _shape(turned_outline, part, size, points.charts.values())
+    rims = different(local)
+    _refuse_unfit_sector(case, part, rims)
+    shape = _with_rims(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
+    if not part.axisymmetric:
+        vertices = Vertices.of_case(case, points.charts, turned_outline, size, part.turn)
+        vertices.refuse_near(shape, part.mirror)
+    return _MeshPlan(turned_outline, shape, size, points.charts, bodies, contact_regions, len(rims))
+
+
+def _size_limits(
+    case: Case,
+    shell: _ImperfectShell,
+    outline: Outline,
+    part: ModelledPart,
+    formulas: _ResolvedFormulas,
+) -> tuple[list[SquaresFeature], float]:
+    """Return where formulas and imperfections without a centre need small elements.
+
+    The second result is the largest size that resolves these imperfections everywhere.
+    """
+    if part.axisymmetric or case.mesh.size:
+        return [], min((geometry.size for geometry in shell.without_centre), default=inf)
+    h = shell.material.h
+    squares, largest = imperfection_refinements(shell.without_centre, shell.perfect, part.turn, h)
+    squares += formula_refinements(formulas.formulas, formulas.cells, outline, part.turn, h)
+    return [feature.finer(case.mesh.refinement) for feature in squares], largest
+
+
+def _shape(
+    outline: Outline, part: ModelledPart, size: Grading, points: Collection[Array]
+) -> tuple[Chart, Grading]:
+    """Return what is triangulated of an outline, and the element sizes there."""
+    shape = outline.chart(part.mirror, size)
+    is_grid = isinstance(shape, Grid)
+    if part.sector and not is_grid:  # a ring has no tip
+        size = towards_tip(size, part.sector)
+        shape = outline.chart(part.sector, size)
+    if isinstance(shape, Grid) and part.mirror and not part.sector:
+        # what a point needs, its image needs too
+        images = []
+        for chart in points:
+            place = outline.embedding(chart[None])[0]
+            images.append(outline.inverse(part.mirror.image(place)))
+        x, y = ((*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, movable_lines=(x, y))
+    return shape, size
+
+
+def _refuse_unfit_sector(case: Case, part: ModelledPart, rims: Sequence[Array]) -> None:
+    """Refuse a sector of a shell with a T-junction, or with rims beside the axis."""
+    if part.sector is None:
+        return
+    if any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
+        raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
+    if rims:
+        raise CaseError(
+            f"symmetry: {case.symmetry}: not with rims of dimples beside the axis: take symmetry: "
+            "half"
+        )
+
+
+def towards_tip(size: Grading, sector: Sector) -> Grading:
+    """Return sizes at most as large as a sector is wide.
+
+    Triangles are then not thin beside the axis of a disc.
+    """
+    tip = DiscFeature((0.0, 0.0), 0.0, MIN_SIZE_AT_TIP * size.largest, sector.angle)
+    return replace(size, features=[*size.features, tip])
+
+
+def _with_rims(
     shape: Chart, local: Sequence[LocalImperfection], rims: tuple[Array, ...], size: Grading
 ) -> Chart | RimmedGrid:
-    """The shape with element edges along the rims."""
+    """Return the shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
@@ -415,104 +649,40 @@ def _matched(
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
-def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
-    """A plane in which the mid-surface with its thickness, plies and imperfections is its own
-    image, with the edges that are lost; else None.
-
-    Parameters
-    ----------
-    loosely
-        See `mesh_mirrors`.
-    """
-    ground = reference_shell_of(case.shell)
-    perfect = ground.perfect
-    parts = [
-        shape_constraint(case.shell, perfect),
-        *leaves(flaws(case.imperfections, ground), perfect, one_by_one=bool(case.patches)),
-        *(plies.leaves(case.context, perfect) if (plies := Laminated.of(case.context)) else ()),
-    ]
-    vectors = [unit(v) for part in parts for v in part.vectors]
-    planes = (
-        [plane]
-        if perfect.round and plane.through_e3
-        else perfect.mirrors(plane.in_plane_vectors, loosely)
-    )
-    for one in planes:
-        along = all(abs(one.normal @ v) < ROUNDING for v in vectors)
-        if one.is_plane_of(plane) and along and all(part.mirrors(one) for part in parts):
-            return one
-    return None
-
-
-def part_of(plane: Mirror | None) -> str:
-    """What of the shell is modelled, in words."""
-    if isinstance(plane, Sector):
-        return f"sector of {180 / plane.waves:.4g} degrees of the"
-    return "half" if plane else "full"
-
-
-def towards_tip(size: Grading, sector: Sector) -> Grading:
-    """Sizes at most as large as a sector is wide, so that triangles are not thin beside the axis of
-    a disc.
-    """
-    tip = DiscFeature((0.0, 0.0), 0.0, SHORTEST * size.largest, sector.angle)
-    return replace(size, features=[*size.features, tip])
-
-
-def _symmetry(
-    case: Case, drawn: Outline, parts: list[SymmetryConstraint]
-) -> tuple[bool, Mirror | None]:
-    """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
-    reason = why_not_axisymmetric(parts)
-    if reason and case.symmetry == "axisymmetric":
-        raise CaseError(f"symmetry: axisymmetric: {reason}")
-    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
-        return True, None
-    if isinstance(case.symmetry, int):
-        places = [np.array(x) for x in case.points.values()]
-        if sector_of_waves := common_sector(parts, drawn, case.symmetry, places):
-            return False, sector_of_waves
-        hint = ""
-        if case.several:
-            hint = "; each shell is held, and its own image in both"
-        elif isinstance(case.shell, MeshSurface):
-            hint = (
-                "; the mesh file must be its own image in both, with each of its edges and patches"
-            )
-        raise CaseError(
-            f"symmetry: {case.symmetry}: shell, supports, fields and load have no two mirror planes through e3 at an "
-            f"angle of {180 / case.symmetry:g} degrees with all named points between them{hint}"
-        )
-    if case.symmetry not in ("auto", "half"):
-        return False, None
-    plane = common_mirror(parts, drawn, loosely=case.symmetry == "half")
-    if case.symmetry == "half" and plane is None:
-        if name := energy_without_mirror(parts, drawn):
-            raise CaseError(f"symmetry: half: the energy {name} does not share it")
-        made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
-        hint = made if isinstance(case.shell, MeshSurface) else ""
-        hint = "; each shell is held, and its own image in it" if case.several else hint
-        raise CaseError(
-            f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}"
-        )
-    return False, plane
-
-
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:
-    """About how many triangles there will be."""
+    """Return about how many triangles there will be."""
     if isinstance(shape, MeshFile):
         halved = isinstance(shape.in_memory, MultiShellMesh)  # it has the cells of its half
         return cell_count(shape) / (plane.copies if plane and not halved else 1)
     return shape.cells * (0.5 if plane else 1.0) if isinstance(shape, Grid) else size.cells(shape)
 
 
-def _turned(components: tuple[int, ...], turn: float) -> list[int]:
-    """The components in a frame into which they turn as a whole."""
-    held = np.eye(3)[list(components)] @ rotation(turn).T
-    return [i for i in range(3) if held[:, i] @ held[:, i] > 0.5]
+def _loads(case: Case, modelled: Modelled) -> Loads:
+    """Return the loads of a model: what the abilities and the last step of each name add."""
+    context, last_steps = case.context, {step.name: step for step in case.programme}
+    amplitudes = set(last_steps)
+    for step in case.programme:
+        amplitudes.update(step.load.drives, step.load.hold)
+    additions = [
+        kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in amplitudes
+    ]
+    additions += [step.load.adds(step, context, modelled) for step in last_steps.values()]
+    additions += [section.adds(context, modelled) for section in context.abilities]
+    fields: dict[str, Any] = {}
+    for addition in additions:
+        for name, value in addition.items():
+            present = fields.get(name)
+            if isinstance(value, dict):
+                fields[name] = {**(present or {}), **value}
+            elif isinstance(value, tuple):
+                fields[name] = (*(present or ()), *value)
+            else:
+                fields[name] = present or value
+    return Loads(**fields)
 
 
 def _thickness(case: Case, turn: float) -> Thickness | None:
+    """Return the factor of the thickness in a frame turned about e3 (rad); None for 1."""
     if case.several:
         return case.several.thickness
     factor = case.thickness_factor
@@ -522,8 +692,36 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
         return Thickness(given=factor)
     if not factor:
         return None
-    told, Q = formula(factor), rotation(turn)
-    return Thickness(
-        lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z),
-        formulas=formula_group([told], Q),
+    in_case_frame, Q = formula(factor), rotation(turn)
+
+    def in_model_frame(x: Array, y: Array, z: Array) -> Array:
+        if not turn:
+            return in_case_frame(x, y, z)
+        return in_case_frame(*np.tensordot(Q.T, np.stack([x, y, z]), 1))
+
+    return Thickness(in_model_frame, formulas=formula_group([in_case_frame], Q))
+
+
+def _warnings(case: Case, places: Array) -> tuple[str, ...]:
+    """Return warnings of what is unphysical, or often meant in another way.
+
+    `places` (n, 3) are all over the undeformed shell.
+    """
+    context = case.context
+    warnings = [part.warning(context, places) for part in context.abilities]
+    warnings += [step.load.warning(step) for step in case.programme]
+    warnings.append(_unit_warning(case, places))
+    return tuple(warning for warning in warnings if warning)
+
+
+def _unit_warning(case: Case, places: Array) -> str | None:
+    """Return a hint at another unit of a mesh file's coordinates; None without."""
+    extent = float(np.ptp(places, axis=0).max())
+    is_usual = 1 / MAX_EXTENT_OVER_RADIUS <= extent <= MAX_EXTENT_OVER_RADIUS
+    if not isinstance(case.shell, MeshSurface) or is_usual:
+        return None
+    key = "unit" if case.shell.with_units else "radius"
+    return (
+        f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: "
+        f"is shell.{key} right?"
     )

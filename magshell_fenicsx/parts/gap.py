@@ -15,7 +15,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.free_parameters import SettableNumber
 from magshell_fenicsx.assembly.memo import Memo
-from magshell_fenicsx.models.carriers import Carrier
+from magshell_fenicsx.models.domains import Carrier
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 

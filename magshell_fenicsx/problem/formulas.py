@@ -25,12 +25,12 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh, space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
-from magshell_fenicsx.models.shell.fitted import Cells, fitted, sampling
+from magshell_fenicsx.models.shell.formula_projection import Cells, fitted, sampling
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
-from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
-from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
+from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, Leaves, Parts
+from magshell_fenicsx.models.shell.adaptive_sampling import leaves as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
-from magshell_fenicsx.parts.part import Context, Formulas
+from magshell_fenicsx.parts.ability import Context, Formulas
 from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
 
 Array = NDArray[np.float64]

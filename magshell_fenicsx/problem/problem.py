@@ -26,14 +26,14 @@ from magshell_fenicsx.mesh.unfolding import double_sector
 from magshell_fenicsx.mesh.vertex_spacing import flat_triangle, refuse_flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
-from magshell_fenicsx.models.shell.patterns import Inside
+from magshell_fenicsx.models.shell.spatial_fields import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (

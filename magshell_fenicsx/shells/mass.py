@@ -20,7 +20,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
-from magshell_fenicsx.models import carriers
+from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
 
@@ -71,7 +71,7 @@ def of_waves(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
     cosine, sine = zip(
-        *(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
+        *(domains.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
     )
     return _integral(model, factor * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 

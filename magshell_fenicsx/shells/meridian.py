@@ -26,10 +26,10 @@ from magshell_fenicsx.assembly.prescribed_motion import EdgePressure, Lid
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.carriers import on_meridian
+from magshell_fenicsx.models.domains import on_meridian
 from magshell_fenicsx.models.shell.edges import FOLD
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
-from magshell_fenicsx.models.shell.patterns import cells_of, field_of_place
+from magshell_fenicsx.models.shell.spatial_fields import cells_of, field_of_place
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.meridian_loads import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.joints import Creases
@@ -48,13 +48,13 @@ from magshell_fenicsx.parts.supports.support_motion import (
 )
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.shells.observed import Thin
-from magshell_fenicsx.shells.terms import INTERIOR, EnergyFactory
+from magshell_fenicsx.shells.model_base import Thin
+from magshell_fenicsx.shells.energy_factory import INTERIOR, EnergyFactory
 from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.meridian_contact import MeridianTouching
-    from magshell_fenicsx.shells.tee import MeridianTee
+    from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
+    from magshell_fenicsx.shells.t_junctions import MeridianTee
 
 Array = NDArray[np.float64]
 SMALL_RISE = (
@@ -144,7 +144,7 @@ class MeridianModel(Thin):
         The contacts of shells with each other, and their T-junctions.
     """
 
-    touchings: "Sequence[MeridianTouching]"
+    shell_contacts: "Sequence[MeridianTouching]"
 
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
@@ -256,25 +256,25 @@ class MeridianModel(Thin):
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
         rule = factory.carrier.contact_rule
-        self.touchings = []
+        self.shell_contacts = []
         if loads.pairs:
-            from magshell_fenicsx.parts.contact.meridian_contact import touchings
+            from magshell_fenicsx.parts.contact.meridian_contact import shell_contacts
 
             curves = self.r0, self.u, meridian.patches, self.material.h, rule
             faces = self.thickness, factory.law_of_cells.thins, factory.natural
-            self.touchings = touchings(loads.pairs, *curves, *faces)
-        for each in self.touchings:
+            self.shell_contacts = shell_contacts(loads.pairs, *curves, *faces)
+        for each in self.shell_contacts:
             stiffnesses |= each.history
             parameters |= each.entered(parameters)
         self.tees: list[MeridianTee] = []
         if any(of is None for of in meridian.joints):
-            from magshell_fenicsx.shells.tee import tees_of_meridian
+            from magshell_fenicsx.shells.t_junctions import tees_of_meridian
 
             self.tees = tees_of_meridian(self)
         begun = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
-            [*terms, *self.touchings, *self.tees],
+            [*terms, *self.shell_contacts, *self.tees],
             held,
             pattern,
             self.material.h,
@@ -322,7 +322,7 @@ class MeridianModel(Thin):
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
-        return ExcludedWaves(Waves(*of, [*self.touchings, *self.tees]))
+        return ExcludedWaves(Waves(*of, [*self.shell_contacts, *self.tees]))
 
     @property
     def waves(self) -> Waves:

@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.parts.supports.supports import rigid_motions
 from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, weight
 from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.unfolded import UnfoldedModes
+from magshell_fenicsx.shells.sector_modes import UnfoldedModes
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 EXCLUDED = (

@@ -7,7 +7,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.shell.patterns import places
+from magshell_fenicsx.models.shell.spatial_fields import places
 from magshell_fenicsx.shells.meridian import MeridianModel
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from magshell_fenicsx.mesh.mirror import (
     Sector,
 )
 from magshell_fenicsx.mesh.patch import Deviation, Embedding, MeshError
-from magshell_fenicsx.models.carriers import on_surface
+from magshell_fenicsx.models.domains import on_surface
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
@@ -41,7 +41,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import carried, cells_of, field_of_place, places
+from magshell_fenicsx.models.shell.spatial_fields import carried, cells_of, field_of_place, places
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.load_vectors import (
@@ -73,12 +73,12 @@ from magshell_fenicsx.parts.supports.supports import (
     put_in_plane,
     refuse_unknown,
 )
-from magshell_fenicsx.shells.observed import Thin
-from magshell_fenicsx.shells.terms import EnergyFactory
-from magshell_fenicsx.shells.unfolded import UnfoldedModes
+from magshell_fenicsx.shells.model_base import Thin
+from magshell_fenicsx.shells.energy_factory import EnergyFactory
+from magshell_fenicsx.shells.sector_modes import UnfoldedModes
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.surface_contact import Touching
+    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 
 
 class ShellModel(Thin):
@@ -319,20 +319,20 @@ class ShellModel(Thin):
                 factory.term(energy)
                 for energy in factory.dead_energies(name, dead, midsurface.edges)
             ]
-        meeting: Sequence[Touching] = ()
+        meeting: Sequence[SurfaceContact] = ()
         if loads.pairs:
-            from magshell_fenicsx.parts.contact.model_surface import touchings
+            from magshell_fenicsx.parts.contact.model_surface import shell_contacts
 
             of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
             thick = carrier.contact_rule, factor, factory.law_of_cells.thins
             surfaces = self.r0, self.u, midsurface.patches
-            meeting = touchings(
+            meeting = shell_contacts(
                 loads.pairs, *surfaces, material.h, *thick, *of_images, shape, self.planes
             )
             terms += meeting
-        self.touchings = meeting
+        self.shell_contacts = meeting
         if loads.joints or midsurface.t_junctions:
-            from magshell_fenicsx.shells.tee import tees
+            from magshell_fenicsx.shells.t_junctions import tees
 
             terms += tees(self)
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())

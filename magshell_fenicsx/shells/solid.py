@@ -26,17 +26,17 @@ from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyM
 from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.fitted import Cells
+from magshell_fenicsx.models.shell.formula_projection import Cells
 from magshell_fenicsx.models.shell.own_term import ByPlace
 from magshell_fenicsx.models.shell.parameters import Condition, Material
-from magshell_fenicsx.models.shell.patterns import (
+from magshell_fenicsx.models.shell.spatial_fields import (
     ByPatch,
     Components,
     cells_of_body,
     field_in_body,
     places_in_body,
 )
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.forces.load_vectors import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.loads import Loads, moments, potentials
@@ -51,8 +51,8 @@ from magshell_fenicsx.parts.supports.support_motion import (
     pressed_edges,
 )
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
-from magshell_fenicsx.shells.observed import Observed
-from magshell_fenicsx.shells.solid_sites import make_sites
+from magshell_fenicsx.shells.model_base import Observed
+from magshell_fenicsx.shells.solid_hessians import make_sites
 from magshell_fenicsx.shells.solid_terms import Density, TermFactory
 
 Array = NDArray[np.float64]

@@ -24,9 +24,9 @@ from magshell_fenicsx.mesh.hexahedra import (
 from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import field_in_body, radial
-from magshell_fenicsx.models.solid import densities
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.shell.spatial_fields import field_in_body, radial
+from magshell_fenicsx.models.solid import body_densities
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
@@ -115,8 +115,8 @@ class TermFactory:
         """What does not depend on a change of volume; of a neo-Hookean body one term."""
         shear, share = self.material.shear, self.material.share
         of = {
-            "distortion": (densities.distortion, 1 - share),
-            "areal distortion": (densities.areal_distortion, share),
+            "distortion": (body_densities.distortion, 1 - share),
+            "areal distortion": (body_densities.areal_distortion, share),
         }
         return [
             self._bulk(
@@ -138,7 +138,8 @@ class TermFactory:
         """
         parameters = self._constants(self.material.bulk, self.h)
         return self._bulk(
-            "compression", self.grown(Density(densities.compression, parameters, degree=REDUCED))
+            "compression",
+            self.grown(Density(body_densities.compression, parameters, degree=REDUCED)),
         )
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
@@ -234,7 +235,7 @@ class TermFactory:
 
     def remanent(self, of: Magnetisation, field: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
+        pattern, law = of.remanent, body_densities if of.law == "deformation" else rotation_law
         Br = (
             field_in_body(pattern, self.u.function_space)
             if callable(pattern)
@@ -259,7 +260,7 @@ class TermFactory:
                 "magnetic" + suffix,
                 density,
                 amplitude,
-                linear=law is densities,
+                linear=law is body_densities,
                 group="magnetic",
                 column="magnetic",
             )
@@ -365,7 +366,9 @@ class TermFactory:
         body = self.body
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
         parameters = (weight, *self._constants(intensity), past)
-        density = Density(densities.turning, parameters, where="end", facets=self.body.faces[edge])
+        density = Density(
+            body_densities.turning, parameters, where="end", facets=self.body.faces[edge]
+        )
         term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
         length = self.log.compile(
             "end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1)
@@ -386,12 +389,12 @@ class TermFactory:
             unit, *([origin] if origin is not None and origin.any() else [])
         )
         of, on_end = (
-            (densities.swept, densities.swept_end)
+            (body_densities.swept, body_densities.swept_end)
             if moved
-            else (densities.pressure, densities.sealing)
+            else (body_densities.pressure, body_densities.sealing)
         )
         work, end_work = (
-            (None, None) if potential else (densities.following, densities.following_end)
+            (None, None) if potential else (body_densities.following, body_densities.following_end)
         )
         of_faces = {
             "pressure": Density(

@@ -29,15 +29,15 @@ from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models import carriers
+from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
-from magshell_fenicsx.models.carriers import Carrier, Energy
+from magshell_fenicsx.models.axisymmetric.wave_hessians import WavePoints
+from magshell_fenicsx.models.domains import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
-from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.tee import MeridianTee
+    from magshell_fenicsx.shells.t_junctions import MeridianTee
 
 Array = NDArray[np.float64]
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
@@ -60,7 +60,7 @@ class Waves:
     Attributes
     ----------
     V
-        Space of the waves' coefficients (U + V, V, W); see `carriers.wave`.
+        Space of the waves' coefficients (U + V, V, W); see `domains.wave`.
     largest
         Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in waves of
         length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
@@ -288,8 +288,8 @@ class Waves:
         return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
-        v, u = fem.Function(self.V), carriers.revolved(self._system.u)
-        cosine, sine = carriers.wave(v, self._m)
+        v, u = fem.Function(self.V), domains.revolved(self._system.u)
+        cosine, sine = domains.wave(v, self._m)
         return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
 
 

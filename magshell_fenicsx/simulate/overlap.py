@@ -11,11 +11,11 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.global_mesh import component_numbers
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.carriers import on_meridian, on_surface
-from magshell_fenicsx.models.shell.patterns import carried, cells_of
+from magshell_fenicsx.models.domains import on_meridian, on_surface
+from magshell_fenicsx.models.shell.spatial_fields import carried, cells_of
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.tee import Surfaces, refuse_misplaced_feet, refuse_misplaced_rings
+from magshell_fenicsx.shells.t_junctions import Surfaces, refuse_misplaced_feet, refuse_misplaced_rings
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
 MOST = 20_000  # cells in which they are looked for: some seconds
@@ -37,18 +37,18 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MOST:
         return
     if problem.axisymmetric:
-        from magshell_fenicsx.parts.touching import on_meridian as curves
+        from magshell_fenicsx.parts.contact import meridian_contact as curves
 
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
         refuse_misplaced_rings(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(given, r0, meridian.patches) if given else None
-        curves.touchings(
+        curves.shell_contacts(
             pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness
         )
         return
-    from magshell_fenicsx.parts.touching.building import touchings
+    from magshell_fenicsx.parts.contact.model_surface import shell_contacts
 
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
@@ -59,7 +59,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     if given and given.given:
         given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
     thickness = thickness_field(given, r0, surface.patches) if given else None
-    touchings(
+    shell_contacts(
         pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness
     )
 

@@ -19,9 +19,9 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.shell.patterns import OfPlacement
+from magshell_fenicsx.models.shell.spatial_fields import OfPlacement
 from magshell_fenicsx.parts.registered import SEEN
-from magshell_fenicsx.parts.seen import Slope
+from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity

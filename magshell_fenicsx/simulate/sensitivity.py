@@ -26,7 +26,7 @@ from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold, sensi
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation
-from magshell_fenicsx.models.shell.patterns import Pattern, WithinRims
+from magshell_fenicsx.models.shell.spatial_fields import Pattern, WithinRims
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionSection,
@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import reference_shell_of
-from magshell_fenicsx.shells.terms import EnergyFactory
+from magshell_fenicsx.shells.energy_factory import EnergyFactory
 from magshell_fenicsx.simulate.numbers import number_of, scene_with, size_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -316,8 +316,8 @@ def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
     the first one.
     """
     at = scene.model.system.at_state(state)
-    of_one: Sequence[Any] = scene.model.touchings
-    of_other: Sequence[Any] = other.model.touchings
+    of_one: Sequence[Any] = scene.model.shell_contacts
+    of_other: Sequence[Any] = other.model.shell_contacts
     for touching, same in zip(of_one, of_other, strict=True):
         if touching.held:
             same.hold(touching.held)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.models.shell import patterns
+from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.parts.natural.shape import natural_field
 from magshell_fenicsx.problem.problem import Problem
@@ -58,7 +58,7 @@ def refilled(scene: Scene, problem: Problem) -> bool:
     """
     model, old = scene.model, scene.problem
     same = bool(old.document.data) and _apart_from_fields(old) == _apart_from_fields(problem)
-    if not same or not model.thin or model.contacts or model.touchings or old.loads.dead:
+    if not same or not model.thin or model.contacts or model.shell_contacts or old.loads.dead:
         return False
     if (old.axisymmetric, old.mirror, old.azimuth) != (
         problem.axisymmetric,
@@ -112,11 +112,11 @@ def _put(model: "ShellModel | MeridianModel", problem: Problem) -> None:
         for c in t.form.coefficients()
     }
     if magnetic and callable(magnetic.remanent):
-        coefficients["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
+        coefficients["Br"].x.array[:] = spatial_fields.pattern_field(magnetic.remanent, r0)[0].x.array
     if problem.thickness and model.thickness:
         patches = model.midsurface.patches if model.midsurface else {}
         model.thickness.x.array[:] = thickness_field(problem.thickness, r0, patches).x.array
     if natural:
         coefficients["natural"].x.array[:] = natural_field(
-            natural, patterns.cells_of(r0), model.V
+            natural, spatial_fields.cells_of(r0), model.V
         ).x.array

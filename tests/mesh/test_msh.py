@@ -19,7 +19,7 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
-from magshell_fenicsx.models.shell.patterns import ByPatch
+from magshell_fenicsx.models.shell.spatial_fields import ByPatch
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.shape.mirrors import mesh_mirrors

@@ -16,7 +16,7 @@ from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.shells.tee import Tee
+from magshell_fenicsx.shells.t_junctions import Tee
 from magshell_fenicsx.simulate.follow import follow
 
 h, WIDTH = 0.02, 0.25

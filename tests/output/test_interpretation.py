@@ -14,7 +14,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import radial
+from magshell_fenicsx.models.shell.spatial_fields import radial
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import SurfaceGatherer
 from magshell_fenicsx.parts.loads import Loads

@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
-from magshell_fenicsx.models.shell.controls import ByControls
+from magshell_fenicsx.models.shell.control_points import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow

@@ -12,7 +12,7 @@ from conftest import CASES
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.models.shell.patterns import WithinRims
+from magshell_fenicsx.models.shell.spatial_fields import WithinRims
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.simulate.sensitivity import sensitivities

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.input.tables import read_vectors
-from magshell_fenicsx.models.shell.controls import Controls
+from magshell_fenicsx.models.shell.control_points import Controls
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate

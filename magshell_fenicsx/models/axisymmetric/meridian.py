@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
-from magshell_fenicsx.models.shell.patterns import places
+from magshell_fenicsx.models.shell.spatial_fields import places
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]

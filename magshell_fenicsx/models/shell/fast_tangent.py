@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.energy import (
     cell_quadrature,
     edge_quadrature,
 )
-from magshell_fenicsx.models.shell.sites import Site
+from magshell_fenicsx.models.shell.element_hessians import Site
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from magshell_fenicsx.assembly.point_kernels import (
 )
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.sites import NAMES, fill, parameters_at
+from magshell_fenicsx.models.shell.element_hessians import NAMES, fill, parameters_at
 
 Array = NDArray[np.float64]
 CHUNK = 16384  # points at a time: their vectors stay within some ten megabytes

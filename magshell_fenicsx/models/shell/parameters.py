@@ -13,7 +13,7 @@ from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, OfShells
 from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.spatial_fields import Pattern
 from magshell_fenicsx.models.shell.rubber import Rubber
 
 

@@ -38,7 +38,7 @@ from magshell_fenicsx.models.shell.gradients import (
     in_own_coordinates,
 )
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
-from magshell_fenicsx.models.shell.sites import NAMES, at_points
+from magshell_fenicsx.models.shell.element_hessians import NAMES, at_points
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from magshell_fenicsx.input.expressions import FormulaGroup
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.formula_projection import Cells, fitted
 from magshell_fenicsx.models.shell.parameters import OwnMaterial
-from magshell_fenicsx.models.shell.patterns import Carried, OfPlacement, cells_of, places
+from magshell_fenicsx.models.shell.spatial_fields import Carried, OfPlacement, cells_of, places
 
 Array = NDArray[np.float64]
 LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding
-from magshell_fenicsx.models.shell.patterns import inside
+from magshell_fenicsx.models.shell.spatial_fields import inside
 from magshell_fenicsx.output.fields.point_fields import (
     PointFields,
     Stresses,

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import inside
+from magshell_fenicsx.models.shell.spatial_fields import inside
 from magshell_fenicsx.models.shell.strains import (
     NaturalFrame,
     TangentFrame,
     bending_moment,
     principal,
 )
-from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.bodies.body_contact import Contact
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
 

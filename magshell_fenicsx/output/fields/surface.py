@@ -20,7 +20,7 @@ from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.law import Law, OfShells
-from magshell_fenicsx.models.shell.patterns import inside
+from magshell_fenicsx.models.shell.spatial_fields import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import (
     RecoveredShell,

@@ -11,7 +11,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyMesh, face_measure
-from magshell_fenicsx.models.shell.patterns import (
+from magshell_fenicsx.models.shell.spatial_fields import (
     Pattern,
     cells_of_body,
     places_in_body,
@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.patterns import (
     shown,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.dead_load import Entries, Weighted, averaged, smooth, within
+from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, within
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
-from magshell_fenicsx.models.shell.patterns import refuse_unbounded
+from magshell_fenicsx.models.shell.spatial_fields import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.moving_source import (
     FieldAtPlaces,
     FieldInSpace,

@@ -16,7 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
-from magshell_fenicsx.parts.part import Ability, Context, Formulas, InTime, Modelled
+from magshell_fenicsx.parts.ability import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.quantities.quantity import CaseSizes
 from magshell_fenicsx.shape.revolution_sections import SurfaceSection
 from magshell_fenicsx.shape.shell_sections import MeshSurface
@@ -373,7 +373,7 @@ class MagneticSection(Section, Ability):
         return interacting + (leaves(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        from magshell_fenicsx.models.shell.patterns import (
+        from magshell_fenicsx.models.shell.spatial_fields import (
             LARGEST,
         )  # the solver takes long to import
 

@@ -36,10 +36,10 @@ from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 from magshell_fenicsx.parts.magnetism.turned import Turning
-from magshell_fenicsx.parts.seen import Sight
+from magshell_fenicsx.parts.observables import Sight
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.observed import Observed
+    from magshell_fenicsx.shells.model_base import Observed
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -102,7 +102,7 @@ class InteractionTerm:
     @property
     def no_number(self) -> str:
         """Explanation for the user where the energy is not a number."""
-        if self._model.touchings:
+        if self._model.shell_contacts:
             return (
                 " (parts are in each other, or too near for the size of their cells: take smaller "
                 "ones)"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
+from magshell_fenicsx.models.shell.spatial_fields import Pattern, by_patch
 from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 

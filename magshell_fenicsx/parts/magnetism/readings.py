@@ -14,7 +14,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
-from magshell_fenicsx.parts.seen import Seen, Sight, Slope
+from magshell_fenicsx.parts.observables import Seen, Sight, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 
@@ -78,7 +78,7 @@ class SoftSeen(Seen):
     """Mean polarisation that the field induces."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.patterns import by_patch
+        from magshell_fenicsx.models.shell.spatial_fields import by_patch
 
         soft_magnet = loads.magnetic.soft if loads.magnetic else None
         if soft_magnet and soft_magnet.patches:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Image, rotation
-from magshell_fenicsx.models.shell.patterns import Uniform, pattern_field, places
+from magshell_fenicsx.models.shell.spatial_fields import Uniform, pattern_field, places
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charges import (
@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.magnetism.charges import (
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, NodalDerivatives
-from magshell_fenicsx.parts.seen import Sight
+from magshell_fenicsx.parts.observables import Sight
 
 Array = NDArray[np.float64]
 JUMP_TOLERANCE = 1e-6  # of the remanence between two cells, over the largest

@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.parts.magnetism import saturation
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.models.shell.patterns import Pattern
+    from magshell_fenicsx.models.shell.spatial_fields import Pattern
     from magshell_fenicsx.parts.magnetism.applied import AppliedField
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 

@@ -7,13 +7,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name
-from magshell_fenicsx.parts.course import Now, Target
+from magshell_fenicsx.parts.step_control import Now, Target
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import Count, LoadStep
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DISTANCE, FORCE, TORQUE, TURN, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
@@ -191,7 +191,7 @@ class SourcesSeen(Seen):
     )
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.patterns import (
+        from magshell_fenicsx.models.shell.spatial_fields import (
             by_patch,
         )  # the solver takes long to import
 

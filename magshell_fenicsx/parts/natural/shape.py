@@ -33,9 +33,9 @@ from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
-from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.formula_projection import Cells, fitted
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
-from magshell_fenicsx.models.shell.patterns import (
+from magshell_fenicsx.models.shell.spatial_fields import (
     OfPlacement,
     Pattern,
     by_patch,

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.parts.part import Account, Context
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.ability import Account, Context
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TURN, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.shells.observed import Observed
+    from magshell_fenicsx.shells.model_base import Observed
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.supports.support_motion import PRECEDENCE
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.observed import Observed
+    from magshell_fenicsx.shells.model_base import Observed
 
 Array = NDArray[np.float64]
 

@@ -32,12 +32,12 @@ from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.course import Gas
-from magshell_fenicsx.parts.seen import Slope
+from magshell_fenicsx.parts.step_control import Gas
+from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.shells.mass import mass_along
 from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.observed import Observed
+from magshell_fenicsx.shells.model_base import Observed
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene

@@ -24,8 +24,8 @@ from magshell_fenicsx.assembly.nonlocal_terms import FieldDifferentiable
 from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.shell import patterns
-from magshell_fenicsx.models.shell.patterns import OfPlacement, Uniform
+from magshell_fenicsx.models.shell import spatial_fields
+from magshell_fenicsx.models.shell.spatial_fields import OfPlacement, Uniform
 from magshell_fenicsx.models.shell.residual import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
@@ -385,7 +385,7 @@ def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
     """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
     model, nodes = scene.model, f.function_space.element.basix_element.points
     places, normals = model.places(nodes)
-    return patterns.inside(places), normals
+    return spatial_fields.inside(places), normals
 
 
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:

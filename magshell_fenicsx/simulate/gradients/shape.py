@@ -22,8 +22,8 @@ from magshell_fenicsx.assembly.field_gradient import WeightedTerm, broken_space
 from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.patterns import OfPlacement
-from magshell_fenicsx.parts.forces.dead_load import by_vertex_normal
+from magshell_fenicsx.models.shell.spatial_fields import OfPlacement
+from magshell_fenicsx.parts.forces.load_vectors import by_vertex_normal
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState

@@ -8,7 +8,7 @@ from conftest import hemisphere as triangulated
 from meridian_scenes import E3, hemisphere
 
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
+from magshell_fenicsx.models.shell.spatial_fields import WithinRims, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.loads import Loads

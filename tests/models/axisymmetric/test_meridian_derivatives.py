@@ -10,7 +10,7 @@ from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Material
-from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
-from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 

@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.stability_monitor import Crossing, StabilityMonitor
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import Condition, Material
-from magshell_fenicsx.models.shell.patterns import radial
+from magshell_fenicsx.models.shell.spatial_fields import radial
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.meridian import MeridianModel

@@ -16,7 +16,7 @@ from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_der
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.shell import ShellModel

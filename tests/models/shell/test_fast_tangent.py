@@ -20,7 +20,7 @@ from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.parameters import Condition, Material
-from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel

@@ -14,8 +14,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulaGroup, formula
-from magshell_fenicsx.models.shell.fitted import fitted
-from magshell_fenicsx.models.shell.patterns import cells_of
+from magshell_fenicsx.models.shell.formula_projection import fitted
+from magshell_fenicsx.models.shell.spatial_fields import cells_of
 from magshell_fenicsx.problem.formulas import adaptive_cells
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shape.outline import outline

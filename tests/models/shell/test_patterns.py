@@ -8,7 +8,7 @@ from conftest import hemisphere
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import (
+from magshell_fenicsx.models.shell.spatial_fields import (
     Components,
     Pattern,
     WithinRims,

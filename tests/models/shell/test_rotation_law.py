@@ -18,7 +18,7 @@ from test_magnetic_energies import order, smooth
 from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism import laws

@@ -4,7 +4,7 @@ import basix
 import numpy as np
 
 from magshell_fenicsx.input.expressions import FormulaGroup, formula
-from magshell_fenicsx.models.shell.unseen import Lattice, Parts, _seen
+from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, Parts, _seen
 
 
 def test_a_rank_without_parts() -> None:

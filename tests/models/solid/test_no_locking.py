@@ -11,7 +11,7 @@ from bodies import plate
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 from magshell_fenicsx.shells.solid_terms import QUADRATURE_DEGREE, SolidTerm, TermFactory

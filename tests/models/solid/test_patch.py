@@ -12,7 +12,7 @@ from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.shapes import StripShape, plane_embedding
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 

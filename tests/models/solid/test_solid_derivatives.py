@@ -11,8 +11,8 @@ from dolfinx import fem
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.mesh.hexahedra import OUTER_FACE, face_measure
 from magshell_fenicsx.models.shell.parameters import EdgeMoment, Material
-from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.shell.spatial_fields import radial
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation

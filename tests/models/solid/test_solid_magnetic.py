@@ -14,8 +14,8 @@ from test_solid_derivatives import FIELD, MU, displacement
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.shell.spatial_fields import radial
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.solid import SolidModel

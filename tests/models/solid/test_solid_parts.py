@@ -24,7 +24,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     PointForce,
 )
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel

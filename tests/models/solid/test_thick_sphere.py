@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 from magshell_fenicsx.shells.solid_terms import TermFactory

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
 from magshell_fenicsx.mesh.user_mesh import lagrange_element
-from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
+from magshell_fenicsx.models.shell.formula_projection import Cells, Element, Fit, fitted
 from magshell_fenicsx.models.shell.own_term import ByPlace
 
 Array = NDArray[np.float64]

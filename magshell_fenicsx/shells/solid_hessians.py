@@ -1,6 +1,6 @@
 """Where the solid's terms live: the Hessians of their densities at points, contracted in batches.
 
-As on the shell (see `models.shell.sites`), with the jets in reference coordinates: the tables of
+As on the shell (see `models.shell.element_hessians`), with the jets in reference coordinates: the tables of
 the shape functions are the same for all cells.
 """
 
@@ -27,7 +27,7 @@ from magshell_fenicsx.assembly.point_kernels import BlockPairs, PointStorage, po
 from magshell_fenicsx.assembly.shape_tables import ShapeTable
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.mesh.hexahedra import BodyMesh
-from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
+from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, parameters_at
 from magshell_fenicsx.shells.solid_terms import SolidTerm
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ class Site:
         same: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices to `same`; see `models.shell.sites.Site.add`."""
+        """Add the terms' element matrices to `same`; see `models.shell.element_hessians.Site.add`."""
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:

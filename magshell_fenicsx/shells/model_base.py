@@ -17,22 +17,22 @@ from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
-from magshell_fenicsx.models.shell import patterns
-from magshell_fenicsx.models.shell.fitted import Cells
+from magshell_fenicsx.models.domains import Carrier, Energy, Facets
+from magshell_fenicsx.models.shell import spatial_fields
+from magshell_fenicsx.models.shell.formula_projection import Cells
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.parts.bodies.contact import Pressing, Region
-from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
+from magshell_fenicsx.parts.bodies.body_contact import Pressing, Region
+from magshell_fenicsx.parts.forces.load_vectors import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.support_motion import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
-from magshell_fenicsx.shells.terms import EnergyFactory
+from magshell_fenicsx.shells.energy_factory import EnergyFactory
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
-    from magshell_fenicsx.parts.touching.touching import Touching
+    from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
+    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
-    touchings: "Sequence[Touching] | Sequence[MeridianTouching]" = ()
+    shell_contacts: "Sequence[Touching] | Sequence[MeridianTouching]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: PlacementAmplitudes | None = None
@@ -209,14 +209,22 @@ class Observed:
 
     def cell_pressures(self, state: State) -> Array | None:
         """The pressure of all contacts in each local cell, see `Pressing`; None without contacts."""
-        if not (self.contacts or self.touchings):
+        if not (self.contacts or self.shell_contacts):
             return None
         pressings = [pressing for pressing, _ in self.contacts.values()]
 
         def present() -> Array:
             each = [pressing.cell_pressures() for pressing in pressings]
             return np.asarray(
-                sum((*each, *(touching.of_cells()[0] for touching in self.touchings)))
+                sum(
+                    (
+                        *each,
+                        *(
+                            touching.cell_pressures_and_gaps()[0]
+                            for touching in self.shell_contacts
+                        ),
+                    )
+                )
             )
 
         return self.system.at_state(state).evaluate(present)
@@ -227,19 +235,19 @@ class Observed:
 
         def present() -> NDArray[np.bool_]:
             each = [pressing.evenly_pressed() for pressing in pressings]
-            of_shells = [touching.of_cells()[2] for touching in self.touchings]
+            of_shells = [touching.cell_pressures_and_gaps()[2] for touching in self.shell_contacts]
             return np.asarray(np.any([*each, *of_shells], axis=0))
 
         return self.system.at_state(state).evaluate(present)
 
     def cell_gaps(self, state: State) -> Array | None:
-        """The least gap over R in each local cell between parts of the shell, see `Touching`; None
+        """The least gap over R in each local cell between parts of the shell, see `SurfaceContact`; None
         without pairs.
         """
-        if not self.touchings:
+        if not self.shell_contacts:
             return None
         gaps = self.system.at_state(state).evaluate(
-            lambda: [touching.of_cells()[1] for touching in self.touchings]
+            lambda: [touching.cell_pressures_and_gaps()[1] for touching in self.shell_contacts]
         )
         return np.asarray(np.min(gaps, axis=0))
 
@@ -309,8 +317,8 @@ class Thin(Observed):
 
     def cells_of_fields(self) -> Cells:
         """Where fields are given by formulas."""
-        return patterns.cells_of(self.r0)
+        return spatial_fields.cells_of(self.r0)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
         """Places and normals at some places of the reference cell, in all cells."""
-        return patterns.places(self.r0, nodes)
+        return spatial_fields.places(self.r0, nodes)

@@ -13,7 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.carriers import Carrier, Energy, Facets, HeldEdge
+from magshell_fenicsx.models.domains import Carrier, Energy, Facets, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
@@ -30,9 +30,9 @@ from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECON
 from magshell_fenicsx.models.shell.law import Law, OfShells, elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
-from magshell_fenicsx.models.shell.patterns import pattern_field
+from magshell_fenicsx.models.shell.spatial_fields import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
-from magshell_fenicsx.parts.bodies.contact import (
+from magshell_fenicsx.parts.bodies.body_contact import (
     Contact,
     Pressing,
     contact_energy,

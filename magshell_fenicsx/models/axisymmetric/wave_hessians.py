@@ -18,10 +18,10 @@ from magshell_fenicsx.assembly.batches import EntityBatch, EntityRule
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo
 from magshell_fenicsx.assembly.point_kernels import PointKernel, PointStorage, full_hessian
-from magshell_fenicsx.models.carriers import Carrier, Energy, revolved_by, wave_by
+from magshell_fenicsx.models.domains import Carrier, Energy, revolved_by, wave_by
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
+from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, parameters_at
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]

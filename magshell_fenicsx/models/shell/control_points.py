@@ -59,7 +59,7 @@ class ByControls:
     """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those
     that turn.
 
-    `frame` is as of `patterns.Components`.
+    `frame` is as of `spatial_fields.Components`.
     """
 
     controls: Controls

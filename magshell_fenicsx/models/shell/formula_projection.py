@@ -21,7 +21,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import FormulaGroup
-from magshell_fenicsx.models.shell.unseen import AT_ONCE, CHILDREN, Lattice, Parts, leaves
+from magshell_fenicsx.models.shell.adaptive_sampling import (
+    AT_ONCE,
+    CHILDREN,
+    Lattice,
+    Parts,
+    leaves,
+)
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -258,7 +264,7 @@ class _Narrow:
 
 
 def _narrow(values: Values, formulas: FormulaGroup, cells: Cells, coarse: Array) -> _Narrow:
-    """Integrals (cells, components) compared with those over leaves, see `unseen.leaves`;
+    """Integrals (cells, components) compared with those over leaves, see `adaptive_sampling.leaves`;
     collective.
     """
     d, kind = cells.dimension, cells.element.cell_type
