@@ -82,7 +82,7 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     model = MeridianModel(meridian, problem.material, 4, conditions, problem.loads)
     waves, carrier = model.excluded_modes.waves, model.factory.carrier
     v = ufl.TestFunction(waves.V)
-    along = domains.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
+    along = domains.wave_jets(v, fem.Constant(meridian.mesh, float(M)))[0].r
     form = np.pi * carrier.over_area()(
         -ufl.dot(kin.normal(carrier.j0), along)
     )  # of the pressure E h/R

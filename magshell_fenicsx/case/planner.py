@@ -34,10 +34,10 @@ from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
+from magshell_fenicsx.models.shell.adaptive_sampling import RefinedParts
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.shell.adaptive_sampling import Leaves
 from magshell_fenicsx.parts.ability import Modelled
 from magshell_fenicsx.parts.bodies.body_contact import Contact
 from magshell_fenicsx.parts.bodies.body_setup import Pressed, body_leaves, contacts
@@ -392,7 +392,7 @@ class _ResolvedFormulas:
     """
 
     formulas: Sequence[PlacedFormulas]
-    cells: Sequence[Leaves | None]
+    cells: Sequence[RefinedParts | None]
 
     @classmethod
     def of(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.models.shell.laminate import Laminate
     from magshell_fenicsx.models.shell.law import Law
-    from magshell_fenicsx.models.shell.parameters import OwnMaterial
+    from magshell_fenicsx.models.shell.parameters import ShellMaterial
     from magshell_fenicsx.models.shell.thickness import Thickness
 
 Array = NDArray[np.float64]
@@ -277,18 +277,18 @@ class SeveralShells:
         )
 
     @cached_property
-    def materials(self) -> "dict[str, OwnMaterial] | None":
+    def materials(self) -> "dict[str, ShellMaterial] | None":
         """Name of a shell -> its material over that of the first; None where all are alike."""
-        from magshell_fenicsx.models.shell.parameters import OwnMaterial
+        from magshell_fenicsx.models.shell.parameters import ShellMaterial
 
-        first, materials = self.parts[0].case.shell, dict[str, OwnMaterial]()
+        first, materials = self.parts[0].case.shell, dict[str, ShellMaterial]()
         laws = list(self.laws)
         for part in self.parts:
             shell, keys = part.case.shell, ("modulus", "density")
             modulus_ratio, density_ratio = (
                 (getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys
             )
-            materials[part.name] = OwnMaterial(
+            materials[part.name] = ShellMaterial(
                 modulus_ratio, shell.poisson_ratio, density_ratio, laws.index(self._law(part))
             )
         return None if len({*materials.values()}) == 1 else materials

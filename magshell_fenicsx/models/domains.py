@@ -32,12 +32,12 @@ Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 
 
-def revolved(f: Expr) -> Jet:
+def revolved_jet(f: Expr) -> Jet:
     """Jet of the axisymmetric field f = (U, W), U e_rho + W e_z."""
-    return revolved_by(_derivatives(f, 2))
+    return revolved_jet_of(_derivatives(f, 2))
 
 
-def revolved_by(derivatives: Sequence[Sequence[Expr]]) -> Jet:
+def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
     """The same from the components of f, f' and f''."""
     (U, W), (Us, Ws), (Uss, Wss) = derivatives
     return Jet(
@@ -50,7 +50,7 @@ def revolved_by(derivatives: Sequence[Sequence[Expr]]) -> Jet:
     )
 
 
-def wave(f: Expr, m: Expr) -> tuple[Jet, Jet]:
+def wave_jets(f: Expr, m: Expr) -> tuple[Jet, Jet]:
     """Jets of v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
 
     The unknowns are f = (P, V, W) with P = U + V: on the axis P = 0 for m = 1 (a
@@ -61,10 +61,10 @@ def wave(f: Expr, m: Expr) -> tuple[Jet, Jet]:
     cosine, sine
         v,_i = cosine_i cos(m theta) + sine_i sin(m theta), and so for all derivatives.
     """
-    return wave_by(_derivatives(f, 3), m)
+    return wave_jets_of(_derivatives(f, 3), m)
 
 
-def wave_by(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
+def wave_jets_of(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
     """The same from the components of f, f' and f''."""
     (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in derivatives)
     cosine = Jet(
@@ -106,7 +106,7 @@ class Energy:
     Attributes
     ----------
     of
-        Of the jet of u: the energy on the carrier, of which `Carrier.whole` times as much is
+        Of the jet of u: the energy on the carrier, of which `IntegrationDomain.whole` times as much is
         modelled.
     work
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
@@ -158,7 +158,7 @@ class HeldEdge:
 
 
 @dataclass(frozen=True)
-class Carrier:
+class IntegrationDomain:
     """The mid-surface, or its meridian, with the placement r0 on it.
 
     Attributes
@@ -321,11 +321,11 @@ class Carrier:
         )
 
 
-def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
+def surface_domain(r0: fem.Function, drawn: fem.Function | None = None) -> IntegrationDomain:
     """The mid-surface, a mesh of triangles."""
     domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
     between = ufl.avg(ufl.CellVolume(domain)) / ufl.avg(ufl.FacetArea(domain))
-    return Carrier(
+    return IntegrationDomain(
         r0,
         lambda f: kin.jet(f, domain),
         kin.facet_covector(domain),
@@ -339,16 +339,16 @@ def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
     )
 
 
-def on_meridian(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
+def meridian_domain(r0: fem.Function, drawn: fem.Function | None = None) -> IntegrationDomain:
     """The meridian, a mesh of intervals."""
     domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
-    along = revolved(r0).r1
+    along = revolved_jet(r0).r1
     width = (
         ufl.CellVolume(domain) / 2 * ufl.sqrt(ufl.dot(along, along))
     )  # triangles have half their height
-    return Carrier(
+    return IntegrationDomain(
         r0,
-        revolved,
+        revolved_jet,
         ufl.as_vector(
             [ufl.FacetNormal(domain)[0], 0]
         ),  # the length of an edge is then that per radian
@@ -370,7 +370,7 @@ def _tables_on_surface(V: fem.FunctionSpace, places: Array) -> Callable[[Array],
 
 
 def _tables_on_meridian(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
-    """Jets at azimuth zero, as `revolved`, by X in [0, 1]; nodal values are (U, W)."""
+    """Jets at azimuth zero, as `revolved_jet`, by X in [0, 1]; nodal values are (U, W)."""
     shapes, nodes = V.element.basix_element.tabulate(2, places)[..., 0], V.dofmap.list
 
     def jets_of(nodal: Array) -> Array:

@@ -11,8 +11,8 @@ from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import ByPlace, OwnTerm
-from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
+from magshell_fenicsx.models.shell.own_term import FormulaParameter, OwnTerm
+from magshell_fenicsx.parts.ability import Context, Formulas, Part, Scales
 from magshell_fenicsx.platform.lazy_import import lazy_import
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 
@@ -85,7 +85,7 @@ class Foundation(Part):
 
     def terms(self, scales: Scales) -> list[OwnTerm]:
         k, springs = self._dimensionless(scales), list[OwnTerm]()
-        factor = (ByPlace(self.factor, "foundation.factor"),) if self.factor else (1.0,)
+        factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
         if "k" in k:
             observed = {"foundation_force": reaction}
             springs.append(OwnTerm("foundation", energy, (scales.force, *factor), k["k"], observed))

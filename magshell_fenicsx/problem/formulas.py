@@ -25,10 +25,10 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh, space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
-from magshell_fenicsx.models.shell.formula_projection import Cells, fitted, sampling
-from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
-from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, Leaves, Parts
-from magshell_fenicsx.models.shell.adaptive_sampling import leaves as leaves_of
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry, project_formula, sampling_points
+from magshell_fenicsx.models.shell.thickness import MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR
+from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, RefinedParts, SubCells
+from magshell_fenicsx.models.shell.adaptive_sampling import refine_where_hidden as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.ability import Context, Formulas
 from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
@@ -102,7 +102,7 @@ def case_formulas(context: Context) -> list[PlacedFormulas]:
 def _specs(context: Context) -> Iterator[Formulas]:
     factor = context.shell.thickness_factor
     if isinstance(factor, str):
-        yield Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
+        yield Formulas(THICKNESS, [factor], MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR, 1.0)
     for section in context.abilities:
         yield from section.formulas(context)
     for step in context.steps:
@@ -198,7 +198,7 @@ def within_chart(shape: PlaneShape | Grid, chart: Array) -> Masks:
     return np.asarray(((chart >= low) & (chart <= high)).all(axis=-1))
 
 
-def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> Leaves:
+def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
     """Return a division of the perfect surface so fine that places in each cell show the formulas.
 
     The cells divide triangles of the chart, of a disc those of a square that is mapped onto it, or
@@ -219,7 +219,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> Leaves:
 
     lattice = Lattice.of(basix.CellType.triangle, CELL_SAMPLES)
 
-    def places_and_areas(parts: Parts) -> tuple[Array, Array]:
+    def places_and_areas(parts: SubCells) -> tuple[Array, Array]:
         X = parts.rule(lattice.places, np.ones(len(lattice.places)))[0]
         corners = triangles[parts.cell]
         x = corners[:, None, 0] + np.matmul(X, corners[:, 1:] - corners[:, :1])
@@ -227,7 +227,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> Leaves:
         area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
         return x, area
 
-    reference = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
+    reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
     first = reference.of(np.arange(len(triangles)))
     return leaves_of(formulas, first, places_and_areas, lattice, len(triangles))
 
@@ -243,7 +243,7 @@ def _chart_triangles(shape: PlaneShape | Grid) -> Array:
     )
 
 
-def narrow_places(leaves: Sequence[Leaves]) -> Array:
+def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
     """Return places (n, 3) at which formulas have values that samples may miss."""
     places: list[Array] = [np.zeros((0, 3))]
     for cells in leaves:
@@ -255,7 +255,7 @@ def narrow_places(leaves: Sequence[Leaves]) -> Array:
     return np.concatenate(places)
 
 
-def polynomial_sizes(values: Callable[[Array], Array], leaves: Leaves | None = None) -> Sizes:
+def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | None = None) -> Sizes:
     """Return the sizes of elements that resolve a formula.
 
     They are half the squares in which polynomials miss most of it, else the squares. What samples
@@ -301,7 +301,7 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: Leaves | None = N
     return sizes
 
 
-def _unsampled_variance(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
+def _unsampled_variance(leaves: RefinedParts, middle: Array, side: float, sampled: Array) -> Array:
     """Return the integral (squares,) of the square of a formula that the samples do not show.
 
     Zero in squares whose samples have half of it.
@@ -323,7 +323,7 @@ def _unsampled_variance(leaves: Leaves, middle: Array, side: float, sampled: Arr
 
 def formula_refinements(
     formulas: Sequence[PlacedFormulas],
-    leaves_of_formulas: Sequence[Leaves | None],
+    leaves_of_formulas: Sequence[RefinedParts | None],
     outline: Outline,
     turn: float,
     h: float,
@@ -414,7 +414,7 @@ def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
 
 
 def unresolved_formulas(
-    formulas: Sequence[PlacedFormulas], cells: Cells, turn: float, h: float
+    formulas: Sequence[PlacedFormulas], cells: CellGeometry, turn: float, h: float
 ) -> list[str]:
     """Return messages about what the cells miss of formulas; collective.
 
@@ -432,7 +432,7 @@ def unresolved_formulas(
 
 
 def _unresolved_formula(
-    key_formulas: PlacedFormulas, cells: Cells, Q: Array, h: float
+    key_formulas: PlacedFormulas, cells: CellGeometry, Q: Array, h: float
 ) -> list[str]:
     """Return messages about one key, see `unresolved_formulas`."""
     spec, element, messages = key_formulas.spec, cells.element, list[str]()
@@ -442,7 +442,7 @@ def _unresolved_formula(
 
     x, normals, _ = cells.at(element.points)
     is_thickness = spec.key == THICKNESS
-    fit = fitted(
+    fit = project_formula(
         values,
         cells,
         values(x, normals),
@@ -481,7 +481,7 @@ def _unresolved_formula(
     return messages
 
 
-def _stiffness_error(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
+def _stiffness_error(values: Callable[[Array, Array], Array], cells: CellGeometry, nodal: Array) -> float:
     """Return the error of the stiffness t^3 or the compliance 1/t^3 of the cells; collective.
 
     It is over the exact value of all cells. Parts of a shell that carry side by side add their
@@ -496,7 +496,7 @@ def _stiffness_error(values: Callable[[Array, Array], Array], cells: Cells, noda
     nodal
         (cells, nodes, 1) thickness factors of the cells.
     """
-    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
+    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.at(X)
     kind, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
     curvatures = basix.create_element(
@@ -523,7 +523,7 @@ def _stiffness_error(values: Callable[[Array, Array], Array], cells: Cells, noda
     return float((error_integral / exact_integral).max())
 
 
-def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:
+def cells_of_patch(patch: PatchMesh, degree: int) -> CellGeometry:
     """Return the cells of a triangulation, with the places of a model of that degree."""
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.gll_warped
@@ -532,4 +532,4 @@ def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:
     X = element.points
     chart = corners[:, :1] + np.einsum("qk,ckd->cqd", X, corners[:, 1:] - corners[:, :1])
     places = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(*chart.shape[:2], 3)
-    return Cells(element, places, len(places), MPI.COMM_SELF)
+    return CellGeometry(element, places, len(places), MPI.COMM_SELF)

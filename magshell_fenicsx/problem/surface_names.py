@@ -9,12 +9,12 @@ import numpy as np
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set
-from magshell_fenicsx.models.shell.kinematics import SECOND
+from magshell_fenicsx.models.shell.kinematics import SECOND_DERIVATIVES
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
 from magshell_fenicsx.parts.registered import SEEN, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
@@ -68,7 +68,7 @@ def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:
             raise CaseError(
                 f"model: solid: {term.name} is an energy of an edge, which only a shell has"
             )
-        second_derivatives = [f"r0.{name}" for name in term.placed_parts if name in SECOND]
+        second_derivatives = [f"r0.{name}" for name in term.placed_parts if name in SECOND_DERIVATIVES]
         if second_derivatives:
             raise CaseError(
                 f"model: solid: {term.name} depends on {', '.join(second_derivatives)}, "
@@ -116,7 +116,7 @@ def _refuse_ambiguous(
 ) -> None:
     """Refuse the support of a name that an edge and a point have."""
     for name, condition in conditions.items():
-        if isinstance(condition, Held) and name in edges and name in points:
+        if isinstance(condition, HeldComponents) and name in edges and name in points:
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
 
 

@@ -30,9 +30,13 @@ from magshell_fenicsx.problem.requests import FrequenciesSection, StabilitySecti
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.shells.mass import Model
-from magshell_fenicsx.shells.modes import Seen, ShellMode, ShellModes, seen_on
+from magshell_fenicsx.shells.modes import ModeSpace, ShellMode, ShellModes, mode_space
+from magshell_fenicsx.simulate.contact_control import (
+    stiffened_equilibrium,
+    touching_bodies,
+    with_stiffer_bodies,
+)
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import hardened, pressing, rigid
 
 Say = Callable[[str], None]
 ROUNDING = 1e-9  # over R: a smaller coordinate is zero
@@ -66,16 +70,16 @@ class _ModeWriter:
     folder: Path
     say: Say
     _model_modes: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
-    _whole_shell_modes: dict[int, tuple[Seen, ShellModes, Gatherer]] = field(default_factory=dict)
+    _whole_shell_modes: dict[int, tuple[ModeSpace, ShellModes, Gatherer]] = field(default_factory=dict)
 
-    def _modes_of_whole_shell(self, number: int) -> tuple[Seen, ShellModes, Gatherer]:
+    def _modes_of_whole_shell(self, number: int) -> tuple[ModeSpace, ShellModes, Gatherer]:
         """Return what sees all modes of the shell at a point, its modes, and their gatherer.
 
         The model of the point may exclude modes.
         """
         scene = self.result.scene_of(number)
         if id(scene) not in self._whole_shell_modes:
-            whole_shell = seen_on(scene.model)
+            whole_shell = mode_space(scene.model)
             self._whole_shell_modes[id(scene)] = (
                 whole_shell,
                 ShellModes(whole_shell.model),
@@ -120,7 +124,7 @@ class _ModeWriter:
         for number, state in points.items():
             whole_shell, shell, _ = self._modes_of_whole_shell(number)
             try:
-                allows_rigid_motion = self.result.scene_of(number).loose
+                allows_rigid_motion = self.result.scene_of(number).allows_rigid_motion
                 lowest = shell.lowest(
                     whole_shell.state(state), section.modes, loose=allows_rigid_motion
                 )
@@ -170,7 +174,7 @@ def write_mode_of(
     state: State,
     label: str,
     vector: Vector,
-    whole_shell: Seen | None = None,
+    whole_shell: ModeSpace | None = None,
 ) -> Surface | None:
     """Write a mode at a state, and return its surface on rank 0; collective.
 
@@ -221,13 +225,13 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     same label; the change of a mode that is not there any more is 1. nan, if the shell finds no
     such equilibrium near.
     """
-    bodies = pressing(scene, state)
+    bodies = touching_bodies(scene, state)
     if not bodies:
         return [0.0] * len(modes)
-    harder = hardened(scene, state, bodies)
+    harder = with_stiffer_bodies(scene, state, bodies)
     if harder is None:
         return [nan] * len(modes)
-    whole_shell = seen_on(scene.model)
+    whole_shell = mode_space(scene.model)
     shell_modes, state = ShellModes(whole_shell.model), whole_shell.state(harder)
     stiffer_modes = shell_modes.vibrations(state, len(modes) + FURTHER_MODES)
     changes = []
@@ -271,20 +275,20 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         )
     states = _states_of_frequencies(result, section, say)
     symmetric_waves, time_unit = dict[int, str](), scene.problem.time_unit
-    modes_of_scene = dict[int, tuple[Seen, ShellModes]]()
-    whole_shells = dict[int, Seen]()
+    modes_of_scene = dict[int, tuple[ModeSpace, ShellModes]]()
+    whole_shells = dict[int, ModeSpace]()
     for number, state in states.items():
         scene = result.scene_of(number)
         if id(scene) not in modes_of_scene:
-            whole_shell = seen_on(scene.model)
+            whole_shell = mode_space(scene.model)
             modes_of_scene[id(scene)] = whole_shell, ShellModes(whole_shell.model)
         whole_shell, shell_modes = modes_of_scene[id(scene)]
         whole_shells[number] = whole_shell
         symmetric_waves[number] = symmetric_wave(whole_shell.model)
-        state = rigid(scene, state)
+        state = stiffened_equilibrium(scene, state)
         try:
             modes = shell_modes.vibrations(
-                whole_shell.state(state), section.count, loose=scene.loose
+                whole_shell.state(state), section.count, loose=scene.allows_rigid_motion
             )
             result.frequencies[number] = modes
             if scene.model.contacts:
@@ -336,7 +340,9 @@ def _lowest_frequency(
     time_unit: float | None,
 ) -> str:
     """Return words for the lowest frequency at a point, and for the rigid motions below it."""
-    rigid_modes = [mode for mode in modes if mode.eigenvalue == 0.0] if scene.loose else []
+    rigid_modes = (
+        [mode for mode in modes if mode.eigenvalue == 0.0] if scene.allows_rigid_motion else []
+    )
     # a wave has a twin
     motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
     rigid_motions = f"{motions} rigid motions, " if motions else ""

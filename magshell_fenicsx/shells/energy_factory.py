@@ -13,7 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.domains import Carrier, Energy, Facets, HeldEdge
+from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
@@ -26,12 +26,19 @@ from magshell_fenicsx.models.shell.energy import (
     constants_of,
     per_area,
 )
-from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, MOVED, SECOND, Edge, Jet
-from magshell_fenicsx.models.shell.law import Law, OfShells, elastic
+from magshell_fenicsx.models.shell.kinematics import (
+    ALL_DERIVATIVES,
+    FIRST_DERIVATIVES,
+    VALUE_AND_FIRST,
+    SECOND_DERIVATIVES,
+    Edge,
+    Jet,
+)
+from magshell_fenicsx.models.shell.law import Law, LawByShell, elastic_density
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.spatial_fields import pattern_field
-from magshell_fenicsx.models.shell.thickness import thick
+from magshell_fenicsx.models.shell.thickness import thickness_weighted
 from magshell_fenicsx.parts.bodies.body_contact import (
     Contact,
     Pressing,
@@ -40,7 +47,7 @@ from magshell_fenicsx.parts.bodies.body_contact import (
     pressed_radius,
     thinned_energy,
 )
-from magshell_fenicsx.parts.gap import thinning
+from magshell_fenicsx.parts.gap import thickness_ratio_at_points
 from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import moments, potentials
@@ -85,7 +92,7 @@ class EnergyFactory:
         What is known of a soft material that saturates, when it was made.
     """
 
-    carrier: Carrier
+    carrier: IntegrationDomain
     u: fem.Function
     material: Material
     sigma: float
@@ -132,12 +139,14 @@ class EnergyFactory:
         return self._elastic(Density(per_area(densities.prestress), (strain,)))
 
     def bending(self) -> Energy:
-        density = self._elastic(Density(per_area(densities.bending), (), parts=CURVED))
+        density = self._elastic(Density(per_area(densities.bending), (), parts=ALL_DERIVATIVES))
         return self.carrier.energy("bending", density, column="bending")
 
     def interior_edges(self) -> Energy:
-        of = edges.folded if self.folded else edges.interior
-        density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
+        of = edges.fold if self.folded else edges.interior
+        density = self._elastic(
+            Density(of, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
+        )
         if self.creases:
             zero = self._constant(0.0)
             density = self.creases.added(
@@ -148,7 +157,9 @@ class EnergyFactory:
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
         """`turn` is the rotation of an edge that moves."""
         parameters = (self._penalty,) if turn is None else (self._penalty, turn)
-        density = self._elastic(Density(edges.clamped, parameters, CURVED, SECOND, facets))
+        density = self._elastic(
+            Density(edges.clamped, parameters, ALL_DERIVATIVES, SECOND_DERIVATIVES, facets)
+        )
         self.held.append(HeldEdge(facets, turn=turn))
         return self.carrier.energy(name, density, column="bending")
 
@@ -156,7 +167,9 @@ class EnergyFactory:
         """Edges on a mirror plane with that normal."""
         plane = self._constant(normal)
         density = self._elastic(
-            Density(edges.symmetric, (self._penalty, plane), CURVED, SECOND, facets)
+            Density(
+                edges.symmetric, (self._penalty, plane), ALL_DERIVATIVES, SECOND_DERIVATIVES, facets
+            )
         )
         self.held.append(HeldEdge(facets, plane=plane))
         return self.carrier.energy(name, density, column="bending")
@@ -186,7 +199,9 @@ class EnergyFactory:
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
         carrier, parameters = self.carrier, (self._penalty, self._constant(normal))
-        density = self._elastic(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
+        density = self._elastic(
+            Density(antisymmetric_edge, parameters, ALL_DERIVATIVES, facets=facets)
+        )
         v = fem.Function(self.u.function_space)
         jets = carrier.j0, carrier.jet(self.u), carrier.jet(v)
         energy = density.of(
@@ -217,7 +232,7 @@ class EnergyFactory:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
         sheet, scale = Sheet(field), self._constant(soft.scale)
         law, *given = self._of_sheet(sheet, soft, applied)
-        parts = FIRST if field.uniform else MOVED
+        parts = FIRST_DERIVATIVES if field.uniform else VALUE_AND_FIRST
         density = Density(per_area(sheet.energy_per_area), (law, scale, *given), parts=parts)
         return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
 
@@ -289,7 +304,7 @@ class EnergyFactory:
         Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
         if applied:
             density = self._magnetised(
-                field, densities.in_space(full), Br, applied.polynomial, parts=MOVED
+                field, densities.in_space(full), Br, applied.polynomial, parts=VALUE_AND_FIRST
             )
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
@@ -311,7 +326,11 @@ class EnergyFactory:
         ]
         if field.gradient is not None:
             density = self._magnetised(
-                field, densities.in_gradient(full), Br, self._constant(field.gradient), parts=MOVED
+                field,
+                densities.in_gradient(full),
+                Br,
+                self._constant(field.gradient),
+                parts=VALUE_AND_FIRST,
             )
             terms.append(
                 carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic")
@@ -323,7 +342,7 @@ class EnergyFactory:
         field: Magnetisation,
         of: Callable[..., Expr],
         *parameters: Parameter,
-        parts: tuple[str, ...] = FIRST,
+        parts: tuple[str, ...] = FIRST_DERIVATIVES,
     ) -> Density:
         """A density of the remanence with the thickness and, if that thins with F, the natural
         shape.
@@ -337,9 +356,13 @@ class EnergyFactory:
         has none.
         """
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        of, following = (self._on_pressed(f) for f in (densities.swept, densities.following))
+        of, following = (
+            self._on_pressed(f) for f in (densities.swept_volume, densities.follower_pressure_work)
+        )
         parameters = (unit,) if self.pressed is None else (unit, self.pressed)
-        density = Density(of, parameters, parts=MOVED, work=None if potential else following)
+        density = Density(
+            of, parameters, parts=VALUE_AND_FIRST, work=None if potential else following
+        )
         return self.carrier.energy("pressure", density, "pressure", drawn=True)
 
     def _on_pressed(self, of: Callable[..., Expr]) -> Callable[..., Expr]:
@@ -351,7 +374,8 @@ class EnergyFactory:
         is pressed.
         """
         return self._volume(
-            self._on_pressed(densities.swept), *([] if self.pressed is None else [self.pressed])
+            self._on_pressed(densities.swept_volume),
+            *([] if self.pressed is None else [self.pressed]),
         )
 
     def volume_change(self, origin: Array) -> ufl.Form:
@@ -398,12 +422,14 @@ class EnergyFactory:
         )
         rule, thins = carrier.contact_rule, self.material.law.some_thin
         thins_at = (
-            thinning(carrier, self.u, self.natural, self.law_of_cells.thins) if thins else None
+            thickness_ratio_at_points(carrier, self.u, self.natural, self.law_of_cells.thins)
+            if thins
+            else None
         )
         pressing = Pressing(
             contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at
         )
-        of, parts = (thinned_energy, MOVED) if thins else (contact_energy, ("r",))
+        of, parts = (thinned_energy, VALUE_AND_FIRST) if thins else (contact_energy, ("r",))
         density = Density(per_area(of), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
@@ -429,13 +455,13 @@ class EnergyFactory:
 
     def _thick(self, density: Density) -> Density:
         """The density over E h with the thickness as it varies, if it does."""
-        return density if self.thickness is None else thick(density, self.thickness)
+        return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
         """A density of what thins, on the natural shape, and where the law of the shell says so."""
         law, own = self.material.law, self.made_of
         density = grown(density, self.natural) if self.natural else density
-        if own is None or not isinstance(law, OfShells):
+        if own is None or not isinstance(law, LawByShell):
             return density
 
         def of(*arguments: Expr, **keywords: Any) -> Expr:
@@ -459,7 +485,7 @@ class EnergyFactory:
         do.
         """
         density = self._thick(density)
-        return density if self.made_of is None else thick(density, self.made_of, 2)
+        return density if self.made_of is None else thickness_weighted(density, self.made_of, 2)
 
     def _elastic(self, density: Density) -> Density:
         """The density of the material with the thickness as it varies, and of the natural shape, if
@@ -467,7 +493,7 @@ class EnergyFactory:
         """
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
-        density = elastic(density, law.with_numbers(*numbers), self.thickness, self.made_of)
+        density = elastic_density(density, law.with_numbers(*numbers), self.thickness, self.made_of)
         return grown(density, self.natural) if self.natural else density
 
     @property

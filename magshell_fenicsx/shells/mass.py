@@ -40,18 +40,20 @@ def mass(model: Model) -> PETSc.Mat:
     return projection.mass(M) if projection else M
 
 
-def whole_mass(model: Model) -> PETSc.Mat:
+def mass_with_supports(model: Model) -> PETSc.Mat:
     """The same with supports."""
     return mass_matrix(_product(model), [])
 
 
 def _product(model: Model) -> fem.Form:
-    factor = weight(model)
+    factor = mass_factor(model)
     name = "mass" if factor is None else "weighted mass"
-    return model.kernels.compile(name, of_displacements(model, 1.0 if factor is None else factor))
+    return model.kernels.compile(
+        name, displacement_product(model, 1.0 if factor is None else factor)
+    )
 
 
-def weight(model: Model) -> Expr | None:
+def mass_factor(model: Model) -> Expr | None:
     """What multiplies the mass of a shell per area: thickness and density; a solid has the
     thickness in its shape.
     """
@@ -61,29 +63,29 @@ def weight(model: Model) -> Expr | None:
     return reduce(mul, factors) if factors else None
 
 
-def of_displacements(model: Model, factor: Expr | float) -> ufl.Form:
+def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
     """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
     product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, model.carrier.whole * product if model.thin else product)
 
 
-def of_waves(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
+def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
     cosine, sine = zip(
-        *(domains.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
+        *(domains.wave_jets(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
     )
     return _integral(model, factor * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
 
 def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
     """phi . M phi as an energy; of a wave phi has the coefficients (U + V, V, W)."""
-    factor = weight(model)
+    factor = mass_factor(model)
     if wave is None:
-        V, product = model.V, of_displacements(model, 1.0 if factor is None else factor)
+        V, product = model.V, displacement_product(model, 1.0 if factor is None else factor)
     else:
         assert model.axisymmetric
-        V, product = model.waves.V, of_waves(model, 1.0 if factor is None else factor)
+        V, product = model.waves.V, wave_product(model, 1.0 if factor is None else factor)
     f = fem.Function(V, name="phi")
     f.x.array[: len(phi)] = phi
     f.x.scatter_forward()
@@ -118,7 +120,7 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
 Rates = Mapping[str, tuple[float, float]]  # of each motion: first and second derivative by time
 
 
-class Ground:
+class SupportInertia:
     """Supports that move in time; a `continuation.motion.MovingSupports`.
 
     Parameters

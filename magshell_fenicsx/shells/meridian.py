@@ -26,10 +26,10 @@ from magshell_fenicsx.assembly.prescribed_motion import EdgePressure, Lid
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.domains import on_meridian
-from magshell_fenicsx.models.shell.edges import FOLD
+from magshell_fenicsx.models.domains import meridian_domain
+from magshell_fenicsx.models.shell.edges import FOLD_ANGLE
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
-from magshell_fenicsx.models.shell.spatial_fields import cells_of, field_of_place
+from magshell_fenicsx.models.shell.spatial_fields import cell_geometry, formula_field
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.meridian_loads import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.joints import Creases
@@ -48,16 +48,16 @@ from magshell_fenicsx.parts.supports.support_motion import (
 )
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.shells.model_base import Thin
+from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.energy_factory import INTERIOR, EnergyFactory
-from magshell_fenicsx.shells.waves import ExcludedWaves, Waves, most_waves
+from magshell_fenicsx.shells.waves import SymmetryBreakingWaves, Waves, largest_wave_number
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
-    from magshell_fenicsx.shells.t_junctions import MeridianTee
+    from magshell_fenicsx.shells.t_junctions import MeridianTJunction
 
 Array = NDArray[np.float64]
-SMALL_RISE = (
+AXIAL_TOLERANCE = (
     1e-9  # largest axial component of a motion of length one that is a translation across the axis
 )
 
@@ -106,7 +106,7 @@ class Probe:
         return matrix.reshape(3, size)
 
 
-class MeridianModel(Thin):
+class MeridianModel(ThinModel):
     """A Koiter shell of revolution with axisymmetric loads; every rank holds all of it.
 
     Parameters
@@ -129,7 +129,7 @@ class MeridianModel(Thin):
     Attributes
     ----------
     system, multiplicity, normals, supports
-        See `Observed`; u = (U, W) along e_rho and e_z.
+        See `ModelBase`; u = (U, W) along e_rho and e_z.
     held
         Where the displacement is zero.
     energies
@@ -144,7 +144,7 @@ class MeridianModel(Thin):
         The contacts of shells with each other, and their T-junctions.
     """
 
-    shell_contacts: "Sequence[MeridianTouching]"
+    shell_contacts: "Sequence[MeridianContact]"
 
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
@@ -168,7 +168,7 @@ class MeridianModel(Thin):
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
-        of_place = partial(field_of_place, self.r0)
+        of_place = partial(formula_field, self.r0)
         loads = self.loads = replace(
             loads, own=tuple(term.with_functions(of_place) for term in loads.own)
         )
@@ -189,10 +189,10 @@ class MeridianModel(Thin):
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
-            shape = Shape.of(natural_field(grown, cells_of(self.r0), V), grown, free)
-        carrier = on_meridian(self.r0, self.growing and self.growing.initial_placement)
+            shape = Shape.of(natural_field(grown, cell_geometry(self.r0), V), grown, free)
+        carrier = meridian_domain(self.r0, self.growing and self.growing.initial_placement)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        folded = meridian.largest_fold(self.r0) > FOLD
+        folded = meridian.largest_fold(self.r0) > FOLD_ANGLE
         creases = Creases.of(loads.joints, meridian) if loads.joints else None
         self.factory = factory = EnergyFactory(
             carrier,
@@ -266,11 +266,11 @@ class MeridianModel(Thin):
         for each in self.shell_contacts:
             stiffnesses |= each.history
             parameters |= each.entered(parameters)
-        self.tees: list[MeridianTee] = []
+        self.tees: list[MeridianTJunction] = []
         if any(of is None for of in meridian.joints):
-            from magshell_fenicsx.shells.t_junctions import tees_of_meridian
+            from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
 
-            self.tees = tees_of_meridian(self)
+            self.tees = meridian_t_junction_terms(self)
         begun = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
@@ -313,16 +313,16 @@ class MeridianModel(Thin):
         other = copy(self)
         other.system = self.system.with_number("numbers of the case", numbers, value)
         other.meridian, other.material = of.meridian, of.material
-        other.excluded_modes = ExcludedWaves(
-            self.waves.of(other.system, most_waves(of.meridian, of.material.h))
+        other.excluded_modes = SymmetryBreakingWaves(
+            self.waves.of(other.system, largest_wave_number(of.meridian, of.material.h))
         )
         return other
 
     @cached_property
-    def excluded_modes(self) -> ExcludedWaves:
+    def excluded_modes(self) -> SymmetryBreakingWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
-        return ExcludedWaves(Waves(*of, [*self.shell_contacts, *self.tees]))
+        return SymmetryBreakingWaves(Waves(*of, [*self.shell_contacts, *self.tees]))
 
     @property
     def waves(self) -> Waves:
@@ -367,7 +367,9 @@ class MeridianModel(Thin):
         if len(free.along):
             return NOT_HELD + "move along (0, 0, 1)"
         if len(free.across):
-            turns_alone = len(free.across) == 1 and np.abs(free.across[0][2::3]).max() > SMALL_RISE
+            turns_alone = (
+                len(free.across) == 1 and np.abs(free.across[0][2::3]).max() > AXIAL_TOLERANCE
+            )
             return NOT_HELD + ("turn" if turns_alone else "move along (1, 0, 0)")
         return ""
 
@@ -376,7 +378,7 @@ class MeridianModel(Thin):
         return self._seen[point](u)
 
     def probe(self, point: str) -> Array:
-        """See `Observed`."""
+        """See `ModelBase`."""
         return self._seen[point].rows(self.system.size)
 
     def _pressed(self) -> EdgePressure:

@@ -17,9 +17,9 @@ from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.domains import Carrier, Energy, Facets
+from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets
 from magshell_fenicsx.models.shell import spatial_fields
-from magshell_fenicsx.models.shell.formula_projection import Cells
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.parts.bodies.body_contact import Pressing, Region
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class Observed:
+class ModelBase:
     """The observations that a path is a table of; a model sets the attributes.
 
     Attributes
@@ -95,7 +95,7 @@ class Observed:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
-    shell_contacts: "Sequence[Touching] | Sequence[MeridianTouching]" = ()
+    shell_contacts: "Sequence[SurfaceContact] | Sequence[MeridianContact]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: PlacementAmplitudes | None = None
@@ -270,7 +270,7 @@ class Observed:
         return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
 
 
-class Thin(Observed):
+class ThinModel(ModelBase):
     """What a mid-surface and a meridian have in common.
 
     Attributes
@@ -302,7 +302,7 @@ class Thin(Observed):
         return energies
 
     @property
-    def carrier(self) -> Carrier:
+    def carrier(self) -> IntegrationDomain:
         """Where its densities are integrated."""
         return self.factory.carrier
 
@@ -315,10 +315,10 @@ class Thin(Observed):
         over = self.carrier.over_area()
         return lambda f: self.carrier.whole * over(f)
 
-    def cells_of_fields(self) -> Cells:
+    def cells_of_fields(self) -> CellGeometry:
         """Where fields are given by formulas."""
-        return spatial_fields.cells_of(self.r0)
+        return spatial_fields.cell_geometry(self.r0)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
         """Places and normals at some places of the reference cell, in all cells."""
-        return spatial_fields.places(self.r0, nodes)
+        return spatial_fields.positions_and_normals(self.r0, nodes)

@@ -23,19 +23,25 @@ from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.parts.supports.supports import rigid_motions
-from magshell_fenicsx.shells.mass import Model, mass_matrix, of_displacements, of_waves, weight
+from magshell_fenicsx.shells.mass import (
+    Model,
+    mass_matrix,
+    displacement_product,
+    wave_product,
+    mass_factor,
+)
 from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.sector_modes import UnfoldedModes
+from magshell_fenicsx.shells.sector_modes import SectorModes
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
-EXCLUDED = (
+SYMMETRY_BREAKING_LABELS = (
     "antisymmetric",
     "m = ",
 )  # what labels of modes begin with that a reduced model does not see
 
 
 @dataclass(frozen=True)
-class Seen:
+class ModeSpace:
     """The model in whose space all modes of a shell are, with those that it excludes: of a sector
     its half.
 
@@ -53,12 +59,16 @@ class Seen:
         return State(self.of(state.u), dict(state.mu))
 
 
-def seen_on(model: Model) -> Seen:
+def mode_space(model: Model) -> ModeSpace:
     """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked;
     collective.
     """
     modes = None if isinstance(model, MeridianModel) else model.excluded_modes
-    return Seen(modes.half, modes.unfolded) if isinstance(modes, UnfoldedModes) else Seen(model)
+    return (
+        ModeSpace(modes.half, modes.unfolded)
+        if isinstance(modes, SectorModes)
+        else ModeSpace(model)
+    )
 
 
 @dataclass(frozen=True)
@@ -175,7 +185,7 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.null_vector`.
         """
-        label = label if label.startswith(EXCLUDED) else ""
+        label = label if label.startswith(SYMMETRY_BREAKING_LABELS) else ""
         family = next(family for family in _families(self.model) if family.label == label)
         return null_vector(family.tangent(state))
 
@@ -195,9 +205,9 @@ def _families(
     If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
     `rest` is the undeformed state of a shell that is not held, whose rigid motions are counted.
     """
-    of_mass = weight(model) if vibrating else None
+    of_mass = mass_factor(model) if vibrating else None
     factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
-    mass = f"{name}mass", of_displacements(model, factor)
+    mass = f"{name}mass", displacement_product(model, factor)
 
     def of(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
         return _Family(
@@ -215,7 +225,7 @@ def _families(
         around: list[Vector] = [*free.around] if free else []
         yield of("", model.system, along)
         waves = model.excluded_modes.waves
-        wave_mass = f"{name}wave mass", of_waves(model, factor)
+        wave_mass = f"{name}wave mass", wave_product(model, factor)
         if vibrating:
             yield _Family(
                 TORSION,

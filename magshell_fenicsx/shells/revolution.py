@@ -7,7 +7,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.shell.spatial_fields import places
+from magshell_fenicsx.models.shell.spatial_fields import positions_and_normals
 from magshell_fenicsx.shells.meridian import MeridianModel
 
 Array = NDArray[np.float64]
@@ -179,5 +179,5 @@ def _revolved(values: Array) -> Array:
 def nodal_normals(r0: fem.Function) -> Array:
     """Unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
     normals = np.zeros((len(r0.x.array) // 2, 3))
-    np.add.at(normals, r0.function_space.dofmap.list, places(r0)[1])
+    np.add.at(normals, r0.function_space.dofmap.list, positions_and_normals(r0)[1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])

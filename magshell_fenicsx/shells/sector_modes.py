@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-SEEN = 1e-3  # in lengths: a state that differs less around e3 is axisymmetric
+AXISYMMETRY_TOLERANCE = 1e-3  # in lengths: a state that differs less around e3 is axisymmetric
 
 
-class UnfoldedModes:
+class SectorModes:
     """Numbers of the unstable modes that a sector excludes.
 
     Parameters
@@ -129,4 +129,4 @@ class UnfoldedModes:
         np.add.at(count, dofs, 1.0)
         t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]
         t = modes.system.zero_at_supports(t.ravel()[: system.size])
-        return t if max_abs(system.comm, t) > SEEN * system.length else None
+        return t if max_abs(system.comm, t) > AXISYMMETRY_TOLERANCE * system.length else None

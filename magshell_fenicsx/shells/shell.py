@@ -28,20 +28,25 @@ from magshell_fenicsx.mesh.mirror import (
     Sector,
 )
 from magshell_fenicsx.mesh.patch import Deviation, Embedding, MeshError
-from magshell_fenicsx.models.domains import on_surface
+from magshell_fenicsx.models.domains import surface_domain
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
+from magshell_fenicsx.models.shell.edges import FOLD_ANGLE, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
-from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
+from magshell_fenicsx.models.shell.fast_tangent import FastTangent, hessian_integrals
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     Force,
-    Held,
+    HeldComponents,
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.spatial_fields import carried, cells_of, field_of_place, places
+from magshell_fenicsx.models.shell.spatial_fields import (
+    user_field_polynomials,
+    cell_geometry,
+    formula_field,
+    positions_and_normals,
+)
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.load_vectors import (
@@ -73,15 +78,15 @@ from magshell_fenicsx.parts.supports.supports import (
     put_in_plane,
     refuse_unknown,
 )
-from magshell_fenicsx.shells.model_base import Thin
+from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
-from magshell_fenicsx.shells.sector_modes import UnfoldedModes
+from magshell_fenicsx.shells.sector_modes import SectorModes
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 
 
-class ShellModel(Thin):
+class ShellModel(ThinModel):
     """A Koiter shell on a mid-surface.
 
     Parameters
@@ -109,7 +114,7 @@ class ShellModel(Thin):
     Attributes
     ----------
     system, multiplicity, normals, loads, load_size, supports
-        See `Observed`.
+        See `ModelBase`.
     kernels
         Names and compile time of the forms in use.
     thickness
@@ -157,21 +162,23 @@ class ShellModel(Thin):
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
-        in_cells = cells_of(self.r0)
+        in_cells = cell_geometry(self.r0)
         for name, laminate in material.every_laminate.items():
             cells = midsurface.patches[name] if name else slice(None)
-            laminate.refuse_normal(places(self.r0)[1][cells], midsurface.mesh.comm)
+            laminate.refuse_normal(positions_and_normals(self.r0)[1][cells], midsurface.mesh.comm)
         for name in ("magnetic", "remanence"):
             if (field := getattr(loads, name)) and field.given:
-                vectors = carried(field.given, midsurface, in_cells)
+                vectors = user_field_polynomials(field.given, midsurface, in_cells)
                 loads = replace(loads, **{name: replace(field, remanent=vectors)})
-        of_place = partial(field_of_place, self.r0)
+        of_place = partial(formula_field, self.r0)
         loads = self.loads = replace(
             loads,
             own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own),
         )
         if thickness and thickness.given:
-            thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
+            thickness = replace(
+                thickness, carried=user_field_polynomials(thickness.given, midsurface, in_cells)
+            )
         self.sigma = default_penalty(degree) if sigma is None else sigma
         for name in [
             name for name, c in conditions.items() if c == "plane" and not midsurface.from_mesh_file
@@ -192,12 +199,14 @@ class ShellModel(Thin):
             cells = midsurface.mesh.topology.index_map(2)
             count = cells.size_local + cells.num_ghosts
             grown = loads.natural.on(
-                midsurface.patches, count, lambda given: carried(given, midsurface, in_cells)
+                midsurface.patches,
+                count,
+                lambda given: user_field_polynomials(given, midsurface, in_cells),
             )
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
-        folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD
-        carrier = on_surface(self.r0, self.growing and self.growing.initial_placement)
+        folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD_ANGLE
+        carrier = surface_domain(self.r0, self.growing and self.growing.initial_placement)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
         creases = Creases.of(loads.joints, midsurface) if loads.joints else None
         pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
@@ -239,7 +248,9 @@ class ShellModel(Thin):
         self.supports: dict[str, Support] = {}
         on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
-            components = condition.components if isinstance(condition, Held) else (0, 1, 2)
+            components = (
+                condition.components if isinstance(condition, HeldComponents) else (0, 1, 2)
+            )
             if condition in ("free", "symmetry"):
                 continue
             if condition == "plane":
@@ -332,10 +343,10 @@ class ShellModel(Thin):
             terms += meeting
         self.shell_contacts = meeting
         if loads.joints or midsurface.t_junctions:
-            from magshell_fenicsx.shells.t_junctions import tees
+            from magshell_fenicsx.shells.t_junctions import t_junction_terms
 
-            terms += tees(self)
-        self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
+            terms += t_junction_terms(self)
+        self._sites = hessian_integrals(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:
             in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
@@ -351,7 +362,7 @@ class ShellModel(Thin):
         if self.moving:
             near = (
                 self.moving.cells,
-                make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells),
+                hessian_integrals(self.r0, degree, terms, self.kernels, chosen=self.moving.cells),
             )
         fast = FastTangent(self.u, self._sites, held + mirrored, near)
         dense = [term for term in terms if isinstance(term, ShellTerm)]
@@ -399,7 +410,7 @@ class ShellModel(Thin):
             interacting.refuse_near()  # now that all is there which it reads
 
     @cached_property
-    def excluded_modes(self) -> AntisymmetricModes | UnfoldedModes | None:
+    def excluded_modes(self) -> AntisymmetricModes | SectorModes | None:
         """The modes that a half model or a sector does not see; None for a whole one.
 
         Compiles kernels.
@@ -407,13 +418,13 @@ class ShellModel(Thin):
         if self.multiplicity == 1:
             return None
         if isinstance(self.mirror, Sector):
-            return UnfoldedModes(self, self._as_half)
+            return SectorModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [
             support_along(self.V, 1, self._on_mirror, along)
             for along in self.mirror.in_plane_vectors
         ]
-        sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        sites = self._sites + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]

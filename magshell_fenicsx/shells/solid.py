@@ -26,15 +26,15 @@ from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyM
 from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.formula_projection import Cells
-from magshell_fenicsx.models.shell.own_term import ByPlace
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry
+from magshell_fenicsx.models.shell.own_term import FormulaParameter
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.spatial_fields import (
     ByPatch,
     Components,
-    cells_of_body,
+    body_cell_geometry,
     field_in_body,
-    places_in_body,
+    body_positions_and_normals,
 )
 from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.forces.load_vectors import assemble_dead_loads
@@ -51,15 +51,15 @@ from magshell_fenicsx.parts.supports.support_motion import (
     pressed_edges,
 )
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
-from magshell_fenicsx.shells.model_base import Observed
-from magshell_fenicsx.shells.solid_hessians import make_sites
-from magshell_fenicsx.shells.solid_terms import Density, TermFactory
+from magshell_fenicsx.shells.model_base import ModelBase
+from magshell_fenicsx.shells.solid_hessians import body_hessian_integrals
+from magshell_fenicsx.shells.solid_terms import SolidDensity, TermFactory
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
 
 
-class SolidModel(Observed):
+class SolidModel(ModelBase):
     """A neo-Hookean, hard-magnetic body around a mid-surface.
 
     Parameters
@@ -115,7 +115,7 @@ class SolidModel(Observed):
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
 
-        def of_place(parameter: ByPlace) -> fem.Function:
+        def of_place(parameter: FormulaParameter) -> fem.Function:
             return field_in_body(
                 Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1
             )
@@ -128,7 +128,10 @@ class SolidModel(Observed):
             for n, c in conditions.items()
             if n in body.faces and c not in ("free", "clamped", *MIRRORS)
         )
-        free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
+        free, growing = (
+            dict[str, fem.Constant](),
+            dict[str, Callable[[SolidDensity], SolidDensity]](),
+        )
         if loads.natural:
             shape = body_shape(loads.natural, body, V, free)
             growing["grown"] = lambda density: grown_in_body(density, shape)
@@ -176,7 +179,7 @@ class SolidModel(Observed):
             self._terms += [factory.own(term, name) for term in potentials(dead)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
-        self._sites = make_sites(body, self.r0, self._terms, self.kernels)
+        self._sites = body_hessian_integrals(body, self.r0, self._terms, self.kernels)
         at_edges = None
         if closed:
             in_planes = {name for name, c in conditions.items() if c in MIRRORS}
@@ -207,15 +210,15 @@ class SolidModel(Observed):
         """The integral over the undeformed volume of what is modelled."""
         return lambda f: f * ufl.dx(domain=self.V.mesh)
 
-    def cells_of_fields(self) -> Cells:
+    def cells_of_fields(self) -> CellGeometry:
         """Where fields are given by formulas."""
-        return cells_of_body(self.V)
+        return body_cell_geometry(self.V)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
         """The nodes of every cell, whatever is asked for, and the normals of the surface at their
         height.
         """
-        return places_in_body(self.V)
+        return body_positions_and_normals(self.V)
 
     def chart(self) -> Array:
         """Coordinates (n, 3) of this rank's nodes: the chart's and the height in the thickness."""
@@ -250,7 +253,7 @@ class SolidModel(Observed):
         if moving:
             near = (
                 moving.cells,
-                make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells),
+                body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, moving.cells),
             )
         fast = FastTangent(self.u, self._sites, held, near)
         parameters: dict[str, FreeParameter] = {
@@ -294,7 +297,7 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
     return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])
 
 
-def grown_in_body(density: Density, shape: Shape) -> Density:
+def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
     """A density that takes a `growth`, of that shape."""
 
     def of(*arguments: Expr) -> Expr:

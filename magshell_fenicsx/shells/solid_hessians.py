@@ -31,7 +31,7 @@ from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, par
 from magshell_fenicsx.shells.solid_terms import SolidTerm
 
 Array = NDArray[np.float64]
-PARTS = 4  # value and three reference derivatives
+JET_PARTS = 4  # value and three reference derivatives
 # where the numbers that a density wants at a point begin: in the body those of X, of the inverse of
 # dX/dxi, and its determinant; at ends the area in its place, then n and t; on the outer face there
 # is X's jet alone
@@ -39,7 +39,7 @@ INVERSE, MEASURE, NORMAL, TANGENT = 3, 12, 13, 16
 SIZES = {"body": 13, "outer": 12, "end": 19}
 
 
-class Site:
+class BodyHessianIntegral:
     """Where some terms live with the same quadrature.
 
     Parameters
@@ -75,17 +75,17 @@ class Site:
         self._geometry = [
             _geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches
         ]
-        self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * PARTS)
+        self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * JET_PARTS)
         self._hessians = {}
         self._pairs: dict[str, BlockPairs] = {}
         self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
         for term in terms:
             pairs = BlockPairs(tuple(combinations_with_replacement(term.density.parts, 2)))
-            z = self._points.field(3 * PARTS) if term.density.work else self._u
+            z = self._points.field(3 * JET_PARTS) if term.density.work else self._u
             W = self._density(term, z)
             self._pairs[term.name] = pairs
             self._hessians[term.name] = point_hessian(
-                term.name, W, z, PARTS, pairs, log, at_zero=z is not self._u
+                term.name, W, z, JET_PARTS, pairs, log, at_zero=z is not self._u
             )
         wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.within_side})
         self._coupled = BlockPairs(tuple(wanted))
@@ -98,7 +98,7 @@ class Site:
         same: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices to `same`; see `models.shell.element_hessians.Site.add`."""
+        """Add the terms' element matrices to `same`; see `models.shell.element_hessians.HessianIntegral.add`."""
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:
@@ -144,7 +144,7 @@ class Site:
                 of(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
         by_reference = ufl.as_matrix(
-            [[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)]
+            [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
         frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.where == "end" else []
@@ -152,13 +152,13 @@ class Site:
         return second(W) * g[MEASURE]
 
 
-def make_sites(
+def body_hessian_integrals(
     body: BodyMesh,
     X: fem.Function,
     terms: Sequence[Term],
     log: KernelLog,
     chosen: NDArray[np.bool_] | None = None,
-) -> list[Site]:
+) -> list[BodyHessianIntegral]:
     """The sites of the terms that have a tangent, one for each quadrature, on all or some local
     cells. Collective.
     """
@@ -172,7 +172,7 @@ def make_sites(
         of_degree = [
             t for t in nonlinear if t.density.where == "body" and t.density.degree == degree
         ]
-        sites.append(Site(X, counted, _rule(V, points, w), of_degree, log))
+        sites.append(BodyHessianIntegral(X, counted, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
         if term.density.where == "body":
             continue
@@ -182,7 +182,7 @@ def make_sites(
             rule = _rule(V, _on_facet(points, facet), w)
             at_facet = around[numbers == facet]
             counted = at_facet if chosen is None else at_facet[chosen[at_facet]]
-            sites.append(Site(X, counted, rule, [term], log, facet))
+            sites.append(BodyHessianIntegral(X, counted, rule, [term], log, facet))
     return sites
 
 
@@ -216,7 +216,7 @@ def _cells_at(
 
 def _geometry(jets: Array, where: str, facet: int | None) -> Array:
     """(points, SIZES[where]) from the placement's jets; dX/dxi and n and t by rows."""
-    flat = jets.reshape(-1, PARTS, 3)
+    flat = jets.reshape(-1, JET_PARTS, 3)
     if where == "outer":
         return flat.reshape(-1, SIZES[where])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives

@@ -22,7 +22,7 @@ from magshell_fenicsx.mesh.hexahedra import (
     face_measure,
 )
 from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
-from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
+from magshell_fenicsx.models.shell.kinematics import ALL_DERIVATIVES, SECOND_DERIVATIVES, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.spatial_fields import field_in_body, radial
 from magshell_fenicsx.models.solid import body_densities
@@ -33,7 +33,7 @@ from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, M
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
-REDUCED = 3  # quadrature degree: two points in each direction
+REDUCED_QUADRATURE_DEGREE = 3  # quadrature degree: two points in each direction
 VALUE, GRADIENT, ON_FACE = (
     (0,),
     (1, 2, 3),
@@ -41,11 +41,11 @@ VALUE, GRADIENT, ON_FACE = (
 )  # parts of a displacement's jet: value, reference derivatives
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
-ROUNDING = 1e-9
+HEIGHT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class Density:
+class SolidDensity:
     """The one source of a term's form and of its point Hessians.
 
     Attributes
@@ -86,7 +86,7 @@ class Density:
         )
 
 
-class SolidTerm(DensityTerm[Density]):
+class SolidTerm(DensityTerm[SolidDensity]):
     """A term of a solid."""
 
 
@@ -104,7 +104,9 @@ class TermFactory:
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
-    grown: Callable[[Density], Density] = lambda density: density  # takes the body's natural shape
+    grown: Callable[[SolidDensity], SolidDensity] = lambda density: (
+        density
+    )  # takes the body's natural shape
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
     saturated: list[PointField] = field(
@@ -121,7 +123,7 @@ class TermFactory:
         return [
             self._bulk(
                 name,
-                self.grown(Density(density, self._constants(part * shear, self.h))),
+                self.grown(SolidDensity(density, self._constants(part * shear, self.h))),
                 group="distortion",
             )
             for name, (density, part) in of.items()
@@ -139,7 +141,11 @@ class TermFactory:
         parameters = self._constants(self.material.bulk, self.h)
         return self._bulk(
             "compression",
-            self.grown(Density(body_densities.compression, parameters, degree=REDUCED)),
+            self.grown(
+                SolidDensity(
+                    body_densities.compression, parameters, degree=REDUCED_QUADRATURE_DEGREE
+                )
+            ),
         )
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
@@ -163,7 +169,7 @@ class TermFactory:
         """What the field makes of a soft body, see `EnergyFactory.soft`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
         law, n0, *given = self._of_sheet(sheet, soft, applied)
-        density = Density(sheet.energy_in_solid, (law, scale, n0, h, *given), VALUE + GRADIENT)
+        density = SolidDensity(sheet.energy_in_solid, (law, scale, n0, h, *given), VALUE + GRADIENT)
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
@@ -174,9 +180,9 @@ class TermFactory:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
         law, n0, *given = self._of_sheet(sheet, field.soft, applied)
-        densities = {"volume": Density(lambda X, u, H, one: one, self._constants(1.0))}
+        densities = {"volume": SolidDensity(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            densities[axis] = Density(
+            densities[axis] = SolidDensity(
                 sheet.induced_in_solid, (law, *self._constants(e), n0, *given)
             )
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
@@ -242,7 +248,7 @@ class TermFactory:
             else self._constants(pattern)[0]
         )
         if field:
-            density = Density(
+            density = SolidDensity(
                 law.magnetic_in_space,
                 (Br, field.polynomial, *self._constants(self.h)),
                 VALUE + GRADIENT,
@@ -255,7 +261,7 @@ class TermFactory:
         ]
         terms = []
         for amplitude, suffix, Ba in directions:
-            density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
+            density = SolidDensity(law.magnetic, (Br, *self._constants(Ba, self.h)))
             of_field = self._bulk(
                 "magnetic" + suffix,
                 density,
@@ -266,7 +272,7 @@ class TermFactory:
             )
             terms.append(of_field)
         if of.gradient is not None:
-            density = Density(
+            density = SolidDensity(
                 law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT
             )
             terms.append(self._bulk("magnetic gradient", density, "lambda_m", column="magnetic"))
@@ -320,26 +326,30 @@ class TermFactory:
             for column, of in term.observed.items()
         }
 
-    def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
+    def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
         """A density of the volume, which depends on places alone."""
-        flat, count, at_point = [ufl.zero(3)] * len(CURVED), len(term.parameters), term.at_point(of)
+        flat, count, at_point = (
+            [ufl.zero(3)] * len(ALL_DERIVATIVES),
+            len(term.parameters),
+            term.at_point(of),
+        )
 
         def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
             return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
 
         constants = constants_of(term, self.u.function_space.mesh, self.free)
-        return Density(at, (*constants, *self._constants(self.h)), VALUE)
+        return SolidDensity(at, (*constants, *self._constants(self.h)), VALUE)
 
-    def _over_body(self, density: Density) -> ufl.Form:
+    def _over_body(self, density: SolidDensity) -> ufl.Form:
         dx = ufl.Measure(
             "dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree}
         )
         X, H = ufl.SpatialCoordinate(self.body.mesh), ufl.grad(self.u)
         return density.of(X, self.u, H, *density.parameters) * dx
 
-    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
+    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
-        flat = [ufl.zero(3)] * len(SECOND)
+        flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
         def on_face(
             X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr
@@ -349,7 +359,7 @@ class TermFactory:
             )
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
-        return Density(
+        return SolidDensity(
             on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER_FACE]
         )
 
@@ -366,7 +376,7 @@ class TermFactory:
         body = self.body
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
         parameters = (weight, *self._constants(intensity), past)
-        density = Density(
+        density = SolidDensity(
             body_densities.turning, parameters, where="end", facets=self.body.faces[edge]
         )
         term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
@@ -380,7 +390,7 @@ class TermFactory:
 
     def _enclosing(
         self, unit: float, origin: Array | None, *, potential: bool = True
-    ) -> dict[str, Density]:
+    ) -> dict[str, SolidDensity]:
         """p times the change of the volume under the outer face, down to the middle line where an
         end is hinged.
         """
@@ -389,15 +399,20 @@ class TermFactory:
             unit, *([origin] if origin is not None and origin.any() else [])
         )
         of, on_end = (
-            (body_densities.swept, body_densities.swept_end)
+            (body_densities.swept_volume, body_densities.swept_volume_on_end)
             if moved
             else (body_densities.pressure, body_densities.sealing)
         )
         work, end_work = (
-            (None, None) if potential else (body_densities.following, body_densities.following_end)
+            (None, None)
+            if potential
+            else (
+                body_densities.follower_pressure_work,
+                body_densities.follower_pressure_work_on_end,
+            )
         )
         of_faces = {
-            "pressure": Density(
+            "pressure": SolidDensity(
                 of, parameters, ON_FACE, QUADRATURE_DEGREE, "outer", faces[OUTER_FACE], work=work
             )
         }
@@ -406,14 +421,14 @@ class TermFactory:
             links = self.body.mesh.topology.connectivity(2, 3)
             low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
             parts = {
-                "whole": low > MIDSURFACE_HEIGHT - ROUNDING,
-                "upper": (low < MIDSURFACE_HEIGHT - ROUNDING)
-                & (high > MIDSURFACE_HEIGHT + ROUNDING),
+                "whole": low > MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE,
+                "upper": (low < MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE)
+                & (high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE),
             }
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
                     facets_of_part, upper = facets[inside], name == "upper"
-                    of_faces[f"pressure {name}"] = Density(
+                    of_faces[f"pressure {name}"] = SolidDensity(
                         on_end,
                         parameters,
                         VALUE + GRADIENT,
@@ -428,7 +443,7 @@ class TermFactory:
     def _bulk(
         self,
         name: str,
-        density: Density,
+        density: SolidDensity,
         amplitude: str | None = None,
         *,
         linear: bool = False,
@@ -440,7 +455,7 @@ class TermFactory:
         term.group, term.column = group or name, column
         return term
 
-    def _on_faces(self, densities: Sequence[Density], v: Expr | None = None) -> ufl.Form:
+    def _on_faces(self, densities: Sequence[SolidDensity], v: Expr | None = None) -> ufl.Form:
         """The sum of energies, or of virtual works of v."""
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)

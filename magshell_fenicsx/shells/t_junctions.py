@@ -2,7 +2,7 @@
 
 Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied
 to the places of the other mid-surface at which they are undeformed. So the edge follows the other
-shell, whose own displacements stay free: cells need not meet. Both ties are springs, `TIGHT` times
+shell, whose own displacements stay free: cells need not meet. Both ties are springs, `TIE_STIFFNESS_RATIO` times
 as stiff as an element beside them. With n of the edge's cell and m of the other shell, t along the
 edge, s = t . (n x m) and c = n . m:
 
@@ -46,21 +46,21 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
-TIGHT = 1e4  # stiffness of a tie over that of an element
-NEAR = 2e-9  # of a parameter: rounding
-APART = (
+TIE_STIFFNESS_RATIO = 1e4  # stiffness of a tie over that of an element
+PARAMETER_TOLERANCE = 2e-9  # of a parameter: rounding
+MAX_DISTANCE_IN_THICKNESSES = (
     0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
 )
-SIDES = np.array([[1, 2], [0, 2], [0, 1]])
+SIDE_CORNERS = np.array([[1, 2], [0, 2], [0, 1]])
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-AROUND = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
-PARTS = 12  # of both tangents of both shells at a point
+CELL_RADIUS_FACTOR = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
+TANGENT_COMPONENTS = 12  # of both tangents of both shells at a point
 AROUND_E3 = np.array(
     [[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]]
 )  # (U, W) -> vector and its derivative
 
 
-class Tie:
+class TieTerm:
     """Points of an edge tied to places of another shell: an `assembly.terms.Term` and
     `assembly.nonlocal_terms.NonlocalTerm`.
 
@@ -104,7 +104,10 @@ class Tie:
         )
         self._turns = bool(joint.rigid or joint.stiffness)
         self._points = PointStorage(max(len(unknowns), 1))
-        self._present, self._moved = self._points.field(PARTS), self._points.field(PARTS)
+        self._present, self._moved = (
+            self._points.field(TANGENT_COMPONENTS),
+            self._points.field(TANGENT_COMPONENTS),
+        )
         # direction along the edge, sine and cosine of the placement, stiffness
         self._fixed = fixed = self._points.field(5)
         angle = _angle(self._present, self._moved, fixed)
@@ -171,8 +174,8 @@ class Tie:
             global_values(self._u),
         )
         if self._turns and len(H):
-            of_parts = np.zeros((len(H), PARTS, PARTS))
-            upper = np.triu_indices(PARTS)
+            of_parts = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
+            upper = np.triu_indices(TANGENT_COMPONENTS)
             of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at(
                 "hessian", u
             )
@@ -188,13 +191,13 @@ class Tie:
         all nodes.
         """
         count = len(self._unknowns)
-        self._present.x.array[: count * PARTS] = (
+        self._present.x.array[: count * TANGENT_COMPONENTS] = (
             self._placed + self._times(self._tangents, u)
         ).ravel()
         return np.array(self._points.evaluate(self._kernels[kernel], count))
 
 
-class Tee(Tie):
+class SurfaceTJunction(TieTerm):
     """The junction of two surfaces.
 
     Parameters
@@ -224,7 +227,7 @@ class Tee(Tie):
         material: Material,
         log: KernelLog,
     ) -> None:
-        surfaces = Surfaces.of(r0)
+        surfaces = MidSurfaces.of(r0)
         at = surfaces.foot_of(foot, on)
         at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
         nodes = surfaces.cells.nodes
@@ -243,9 +246,9 @@ class Tee(Tie):
             u,
             (3 * both[:, :, None] + np.arange(3)).reshape(len(at.x), count),
             np.einsum("nk,cd->nckd", beta, axes).reshape(len(at.x), 3, count),
-            np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), PARTS, count),
+            np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), TANGENT_COMPONENTS, count),
             at.along,
-            _stiff(
+            _tie_stiffness(
                 joint,
                 material,
                 np.maximum(of_cells[at.cell], of_cells[at.other_cell]),
@@ -257,7 +260,7 @@ class Tee(Tie):
 
 
 @dataclass(frozen=True)
-class Foot:
+class EdgeOnShell:
     """Points (n, 3) of an edge, and the places of another shell that are nearest to them.
 
     Attributes
@@ -299,7 +302,7 @@ class Foot:
             On every rank, with the place and how far it is.
         """
         _refuse_apart(comm, self.apart, self.x, h, key, joint)
-        if min(comm.allgather(self.clearance)) < APART * h:
+        if min(comm.allgather(self.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
             foot, other = joint.edges
             raise MeshError(
                 f"{key}: the shell of the edge {foot} lies in the mid-surface of {other}, where both take the same "
@@ -308,7 +311,7 @@ class Foot:
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class MidSurfaces:
     """The undeformed mid-surfaces of all shells, whole on every rank.
 
     Attributes
@@ -336,7 +339,7 @@ class Surfaces:
         """Return (3, n, functions): shape functions at places and their derivatives."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
-    def foot_of(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> Foot:
+    def foot_of(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> EdgeOnShell:
         """Return the foot of an edge on another shell; collective.
 
         Parameters
@@ -347,7 +350,7 @@ class Surfaces:
             Which local cells are of the other shell.
         """
         first, nodes = self.cells.own_range.start, self.cells.nodes
-        cells, ends = _sides(self.V, facets, len(self.cells.own_range))
+        cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
         along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
@@ -362,7 +365,7 @@ class Surfaces:
         beside = self.r0[nodes[first + cells]]
         far = self.nearest_places(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
         clearance = float(far.max(axis=1, initial=0.0).min(initial=np.inf))
-        return Foot(cell, on_edge, x, along, weight, length, other, Y, apart, clearance)
+        return EdgeOnShell(cell, on_edge, x, along, weight, length, other, Y, apart, clearance)
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance,
@@ -377,7 +380,7 @@ class Surfaces:
         )
         nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
-        radii = AROUND * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+        radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
         near = (
             cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
         )
@@ -401,15 +404,15 @@ class Surfaces:
         return nearest, Y, apart
 
 
-class MeridianTee(Tie):
-    """The junction of two meridians, which are `Tie`d at one point.
+class MeridianTJunction(TieTerm):
+    """The junction of two meridians, which are `TieTerm`d at one point.
 
     Parameters
     ----------
     tied
         The parameters of both.
     stiffness
-        See `Tee`.
+        See `SurfaceTJunction`.
     """
 
     def __init__(
@@ -425,16 +428,18 @@ class MeridianTee(Tie):
     ) -> None:
         V = r0.function_space
         ends, dofs = _ends_of_cells(V), V.dofmap.list
-        cells, self._shapes = _rings(V, tied)
+        cells, self._shapes = _parallels(V, tied)
         self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
         nodal = r0.x.array.reshape(-1, 2)
-        rho = _refuse_rings_apart(r0, tied, material.h, key, joint)
+        rho = _refuse_parallels_apart(r0, tied, material.h, key, joint)
         foot = int(cells[0][0])
         length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(
             self._shapes[0][1] @ nodal[dofs[foot]]
         )
         stiff = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
-        ties = _stiff(joint, material, stiff, np.array([length]), 2 * np.pi * np.array([rho]))
+        ties = _tie_stiffness(
+            joint, material, stiff, np.array([length]), 2 * np.pi * np.array([rho])
+        )
         of_u = self._numbers(2), *self._maps(AROUND_E3)
         super().__init__(joint, r0, u, *of_u, np.array([[0.0, 1.0]]), ties, log)
 
@@ -468,13 +473,16 @@ def _ends_of_cells(V: fem.FunctionSpace) -> Array:
     return np.asarray(V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0])
 
 
-def _rings(
+def _parallels(
     V: fem.FunctionSpace, tied: tuple[float, float]
 ) -> tuple[list[Longs], list[tuple[Array, Array]]]:
     """Return the cells at both parameters of a junction, with their shape functions there and
     slopes, all in one row."""
     ends, shapes = _ends_of_cells(V), []
-    inside = [(ends.min(axis=1) < s + NEAR) & (s - NEAR < ends.max(axis=1)) for s in tied]
+    inside = [
+        (ends.min(axis=1) < s + PARAMETER_TOLERANCE) & (s - PARAMETER_TOLERANCE < ends.max(axis=1))
+        for s in tied
+    ]
     cells = [
         np.flatnonzero(of) for of in inside
     ]  # a place on a vertex is tied to by the mean of two cells
@@ -487,7 +495,7 @@ def _rings(
     return cells, shapes
 
 
-def _refuse_rings_apart(
+def _refuse_parallels_apart(
     r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint
 ) -> float:
     """Return the radius of the ring of an edge, which must be on the other shell.
@@ -498,7 +506,7 @@ def _refuse_rings_apart(
         If it is not.
     """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
-    cells, shapes = _rings(V, tied)
+    cells, shapes = _parallels(V, tied)
     (rho, z), other = (
         N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True)
     )
@@ -507,7 +515,7 @@ def _refuse_rings_apart(
     return float(rho)
 
 
-def refuse_misplaced_rings(
+def refuse_misplaced_parallels(
     joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float
 ) -> None:
     """See that the edges of T-junctions are on the other shell, as a model of the meridian does.
@@ -519,7 +527,7 @@ def refuse_misplaced_rings(
     """
     for i, (joint, s, of) in enumerate(zip(joints, meridian.tied, meridian.joints, strict=True)):
         if of is None:
-            _refuse_rings_apart(r0, s, h, f"joints.{i}.edges", joint)
+            _refuse_parallels_apart(r0, s, h, f"joints.{i}.edges", joint)
 
 
 def _entries(unknowns: Longs, H: Array) -> Entries:
@@ -527,23 +535,25 @@ def _entries(unknowns: Longs, H: Array) -> Entries:
     return rows.ravel(), columns.ravel(), H.ravel()
 
 
-def _stiff(joint: Joint, material: Material, factors: Array, length: Array, weight: Array) -> Array:
+def _tie_stiffness(
+    joint: Joint, material: Material, factors: Array, length: Array, weight: Array
+) -> Array:
     """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
     of that length.
     """
     turned = (
-        TIGHT * factors[:, 1] * material.bending_stiffness / length
+        TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
         if joint.rigid
         else joint.stiffness
     )
-    return np.column_stack([weight * TIGHT * factors[:, 0] / length, weight * turned])
+    return np.column_stack([weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turned])
 
 
 def _refuse_apart(comm: MPI.Comm, apart: Array, x: Array, h: float, key: str, joint: Joint) -> None:
     worst = int(apart.argmax()) if len(apart) else -1
     of_rank = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
     far, place = max(comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0])
-    if far > APART * h:
+    if far > MAX_DISTANCE_IN_THICKNESSES * h:
         foot, other = joint.edges
         by = f"by {far:.4g} R" if np.isfinite(far) else "by more than a cell"
         raise MeshError(
@@ -552,7 +562,7 @@ def _refuse_apart(comm: MPI.Comm, apart: Array, x: Array, h: float, key: str, jo
         )
 
 
-def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
+def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
     """Local cells of this rank that have boundary facets, and both ends (n, 2, 2) of each in the
     reference cell.
     """
@@ -565,7 +575,9 @@ def _sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple
         cell = int(to_cell.links(facet)[0])
         if cell < owned:
             cells.append(cell)
-            ends.append(CORNERS[SIDES[int(np.flatnonzero(to_facet.links(cell) == facet)[0])]])
+            ends.append(
+                CORNERS[SIDE_CORNERS[int(np.flatnonzero(to_facet.links(cell) == facet)[0])]]
+            )
     return np.array(cells, dtype=np.int64), np.array(ends).reshape(-1, 2, 2)
 
 
@@ -584,7 +596,7 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
-def _tee_joints(
+def _t_junction_joints(
     joints: Sequence[Joint], surface: Midsurface
 ) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
     """Return the joints that are T-junctions, with their keys and which cells of this rank the
@@ -604,7 +616,7 @@ def _tee_joints(
     ]
 
 
-def refuse_misplaced_feet(
+def refuse_misplaced_edges(
     joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float
 ) -> None:
     """See that the edges of T-junctions are on the other shell, as a model does; collective.
@@ -614,8 +626,8 @@ def refuse_misplaced_feet(
     MeshError
         On every rank, with the edge.
     """
-    tied = _tee_joints(joints, surface)
-    surfaces = Surfaces.of(r0) if tied else None
+    tied = _t_junction_joints(joints, surface)
+    surfaces = MidSurfaces.of(r0) if tied else None
     for joint, key, on in tied:
         assert surfaces
         surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(
@@ -623,31 +635,35 @@ def refuse_misplaced_feet(
         )
 
 
-def tees(model: "ShellModel") -> list[Tee]:
+def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
     """The T-junctions of a model; collective."""
     surface = model.midsurface
-    tied = _tee_joints(model.loads.joints, surface)
+    tied = _t_junction_joints(model.loads.joints, surface)
     if not tied:
         return []
-    edges, factors, log = surface.edges, _factors(model), model.kernels
+    edges, factors, log = surface.edges, _stiffness_factors(model), model.kernels
     return [
-        Tee(joint, key, model.r0, model.u, edges[joint.edges[0]], on, factors, model.material, log)
+        SurfaceTJunction(
+            joint, key, model.r0, model.u, edges[joint.edges[0]], on, factors, model.material, log
+        )
         for joint, key, on in tied
     ]
 
 
-def tees_of_meridian(model: "MeridianModel") -> list[MeridianTee]:
+def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]:
     """The same of a meridian."""
-    meridian, factors, log = model.meridian, _factors(model), model.kernels
+    meridian, factors, log = model.meridian, _stiffness_factors(model), model.kernels
     tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
     return [
-        MeridianTee(joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log)
+        MeridianTJunction(
+            joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log
+        )
         for i, (joint, s, of) in tied
         if of is None
     ]
 
 
-def _factors(model: "ShellModel | MeridianModel") -> Array:
+def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
     """(cells of this rank, 2) E h and E h^3 of each over those of the first shell."""
     cells = model.V.mesh.topology.index_map(model.V.mesh.topology.dim)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))

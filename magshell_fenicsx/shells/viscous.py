@@ -21,7 +21,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.nonlocal_terms import Factors
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
-from magshell_fenicsx.models.domains import Carrier, HeldEdge
+from magshell_fenicsx.models.domains import IntegrationDomain, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -35,8 +35,10 @@ if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space
-STEP = 1e-3  # part of the thickness by which a velocity moves the shell for its rate of strain
+STRAIN_SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space
+VELOCITY_STEP_IN_THICKNESSES = (
+    1e-3  # part of the thickness by which a velocity moves the shell for its rate of strain
+)
 
 
 @dataclass(frozen=True)
@@ -95,11 +97,11 @@ class Viscosity:
     ) -> None:
         self._model, self._mu, self._branches, self.creep_time = model, dict(mu), branches, kelvin
         V, carrier = model.V, model.factory.carrier
-        Q = carrier.discontinuous(SIZE)
+        Q = carrier.discontinuous(STRAIN_SIZE)
         self._jets = carrier.tables(V, Q.element.basix_element.points)
         self._frame = TangentFrame.of(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
-        self._given = _Given(
+        self._given = _PrescribedStress(
             self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0)
         )
         works = _works(model, self._given)
@@ -113,8 +115,8 @@ class Viscosity:
             term.name for term in model.system.terms if term.column in ("stretching", "bending")
         ]
         law = model.material.law
-        self._slowing = _Slowing(model) if law.linear != law else None
-        self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
+        self._slowing = _AddedViscousTangent(model) if law.linear != law else None
+        self.memory = Memory([np.zeros((*self._places.shape, STRAIN_SIZE)) for _ in branches])
         self._first: tuple[Vector, Array] = (
             np.empty(0),
             np.empty(0),
@@ -128,7 +130,7 @@ class Viscosity:
         stress = (
             self.creep_time * self._rate(at, v)
             if self.creep_time
-            else np.zeros((*self._places.shape, SIZE))
+            else np.zeros((*self._places.shape, STRAIN_SIZE))
         )
         if self._branches:
             for branch, q, end in zip(
@@ -153,7 +155,7 @@ class Viscosity:
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
         return self.creep_time * rate + sum(
-            b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches
+            b.modulus * (_retained_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches
         )
 
     def begin(self) -> None:
@@ -185,7 +187,7 @@ class Viscosity:
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Of a stress at nodes, and of edges that open from u0 to u1."""
         given, system = self._given, self._model.system
-        self._field.x.array.reshape(-1, SIZE)[self._places] = stress
+        self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         given.stiffness.value = stiffness
         for field, displacement in ((given.before, u0), (given.after, u1)):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
@@ -198,7 +200,11 @@ class Viscosity:
         change, rate = self._change(u0, u1), self.memory.rate
         bend = 0.0 if rate is None else change / dt - rate
         return [
-            np.asarray(np.exp(-dt / b.time) * q + _share(b, dt) * change + self._bend(b, dt) * bend)
+            np.asarray(
+                np.exp(-dt / b.time) * q
+                + _retained_share(b, dt) * change
+                + self._bend(b, dt) * bend
+            )
             for b, q in zip(self._branches, self.memory.strains, strict=True)
         ]
 
@@ -207,7 +213,7 @@ class Viscosity:
         return (
             0.0
             if self.memory.rate is None
-            else _bent(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+            else _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
         )
 
     def _change(self, u0: Vector, u1: Vector) -> Array:
@@ -220,8 +226,8 @@ class Viscosity:
     def _rate(self, u: Vector, v: Vector) -> Array:
         size = max_abs(self._model.system.comm, v)
         if size == 0:
-            return np.zeros((*self._places.shape, SIZE))
-        step = STEP * self._model.material.h / size
+            return np.zeros((*self._places.shape, STRAIN_SIZE))
+        step = VELOCITY_STEP_IN_THICKNESSES * self._model.material.h / size
         return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
 
     def _strain(self, u: Vector) -> Array:
@@ -236,7 +242,7 @@ class Viscosity:
         )
 
 
-class _Slowing:
+class _AddedViscousTangent:
     """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's
     `AddedTangent`.
 
@@ -246,7 +252,7 @@ class _Slowing:
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
-        rates, v = _Rates(model), ufl.TestFunction(model.V)
+        rates, v = _StrainRates(model), ufl.TestFunction(model.V)
         self._since, whole = rates.since, model.factory.carrier.whole
         self._forms = [
             model.kernels.compile(
@@ -284,12 +290,12 @@ class _Slowing:
         return np.zeros_like(v)
 
 
-def _share(branch: Branch, dt: float) -> float:
+def _retained_share(branch: Branch, dt: float) -> float:
     """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
 
 
-def _bent(z: float) -> float:
+def _curvature_weight(z: float) -> float:
     """The integral of exp(-z (1 - s)) (s - 1/2) over a step, 0 to 1."""
     if z < 1e-2:
         return z / 12 - z**2 / 24 + z**3 / 80
@@ -297,7 +303,7 @@ def _bent(z: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Given:
+class _PrescribedStress:
     """What viscous forces depend on: stresses at nodes, and two displacements between which edges
     open, how stiffly.
     """
@@ -314,7 +320,7 @@ class _Given:
         at = self.field(side) if side else self.field
         return covariant(j, at, 0), covariant(j, at, 6)
 
-    def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
+    def opened(self, carrier: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
         after, before = (
             jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before)
@@ -322,8 +328,8 @@ class _Given:
         return self.stiffness * (after - before)
 
 
-class _Rates:
-    """What takes the place of `_Given` in the forces' derivative: strains and jumps by a change of
+class _StrainRates:
+    """What takes the place of `_PrescribedStress` in the forces' derivative: strains and jumps by a change of
     a displacement.
     """
 
@@ -332,18 +338,18 @@ class _Rates:
         self._jet = model.factory.carrier.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """See `_Given`."""
-        E, K = _strained(j, self._jet.side(side) if side else self._jet)
+        """See `_PrescribedStress`."""
+        E, K = _strains(j, self._jet.side(side) if side else self._jet)
         return ufl.derivative(E, self.since, self._change), ufl.derivative(
             K, self.since, self._change
         )
 
-    def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
-        """See `_Given`."""
+    def opened(self, carrier: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
+        """See `_PrescribedStress`."""
         return ufl.derivative(jump(carrier.j0 + self._jet), self.since, self._change)
 
 
-def _strained(j: Jet, u: Jet) -> tuple[Expr, Expr]:
+def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
     return kin.membrane_strain(j, u), kin.curvature_change(j, u)
 
 
@@ -367,7 +373,9 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
     return held_jump(r0, m, n0 if edge.turn is None else ufl.dot(edge.turn, n0))
 
 
-def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[ufl.Form]:
+def _works(
+    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+) -> list[ufl.Form]:
     """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its
     gradient are forces.
 
@@ -387,7 +395,7 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
             else of_shell.made_of(*((own(side) if side else own)[i] for i in (0, 1, 3)))
         )
 
-    E, K = _strained(r0, u)
+    E, K = _strains(r0, u)
     strain, bend = given.strain(r0, "")
     up = kin.inverse_metric(r0)
     own = law(r0)
@@ -409,7 +417,7 @@ def _works(model: "ShellModel | MeridianModel", given: _Given | _Rates) -> list[
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
         edge = kin.inverse_metric(j), (nu1, nu2), 1
         given_moment += law(j, side).edge_moment(*given.strain(j, side), *edge) / 2
-        bent += law(j, side).edge_moment(*_strained(j, v), *edge) / 2
+        bent += law(j, side).edge_moment(*_strains(j, v), *edge) / 2
         stiff += (
             law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge)
             / 2

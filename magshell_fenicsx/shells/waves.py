@@ -31,13 +31,13 @@ from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.wave_hessians import WavePoints
-from magshell_fenicsx.models.domains import Carrier, Energy
+from magshell_fenicsx.models.axisymmetric.wave_hessians import WaveHessians
+from magshell_fenicsx.models.domains import IntegrationDomain, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.t_junctions import MeridianTee
+    from magshell_fenicsx.shells.t_junctions import MeridianTJunction
 
 Array = NDArray[np.float64]
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
@@ -60,7 +60,7 @@ class Waves:
     Attributes
     ----------
     V
-        Space of the waves' coefficients (U + V, V, W); see `domains.wave`.
+        Space of the waves' coefficients (U + V, V, W); see `domains.wave_jets`.
     largest
         Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in waves of
         length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
@@ -73,27 +73,27 @@ class Waves:
         system: FiniteElementSystem,
         energies: Sequence[Energy],
         meridian: Meridian,
-        carrier: Carrier,
+        carrier: IntegrationDomain,
         supports: Supports,
         log: KernelLog,
-        touching: "Sequence[MeridianTouching | MeridianTee]" = (),
+        touching: "Sequence[MeridianContact | MeridianTJunction]" = (),
     ) -> None:
         self.touching = touching
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
         self._m = fem.Constant(V.mesh, 1.0)
         self._kept = [e for e in energies if not e.linear]
-        self._points = WavePoints(carrier, system.u, self._kept, log)
+        self._points = WaveHessians(carrier, system.u, self._kept, log)
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
-        self._look_at(most_waves(meridian, system.length))
+        self._look_at(largest_wave_number(meridian, system.length))
         self._solve_for(system)
 
     def _look_at(self, largest: int) -> None:
         self.largest = largest
         self._nodes = largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
-        self._weights = _lagrange(self._nodes, np.arange(largest + 1))
-        self._pieces = [_Piece(2, largest, self._nodes)]
+        self._weights = _lagrange_weights(self._nodes, np.arange(largest + 1))
+        self._pieces = [_WaveRange(2, largest, self._nodes)]
 
     def _solve_for(self, system: FiniteElementSystem) -> None:
         self._system, self._matrices = system, dict[str, PETSc.Mat]()
@@ -199,9 +199,9 @@ class Waves:
         return self._points.entries(factors, [float(m) for m in waves])
 
     @cached_property
-    def _bands(self) -> "list[Banded]":
+    def _bands(self) -> "list[BandedMatrices]":
         """Of m = 1, and of all others."""
-        return [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
+        return [BandedMatrices(*self._sparsity, self._rows(m)) for m in (1, 2)]
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -288,17 +288,17 @@ class Waves:
         return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
-        v, u = fem.Function(self.V), domains.revolved(self._system.u)
-        cosine, sine = domains.wave(v, self._m)
+        v, u = fem.Function(self.V), domains.revolved_jet(self._system.u)
+        cosine, sine = domains.wave_jets(v, self._m)
         return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
 
 
-def most_waves(meridian: Meridian, length: float) -> int:
+def largest_wave_number(meridian: Meridian, length: float) -> int:
     """See `Waves.largest`."""
     return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
-class _Piece:
+class _WaveRange:
     """The waves from a first to a last one.
 
     Attributes
@@ -313,15 +313,15 @@ class _Piece:
         bernstein = [
             comb(DEGREE, i) * places**i * (1 - places) ** (DEGREE - i) for i in range(DEGREE + 1)
         ]
-        values = _lagrange(nodes, first + (last - first) * places)
+        values = _lagrange_weights(nodes, first + (last - first) * places)
         self.inner = np.linalg.solve(np.stack(bernstein, axis=1), values)[1:-1]
 
-    def halves(self, nodes: NDArray[np.float64]) -> list["_Piece"]:
+    def halves(self, nodes: NDArray[np.float64]) -> list["_WaveRange"]:
         middle = round(sqrt(self.first * self.last))  # the matrices vary most at small m
-        return [_Piece(self.first, middle, nodes), _Piece(middle, self.last, nodes)]
+        return [_WaveRange(self.first, middle, nodes), _WaveRange(middle, self.last, nodes)]
 
 
-def _lagrange(
+def _lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """What the values at some nodes weigh in their polynomial's values at other places; (places,
@@ -346,7 +346,7 @@ def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class WavesOf:
+class WaveFamily:
     """The waves of one number m; a `continuation.stability_monitor.ModeFamily`."""
 
     waves: Waves
@@ -362,7 +362,7 @@ class WavesOf:
 
 
 @dataclass(frozen=True)
-class ExcludedWaves:
+class SymmetryBreakingWaves:
     """All that are looked at."""
 
     waves: Waves
@@ -370,7 +370,7 @@ class ExcludedWaves:
     @property
     def families(self) -> Sequence[ModeFamily]:
         """For a `StabilityMonitor`: every number of waves by itself."""
-        return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
+        return [WaveFamily(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
     @property
     def tangents(self) -> Waves | None:
@@ -386,7 +386,7 @@ class ExcludedWaves:
         return any(self.waves.counts(state))
 
 
-class Banded:
+class BandedMatrices:
     """Weighted sums of small symmetric matrices that share one sparsity pattern, and whether they
     are definite.
 

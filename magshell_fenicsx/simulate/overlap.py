@@ -11,11 +11,15 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.global_mesh import component_numbers
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.domains import on_meridian, on_surface
-from magshell_fenicsx.models.shell.spatial_fields import carried, cells_of
+from magshell_fenicsx.models.domains import meridian_domain, surface_domain
+from magshell_fenicsx.models.shell.spatial_fields import cell_geometry, user_field_polynomials
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.t_junctions import Surfaces, refuse_misplaced_feet, refuse_misplaced_rings
+from magshell_fenicsx.shells.t_junctions import (
+    MidSurfaces,
+    refuse_misplaced_edges,
+    refuse_misplaced_parallels,
+)
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
 MOST = 20_000  # cells in which they are looked for: some seconds
@@ -42,10 +46,16 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
-        refuse_misplaced_rings(problem.loads.joints, meridian, r0, h)
+        refuse_misplaced_parallels(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(given, r0, meridian.patches) if given else None
         curves.shell_contacts(
-            pairs, r0, fem.Function(V), meridian.patches, h, on_meridian(r0).contact_rule, thickness
+            pairs,
+            r0,
+            fem.Function(V),
+            meridian.patches,
+            h,
+            meridian_domain(r0).contact_rule,
+            thickness,
         )
         return
     from magshell_fenicsx.parts.contact.model_surface import shell_contacts
@@ -53,14 +63,16 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
     r0 = surface.placement(V)
-    refuse_misplaced_feet(problem.loads.joints, surface, r0, h)
+    refuse_misplaced_edges(problem.loads.joints, surface, r0, h)
     if problem.loads.interaction:
         _refuse_parts_in_each_other(r0, h)
     if given and given.given:
-        given = replace(given, carried=carried(given.given, surface, cells_of(r0)))
+        given = replace(
+            given, carried=user_field_polynomials(given.given, surface, cell_geometry(r0))
+        )
     thickness = thickness_field(given, r0, surface.patches) if given else None
     shell_contacts(
-        pairs, r0, fem.Function(V), surface.patches, h, on_surface(r0).contact_rule, thickness
+        pairs, r0, fem.Function(V), surface.patches, h, surface_domain(r0).contact_rule, thickness
     )
 
 
@@ -76,7 +88,7 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
     from magshell_fenicsx.parts.magnetism.stacked_faces import OVERLAP_DISTANCE
 
-    surfaces, V = Surfaces.of(r0), r0.function_space
+    surfaces, V = MidSurfaces.of(r0), r0.function_space
     nodes = surfaces.cells.nodes
     part = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
     for number in np.unique(part)[1:]:

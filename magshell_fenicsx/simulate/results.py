@@ -19,14 +19,14 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.shell.spatial_fields import OfPlacement
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.models.shell.spatial_fields import PlacementField
 from magshell_fenicsx.parts.observables import Slope
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.steps import held_by
+from magshell_fenicsx.simulate.steps import held_conjugates_of_step
 
 Array = NDArray[np.float64]
 AT_POLE = ("w_pole_over_h", "w_over_h")
@@ -204,8 +204,8 @@ def offset(scene: Scene, target: Target) -> fem.Function:
     """The displacement that reaches the target, at the nodes of the model."""
     axes, Q = scene.model.axes, rotation(scene.problem.azimuth)
 
-    def of(r0: fem.Function) -> OfPlacement:
-        offsets = OfPlacement(r0.function_space, "offset", of)
+    def of(r0: fem.Function) -> PlacementField:
+        offsets = PlacementField(r0.function_space, "offset", of)
         places = np.zeros((np.size(r0.x.array) // len(axes), 3))
         places[:, axes] = np.reshape(r0.x.array, (-1, len(axes)))
         wanted = target(places @ Q) @ Q.T
@@ -245,7 +245,7 @@ def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> floa
     It is the change of the energy under the other loads as they are held: that of Pi, plus the
     integral of q dmu for each amplitude whose conjugate q is held.
     """
-    held = held_by(scene, step, begin)
+    held = held_conjugates_of_step(scene, step, begin)
     before, after = (sum(scene.energies(state).values()) for state in (begin, end))
     change = after - before
     for name, q in held.items():

@@ -24,21 +24,26 @@ from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.bodies.body_contact import Pressing
-from magshell_fenicsx.parts.step_control import SnapSection
-from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection, level_in
 from magshell_fenicsx.parts.contact.time_averaging import TimeAveragedContact, samples_of_step
+from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
+from magshell_fenicsx.parts.motion.motion_step import (
+    EventSection,
+    PushSection,
+    TimeSection,
+    level_in,
+)
+from magshell_fenicsx.parts.step_control import SnapSection
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.meridian_chart import vector_function
-from magshell_fenicsx.shells.mass import Ground, mass, whole_mass
+from magshell_fenicsx.shells.mass import SupportInertia, mass, mass_with_supports
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.viscous import Branch, Viscosity
-from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
+from magshell_fenicsx.simulate.contact_control import raised_stiffnesses, stiff_for
+from magshell_fenicsx.simulate.motion_rows import MotionRows, StepRefinement
+from magshell_fenicsx.simulate.path_records import Records
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import staged
-from magshell_fenicsx.simulate.touch import stiff_for, stiffnesses
-from magshell_fenicsx.simulate.walked import Records
+from magshell_fenicsx.simulate.stage import make_stage
 
 Array = NDArray[np.float64]
 SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
@@ -50,7 +55,9 @@ IDLE = ""  # an amplitude of no load
 NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
 
 
-def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Vector, Vector]:
+def pushed_along_mode(
+    scene: Scene, push: PushSection, state: State, v: Vector
+) -> tuple[Vector, Vector]:
     """Displacement and velocity with a natural mode of the model itself, inward at the pole."""
     comm = scene.model.system.comm
     modes = ShellModes(scene.model)
@@ -68,7 +75,7 @@ def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Ve
     ) * h * phi
 
 
-def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
+def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     """The velocity with these components, formulas of the undeformed place, at the nodes; zero at
     supports.
     """
@@ -85,13 +92,13 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     )
 
 
-def thrown(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
+def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
     """The clock of the state before a step, with the energy of its initial velocity; empty without
     one.
     """
-    v = by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
+    v = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
     if load.push and load.push.velocity:
-        v = pushed(scene, load.push, state, v)[1]
+        v = pushed_along_mode(scene, load.push, state, v)[1]
     if not max_abs(scene.comm, v):
         return {}
     x, Mx = (M := mass(scene.model)).createVecs()
@@ -100,17 +107,17 @@ def thrown(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
     return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}
 
 
-def own_time(value: Time) -> float:
+def time_in_case_unit(value: Time) -> float:
     """A time in the case's own unit."""
     return float(in_units("second")(value))
 
 
-def time_of(problem: Problem, value: Time) -> float:
+def dimensionless_time(problem: Problem, value: Time) -> float:
     """A time over R sqrt(rho/E)."""
-    return own_time(value) / (problem.time_unit or 1.0)
+    return time_in_case_unit(value) / (problem.time_unit or 1.0)
 
 
-def level_of(problem: Problem, name: str, value: Level) -> float:
+def amplitude_of_level(problem: Problem, name: str, value: Level) -> float:
     """A value of a history as an amplitude."""
     if name != "lambda_m":
         return level_in(problem.context, name, value)
@@ -138,7 +145,7 @@ class LoadsInTime:
     def __init__(
         self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]
     ) -> None:
-        self._mu, time = dict(state.mu), partial(time_of, problem)
+        self._mu, time = dict(state.mu), partial(dimensionless_time, problem)
         histories = dict(zip(load.drives, load.history.values(), strict=True))
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
         self._curves, self.marks = dict[str, Curve](), set[float]()
@@ -146,7 +153,9 @@ class LoadsInTime:
             # histories are in the case's own unit of time
             driven = steps.get(name)
             value = driven.in_history(state.mu[name]) if driven else state.mu[name]
-            of = curve(history, own_time, partial(level_of, problem, name), value)
+            of = curve(
+                history, time_in_case_unit, partial(amplitude_of_level, problem, name), value
+            )
             size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(of, size, unit, driven.of_history if driven else float)
             self.marks |= set(marks(history, time, time(load.duration)))
@@ -184,10 +193,10 @@ class _Ends:
     """Where bodies press, and the displacements of shells that may touch, at one end of a step."""
 
     of_bodies: list[tuple[Array, float | Array]]
-    of_shells: list[Array]
+    nodes_by_shell: list[Array]
 
 
-class Pressings:
+class ContactsInTime:
     """All contacts of a system in steps in time, with bodies and between shells; a
     `continuation.motion.AveragedContact`.
 
@@ -236,7 +245,9 @@ class Pressings:
             self._pressings, before.of_bodies, after.of_bodies, strict=True
         ):
             pressing.average(low, high, part)
-        for contact, u, v in zip(self._between, before.of_shells, after.of_shells, strict=True):
+        for contact, u, v in zip(
+            self._between, before.nodes_by_shell, after.nodes_by_shell, strict=True
+        ):
             contact.samples = ()
             contact.samples = samples_of_step(contact, u, v, part)
 
@@ -250,7 +261,10 @@ class Pressings:
     def penetration_message(self, begin: State, end: State) -> str:
         """Which shells pass through each other in a step."""
         ends = zip(
-            self._between, self._at_begin(begin).of_shells, self._places(end).of_shells, strict=True
+            self._between,
+            self._at_begin(begin).nodes_by_shell,
+            self._places(end).nodes_by_shell,
+            strict=True,
         )
         through = [
             contact.pair.words for contact, before, after in ends if contact.passes(before, after)
@@ -276,7 +290,7 @@ class Pressings:
 
 
 @dataclass(frozen=True)
-class Moving(State):
+class MovingState(State):
     """A state with a velocity, and perhaps one of its supports."""
 
     v: Vector
@@ -291,7 +305,7 @@ def motion(
     Parameters
     ----------
     held
-        Amplitude -> its conjugate, as of `staged`.
+        Amplitude -> its conjugate, as of `make_stage`.
 
     Raises
     ------
@@ -301,29 +315,33 @@ def motion(
     problem, system = scene.problem, scene.model.system
     loads = LoadsInTime(problem, load, state, scene.motions)
     drag = float(in_units("1/second")(load.drag)) * (problem.time_unit or 1.0)
-    u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
+    u, v = state.u, state.v if isinstance(state, MovingState) else 0.0 * state.u
     if load.push:
-        u, v = pushed(scene, load.push, state, v)
+        u, v = pushed_along_mode(scene, load.push, state, v)
     if load.velocity:
-        v = v + by_formula(scene, load.velocity)
+        v = v + velocity_by_formula(scene, load.velocity)
 
     def begin() -> tuple[Integrator, Motion]:
-        viscous, device, ground = viscosity(scene, state), staged(scene, state, held).device, None
+        viscous, device, ground = (
+            viscosity(scene, state),
+            make_stage(scene, state, held).device,
+            None,
+        )
         if moving := scene.motions & set(load.drives):
             if viscous:
                 raise CaseError(
                     f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest"
                 )
-            carried = state.ground if isinstance(state, Moving) else None
-            ground = Ground(
+            carried = state.ground if isinstance(state, MovingState) else None
+            ground = SupportInertia(
                 system,
-                whole_mass(scene.model),
+                mass_with_supports(scene.model),
                 lambda t, b: (loads(t, b), loads.rates(t, b, moving)),
                 carried,
             )
         pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
         between = scene.model.shell_contacts
-        touching = Pressings(system, pressings, between) if pressings or between else None
+        touching = ContactsInTime(system, pressings, between) if pressings or between else None
         integrator = Integrator(
             system,
             mass(scene.model),
@@ -336,8 +354,8 @@ def motion(
         return integrator, integrator.begin(0.0, u, v)
 
     integrator, now = begin()
-    ground, duration = integrator.supports, time_of(problem, load.duration)
-    fixed = None if load.step is None else time_of(problem, load.step)
+    ground, duration = integrator.supports, dimensionless_time(problem, load.duration)
+    fixed = None if load.step is None else dimensionless_time(problem, load.step)
     steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
     total = most + system.stored_energy(now.u, now.mu)
@@ -357,8 +375,8 @@ def motion(
         return quiet or crossed(before, now)
 
     whole = load.errors == "motion" and fixed is None
-    rehearse = Rehearsed(scene, held, loads.marks, begin, outputs, over) if whole else None
-    walk = Intervals(scene, integrator, held, steps, loads.marks, rehearse)
+    rehearse = StepRefinement(scene, held, loads.marks, begin, outputs, over) if whole else None
+    walk = MotionRows(scene, integrator, held, steps, loads.marks, rehearse)
     for end in outputs:
         before, first = now, dt
         now, dt, point = walk.journalled(before, first, end)
@@ -402,7 +420,7 @@ def motion(
             )
             return rest
         if ended:
-            return Moving(
+            return MovingState(
                 point.state.u,
                 point.state.mu,
                 now.v,
@@ -446,12 +464,12 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     for branch in shell.relaxation:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
-        branches.append(Branch(ratio, time_of(problem, branch.time)))
+        branches.append(Branch(ratio, dimensionless_time(problem, branch.time)))
     assert model.thin
-    return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), branches)
+    return Viscosity(model, state.mu, dimensionless_time(problem, shell.viscosity or 0.0), branches)
 
 
-def released(
+def snap_records(
     scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]
 ) -> Records:
     """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state
@@ -487,7 +505,7 @@ def released(
 
 def _rest(scene: Scene, held: Mapping[str, HeldConjugate], state: State) -> State | None:
     """The equilibrium near a state; None if there is none near, or an unstable one."""
-    stage = staged(scene, state, held)
+    stage = make_stage(scene, state, held)
     start = stage.enter(state)
     start, raised = start.with_(start.u, IDLE, 0.0), dict[str, float]()
     while True:
@@ -497,7 +515,7 @@ def _rest(scene: Scene, held: Mapping[str, HeldConjugate], state: State) -> Stat
         )
         if not outcome.converged or moved > NEAR:
             return None
-        stiffer = stiffnesses(scene, at_rest := stage.leave(outcome.state))
+        stiffer = raised_stiffnesses(scene, at_rest := stage.leave(outcome.state))
         if not stiffer:
             break
         raised |= stiffer

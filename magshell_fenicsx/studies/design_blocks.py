@@ -11,7 +11,7 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.section import si_size
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.multi_shell import ShellPose
-from magshell_fenicsx.models.shell.control_points import ByControls, Controls
+from magshell_fenicsx.models.shell.control_points import ControlledPattern, ControlPoints
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
     loads = scene.problem.loads
     magnetic = loads.magnetic or loads.remanence
     assert magnetic
-    assert isinstance(magnetic.remanent, ByControls)
+    assert isinstance(magnetic.remanent, ControlledPattern)
     return np.asarray(
         field_gradient.field.function_space.mesh.comm.allreduce(
             magnetic.remanent.pulled(field_gradient.places, field_gradient.forces)
@@ -107,7 +107,7 @@ class Vectors:
         Least and largest length; None: they stay as they are.
     """
 
-    controls: Controls
+    controls: ControlPoints
     start: Array
     lengths: tuple[float, float] | None
     name: str = "remanence"
@@ -204,7 +204,7 @@ class ControlPointField(Bounded):
         Of several: the place of each, and its thickness over h.
     """
 
-    controls: Controls
+    controls: ControlPoints
     length: float = 1.0
     shells: Mapping[str, tuple[ShellPose, float]] = field(default_factory=dict)
 
@@ -239,7 +239,7 @@ class ControlPointField(Bounded):
             new = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), new]
 
-    def _controls_on_shell(self, place: ShellPose, ratio: float) -> tuple[Controls, float]:
+    def _controls_on_shell(self, place: ShellPose, ratio: float) -> tuple[ControlPoints, float]:
         """The points in the frame of one of several shells, over its own length."""
         control_points = self.controls.places
         x = place.to_shell_frame(
@@ -248,7 +248,7 @@ class ControlPointField(Bounded):
         points_of_shell = (
             np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
         )
-        return Controls(points_of_shell, self.controls.width / place.scale), ratio
+        return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
 
     def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:
         """Derivative (nodes of cells, 1) of the thickness over h by the factor of the thickness of
@@ -261,7 +261,7 @@ class ControlPointField(Bounded):
             ratios[surface.patches[name][: shape[0]]] = ratio
         return ratios.reshape(-1, 1)
 
-    def _formula(self, values: Array, controls: Controls, R: float = 1.0) -> str:
+    def _formula(self, values: Array, controls: ControlPoints, R: float = 1.0) -> str:
         """Formula of the field for values at the control points, with lengths over R except for a
         curvature.
         """

@@ -14,13 +14,13 @@ from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.control_points import Controls
+from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
 from magshell_fenicsx.problem.formulas import THICKNESS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline
-from magshell_fenicsx.simulate.numbers import number_of
+from magshell_fenicsx.simulate.perturbation import number_at_key
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design_blocks import (
     ControlPointField,
@@ -77,7 +77,7 @@ class Variables:
         return tuple(part.name for part in self.parts)
 
     @property
-    def controls(self) -> Controls | None:
+    def controls(self) -> ControlPoints | None:
         """Control points of the remanence; None if it does not vary."""
         return self.remanence.controls if self.remanence else None
 
@@ -185,7 +185,7 @@ def refuse_unfit_numbers(
     for key in design.numbers:
         low, high, unit = design.bounds(key)
         try:
-            value, text = number_of(case.context, key), value_at(source.data, key.split("."))
+            value, text = number_at_key(case.context, key), value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
         start = value / si_size(unit)
@@ -249,7 +249,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
                 name,
                 np.asarray(start),
                 (low, high),
-                Controls(points, width),
+                ControlPoints(points, width),
                 case.shell.reference,
                 shells,
             )
@@ -295,7 +295,7 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
 
 def controls_of(
     case: Case, count: int | None, width: float | None, key: str
-) -> tuple[Controls, Array]:
+) -> tuple[ControlPoints, Array]:
     """The points of the remanence, and its vectors there as the case has them.
 
     Raises
@@ -318,7 +318,7 @@ def controls_of(
         places, vectors = read_vectors(
             magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files
         )
-        return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
+        return ControlPoints(places, width or magnetic.remanent.filter or 1.0), vectors
     problem = case.problem()
     places, width = _spread(case, problem, count, width)
     field = magnetisation(magnetic, case.context, 0.0, problem.within)
@@ -333,7 +333,7 @@ def controls_of(
         vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
     if problem.meridian:
         places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
-    return Controls(places, width), vectors
+    return ControlPoints(places, width), vectors
 
 
 def _places(case: Case, problem: Problem, count: int) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import VECTORS, write_vectors
-from magshell_fenicsx.models.shell.control_points import Controls
+from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design_blocks import Vectors, by_components
 from magshell_fenicsx.studies.design_variables import controls_of
@@ -41,7 +41,7 @@ class RemanenceField:
         The components that are looked for; on a strip those in the plane of x and z.
     """
 
-    controls: Controls
+    controls: ControlPoints
     start: Array
     free_components: tuple[int, ...]
     smooth: Smooth

@@ -16,7 +16,7 @@ from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.shells.t_junctions import Tee
+from magshell_fenicsx.shells.t_junctions import SurfaceTJunction
 from magshell_fenicsx.simulate.follow import follow
 
 h, WIDTH = 0.02, 0.25
@@ -134,7 +134,7 @@ def test_derivatives() -> None:
         )
     )
     system, mu = scene.model.system, scene.unloaded().mu
-    (term,) = (each for each in system.terms if isinstance(each, Tee))
+    (term,) = (each for each in system.terms if isinstance(each, SurfaceTJunction))
     rng = np.random.default_rng(0)
     u, v = (
         system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (1e-3, 1.0)

@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.sector_modes import UnfoldedModes
+from magshell_fenicsx.shells.sector_modes import SectorModes
 
 h = 0.02
 MATERIAL = {"thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
@@ -100,7 +100,7 @@ def test_copies_make_the_half(name: str) -> None:
     scene = Scene(sector(name))
     model, waves = scene.model, scene.problem.mirror.waves  # type: ignore[union-attr]
     assert isinstance(model, ShellModel)
-    assert isinstance(model.excluded_modes, UnfoldedModes)
+    assert isinstance(model.excluded_modes, SectorModes)
     half = model.excluded_modes.half
     assert (model.multiplicity, half.multiplicity) == (2 * waves, 2)
     size = {"rings": 0.4, "gripper": 2.0, "joined": 1e-7}[
@@ -147,7 +147,7 @@ def test_a_ball_on_a_sector() -> None:
     scene = Scene(Case.from_source(data))
     model = scene.model
     assert isinstance(model, ShellModel)
-    assert isinstance(model.excluded_modes, UnfoldedModes)
+    assert isinstance(model.excluded_modes, SectorModes)
     half, u = model.excluded_modes.half, symmetric(scene, -0.1)
     copies = model.excluded_modes.unfolded(u)
     mu = scene.unloaded().mu | {"approach": 0.5}

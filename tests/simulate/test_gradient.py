@@ -19,12 +19,12 @@ from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
-from magshell_fenicsx.models.shell.control_points import ByControls
+from magshell_fenicsx.models.shell.control_points import ControlledPattern
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
-from magshell_fenicsx.simulate.numbers import scene_with
+from magshell_fenicsx.simulate.perturbation import perturbed_scene
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
 from magshell_fenicsx.simulate.sensitivity import fold_at
@@ -55,7 +55,7 @@ def with_values(scene: Scene, change: Array) -> Scene:
     """The scene with other vectors at the points of its remanence."""
     loads = scene.problem.loads
     assert loads.magnetic
-    assert isinstance(loads.magnetic.remanent, ByControls)
+    assert isinstance(loads.magnetic.remanent, ControlledPattern)
     other = replace(loads.magnetic.remanent, values=loads.magnetic.remanent.values + change)
     problem = replace(
         scene.problem, loads=replace(loads, magnetic=replace(loads.magnetic, remanent=other))
@@ -67,7 +67,7 @@ def of_points(scene: Scene, found: object) -> Array:
     assert isinstance(found, FieldGradient)
     assert scene.problem.loads.magnetic
     remanent = scene.problem.loads.magnetic.remanent
-    assert isinstance(remanent, ByControls)
+    assert isinstance(remanent, ControlledPattern)
     return remanent.pulled(found.places, found.forces)
 
 
@@ -132,7 +132,7 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
         return functional(scene, state, "tip_ux").value
 
     def softer(c: float) -> float:
-        there = scene_with(scene, key, ratio * (1 + c))
+        there = perturbed_scene(scene, key, ratio * (1 + c))
         return functional(there, at(there, near), "tip_ux").value
 
     assert found_numbers["lambda_m"] == pytest.approx(

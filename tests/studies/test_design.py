@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.input.tables import read_vectors
-from magshell_fenicsx.models.shell.control_points import Controls
+from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.public import run
-from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.simulate.scene_reuse import SceneReuse
 from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ def test_fields_between_bounds(strip: Callable[[str], Path], tmp_path: Path) -> 
     source = read_source(strip(f"design: {{objective: {{maximise: tip_uz}}, {varied}}}\n"))
     case = Case.from_source(source)
     assert case.design
-    vary, standing = variables(source, case, case.design), Standing()
+    vary, standing = variables(source, case, case.design), SceneReuse()
     x, way = vary.start_values, np.random.default_rng(0).standard_normal(len(vary.start_values))
 
     def at(c: float) -> DesignEvaluation:
@@ -322,7 +322,7 @@ def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
     vary = variables(source := read_source(file), case := Case.from_source(source), case.design)  # type: ignore[arg-type]
     way, B = np.random.default_rng(0).random(len(vary.start_values)), tmp_path / "B.csv"
     back, here, further = (
-        evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, MPI.COMM_WORLD, Standing())
+        evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, MPI.COMM_WORLD, SceneReuse())
         for x in (vary.start_values + c * way for c in (0.01, 0.02, 0.03))
     )
     slope = (further.values["omega2_1"] - back.values["omega2_1"]) / 0.02
@@ -378,7 +378,7 @@ def test_letter_and_its_elastica(tmp_path: Path) -> None:
     assert content["best"]["largest_distance"] < 0.01
     assert content["verified"]["largest_distance"] < 0.01
     places, vectors = read_vectors(tmp_path / "best.csv", "")
-    found = Controls(places, 1 / 15)
+    found = ControlPoints(places, 1 / 15)
     q, s = 12 * 1e-3 * 100**2, np.linspace(0, 1, 201)
 
     def slopes(s: Array, y: Array) -> Array:

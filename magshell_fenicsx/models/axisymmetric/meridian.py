@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.vertex_spacing import line_coordinates
-from magshell_fenicsx.models.shell.spatial_fields import places
+from magshell_fenicsx.models.shell.spatial_fields import positions_and_normals
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
-MOST_CELLS = 1_000_000
-ROUNDING = 1e-9  # of a parameter
+MAX_CELLS = 1_000_000
+PARAMETER_TOLERANCE = 1e-9  # of a parameter
 Names = Sequence[str | None]
 
 
@@ -98,7 +98,10 @@ class Meridian:
         """The cells of each shell, or of those that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._ends), dtype=bool)]
         for both in self.tied:
-            begin, end = self._ends[:, :1] - ROUNDING, self._ends[:, 1:] + ROUNDING
+            begin, end = (
+                self._ends[:, :1] - PARAMETER_TOLERANCE,
+                self._ends[:, 1:] + PARAMETER_TOLERANCE,
+            )
             at = ((begin < both) & (both < end)).any(axis=1)
             parts = [of for of in bodies if (of & at).any()]
             bodies = [of for of in bodies if all(of is not part for part in parts)] + [
@@ -111,7 +114,7 @@ class Meridian:
         """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a
         T-junction.
         """
-        near = [np.abs(self._ends - one) < ROUNDING for one, _ in self.tied]
+        near = [np.abs(self._ends - one) < PARAMETER_TOLERANCE for one, _ in self.tied]
         return [
             1.0 * at[:, 1] - 1.0 * at[:, 0] if one == other else None
             for at, (one, other) in zip(near, self.tied, strict=True)
@@ -143,7 +146,7 @@ class Meridian:
 
     def largest_fold(self, r0: fem.Function) -> float:
         """The largest angle (rad) between the undeformed normals at a joint of two edges."""
-        nodes, normals, angles = r0.function_space.dofmap.list, places(r0)[1], [0.0]
+        nodes, normals, angles = r0.function_space.dofmap.list, positions_and_normals(r0)[1], [0.0]
         for marks in self.joints:
             if marks is not None:
                 cells = [int(marks.argmax()), int(marks.argmin())]
@@ -192,8 +195,8 @@ def make_meridian(
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
     parts = [ends for _, ends in pieces] or [(float(vertices[0]), float(vertices[-1]))]
-    first = np.searchsorted([begin for begin, _ in parts], vertices[:-1] + ROUNDING)
-    inside = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - ROUNDING
+    first = np.searchsorted([begin for begin, _ in parts], vertices[:-1] + PARAMETER_TOLERANCE)
+    inside = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - PARAMETER_TOLERANCE
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
         MPI.COMM_SELF,
@@ -203,7 +206,9 @@ def make_meridian(
     )
     domain.topology.create_connectivity(0, 1)
     facets = [
-        mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.abs(x[0] - end) < ROUNDING)
+        mesh.locate_entities_boundary(
+            domain, 0, lambda x, end=end: np.abs(x[0] - end) < PARAMETER_TOLERANCE
+        )
         for ends in parts
         for end in ends
     ]
@@ -213,10 +218,13 @@ def make_meridian(
     if points is None or (pieces and "pole" not in points):
         places = embedding(np.column_stack([vertices, 0 * vertices]))
         still = [end for name, end in zip(names, np.ravel(parts), strict=True) if name in held]
-        free = np.abs(np.subtract.outer(vertices, still)).min(axis=1, initial=inf) > ROUNDING
+        free = (
+            np.abs(np.subtract.outer(vertices, still)).min(axis=1, initial=inf)
+            > PARAMETER_TOLERANCE
+        )
         highest = np.argmax(places[:, 2])
         if not free[highest] and free.any():
-            on_axis = free & (np.abs(places[:, 0]) < ROUNDING)
+            on_axis = free & (np.abs(places[:, 0]) < PARAMETER_TOLERANCE)
             highest = np.argmax(np.where(on_axis if on_axis.any() else free, places[:, 2], -inf))
         s = float(vertices[highest]) if pieces else 0.0
         points = {**(points or {}), "pole": (s, 0.0)}
@@ -258,7 +266,7 @@ def graded_vertices(
     Raises
     ------
     MeshError
-        If there would be more than `MOST_CELLS`.
+        If there would be more than `MAX_CELLS`.
 
     Notes
     -----
@@ -292,9 +300,9 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
         s = np.linspace(a, b, 20001)
         with np.errstate(over="ignore", divide="ignore"):
             counted = np.concatenate([[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))])
-        if not counted[-1] < MOST_CELLS:
+        if not counted[-1] < MAX_CELLS:
             raise MeshError(
-                f"mesh: the meridian would have {counted[-1]:.2g} cells, allowed {MOST_CELLS:g}: take a larger "
+                f"mesh: the meridian would have {counted[-1]:.2g} cells, allowed {MAX_CELLS:g}: take a larger "
                 "mesh.size, a lower mesh.refinement, or larger bodies"
             )
         cells = int(np.ceil(counted[-1]))

@@ -18,7 +18,7 @@ from magshell_fenicsx.assembly.batches import EntityBatch, EntityRule
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo
 from magshell_fenicsx.assembly.point_kernels import PointKernel, PointStorage, full_hessian
-from magshell_fenicsx.models.domains import Carrier, Energy, revolved_by, wave_by
+from magshell_fenicsx.models.domains import IntegrationDomain, Energy, revolved_jet_of, wave_jets_of
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, parameters_at
@@ -33,7 +33,7 @@ _UPPER = tuple(
 )  # pairs of components; the others follow by symmetry
 
 
-class WavePoints:
+class WaveHessians:
     """The matrices of Q_m, without what is held.
 
     Parameters
@@ -51,14 +51,18 @@ class WavePoints:
     """
 
     def __init__(
-        self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog
+        self,
+        carrier: IntegrationDomain,
+        u: fem.Function,
+        energies: Sequence[Energy],
+        log: KernelLog,
     ) -> None:
         self._nodes = u.function_space.dofmap.list.astype(np.int64)
         places = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
-            places.setdefault(_place(e), []).append(e)
+            places.setdefault(_support_of(e), []).append(e)
         self._sites = [
-            _Site(carrier, u, batch, at_place, log)
+            _WaveBatch(carrier, u, batch, at_place, log)
             for at_place in places.values()
             for batch in _batches(carrier, at_place[0].density)
         ]
@@ -85,14 +89,14 @@ class WavePoints:
         return total.reshape(len(waves), -1, 3, 3)
 
 
-class _Site:
+class _WaveBatch:
     """The energies at the points of one batch: of the cells, of the vertices between them, or of an
     end.
     """
 
     def __init__(
         self,
-        carrier: Carrier,
+        carrier: IntegrationDomain,
         u: fem.Function,
         batch: EntityBatch,
         energies: Sequence[Energy],
@@ -164,9 +168,9 @@ class _Site:
     @cached_property
     def _kernels(self) -> list[PointKernel]:
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
-        both = [wave_by(each, self._m) for each in waves]
+        both = [wave_jets_of(each, self._m) for each in waves]
         u, r0, drawn = (
-            [revolved_by(self._of_sides(field, PLANE, side)) for side in self._sides]
+            [revolved_jet_of(self._of_sides(field, PLANE, side)) for side in self._sides]
             for field in (self._at_u, self._at_r0, self._drawn)
         )
         kernels = []
@@ -181,7 +185,7 @@ class _Site:
             W = ufl.zero()
             for part in range(2):  # the cosine's and the sine's
                 v = [each[part] for each in both]
-                W = W + _added(e.density, start, moved, v, self._edge(r0), parameters)
+                W = W + _perturbed_density(e.density, start, moved, v, self._edge(r0), parameters)
             kernels.append(full_hessian(f"{e.name} waves", W, self._wave, self._log))
         return kernels
 
@@ -280,7 +284,7 @@ class _Site:
         return np.asarray(np.outer(sizes, weights).reshape(-1, 1) * by_length)
 
 
-def _added(
+def _perturbed_density(
     density: Density,
     r0: Sequence[Jet],
     u: Sequence[Jet],
@@ -325,14 +329,14 @@ def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_ar
     return coo_array((np.ones(len(places[0])), places), (9 * count, entries.size)).tocsr()
 
 
-def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:
+def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
     """Where a density lives: energies with the same one share their points."""
     assert e.density
     facets = () if e.density.facets is None else tuple(int(facet) for facet in e.density.facets)
     return e.density.sides, e.density.quadrature or 0, facets
 
 
-def _batches(carrier: Carrier, density: Density | None) -> Iterable[EntityBatch]:
+def _batches(carrier: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
     """The points where a density lives; the geometry of each is the covector and the length of the
     cell, by sides.
     """

@@ -1,4 +1,4 @@
-"""Parts of cells in which a formula has values that samples do not show, however small these parts
+"""SubCells of cells in which a formula has values that samples do not show, however small these parts
 are.
 
 The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with
@@ -19,16 +19,18 @@ from magshell_fenicsx.input.expressions import FormulaGroup
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-AT_ONCE = 4096  # parts that are evaluated together
-OPEN = 5e-3  # of the integral of the variation: what ranges may leave open
+BATCH_SIZE = 4096  # parts that are evaluated together
+MAX_OPEN_VARIATION = 5e-3  # of the integral of the variation: what ranges may leave open
 # of the integral of |f|: so little may be open whatever the variation, as of a step at a rim
-SLIGHT = 1e-4
-BOTH = 0.9  # of the difference of values: both sides of a step are seen, and little is left open
-ALIKE = 8.0  # times what values show: derivatives that differ less hide nothing
-SHARE = 0.03  # of the largest part of that: what is divided now, before others
-ROUNDING = 1e-9  # of the largest value
-SMALLEST, LARGEST = 1e-7, 1e150  # over R, and a value
-MOST = 60_000  # parts in all
+MAX_OPEN_INTEGRAL = 1e-4
+STEP_SHARE = (
+    0.9  # of the difference of values: both sides of a step are seen, and little is left open
+)
+SLOPE_RATIO = 8.0  # times what values show: derivatives that differ less hide nothing
+DIVIDED_SHARE = 0.03  # of the largest part of that: what is divided now, before others
+VALUE_TOLERANCE = 1e-9  # of the largest value
+MIN_SIZE, MAX_VALUE = 1e-7, 1e150  # over R, and a value
+MAX_PARTS = 60_000  # parts in all
 CHILDREN: dict[
     int, list[tuple[tuple[float, ...], tuple[float, ...]]]
 ] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
@@ -42,24 +44,24 @@ CHILDREN: dict[
 
 
 @dataclass(frozen=True)
-class Parts:
+class SubCells:
     """Images of the reference cell in it, X = corner + sides * X', each of a cell."""
 
     cell: Numbers
     corner: Array
     sides: Array
 
-    def __getitem__(self, which: slice | NDArray[np.bool_]) -> "Parts":
-        return Parts(self.cell[which], self.corner[which], self.sides[which])
+    def __getitem__(self, which: slice | NDArray[np.bool_]) -> "SubCells":
+        return SubCells(self.cell[which], self.corner[which], self.sides[which])
 
-    def of(self, cells: Numbers) -> "Parts":
+    def of(self, cells: Numbers) -> "SubCells":
         """The same in each of some cells."""
         times = len(cells)
         numbers = np.repeat(cells, len(self.cell))
-        return Parts(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
+        return SubCells(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
 
     @classmethod
-    def together(cls, several: "Sequence[Parts]") -> "Parts":
+    def together(cls, several: "Sequence[SubCells]") -> "SubCells":
         return cls(
             *(
                 np.concatenate([getattr(one, name) for one in several])
@@ -67,17 +69,17 @@ class Parts:
             )
         )
 
-    def pieces(self) -> "list[Parts]":
+    def pieces(self) -> "list[SubCells]":
         """A few at a time."""
-        return [self[i : i + AT_ONCE] for i in range(0, len(self.cell), AT_ONCE)]
+        return [self[i : i + BATCH_SIZE] for i in range(0, len(self.cell), BATCH_SIZE)]
 
-    def divided(self) -> "Parts":
+    def divided(self) -> "SubCells":
         """The parts of the first, those of the second, and so on."""
         children = CHILDREN[self.corner.shape[1]]
         at, by = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
         corner = self.corner[:, None] + self.sides[:, None] * at
-        return Parts(
+        return SubCells(
             np.repeat(self.cell, len(children)),
             corner.reshape(-1, d),
             (self.sides[:, None] * by).reshape(-1, d),
@@ -89,8 +91,8 @@ class Parts:
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
 
 
-Look = Callable[
-    [Parts], tuple[Array, Array]
+PlacesOfParts = Callable[
+    [SubCells], tuple[Array, Array]
 ]  # places (parts, q, 3), the corners first, and areas (parts,)
 
 
@@ -127,8 +129,8 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Leaves:
-    """Parts that are not divided any more, on this rank.
+class RefinedParts:
+    """SubCells that are not divided any more, on this rank.
 
     Attributes
     ----------
@@ -142,7 +144,7 @@ class Leaves:
         The part of that which may not be seen, where too many parts would be needed; else 0.
     """
 
-    parts: Parts
+    parts: SubCells
     area: Array
     centre: Array
     size: Array
@@ -151,14 +153,14 @@ class Leaves:
     open: float
 
 
-def leaves(
+def refine_where_hidden(
     formulas: FormulaGroup,
-    first: Parts,
-    look: Look,
+    first: SubCells,
+    look: PlacesOfParts,
     lattice: Lattice,
     owned: int,
     comm: MPI.Comm = MPI.COMM_SELF,
-) -> Leaves:
+) -> RefinedParts:
     """The first parts, divided where that is needed; collective.
 
     Parameters
@@ -168,7 +170,7 @@ def leaves(
     owned
         The cells with smaller numbers count in sums.
     """
-    parts, seen = first, _seen(formulas, first, look, lattice)
+    parts, seen = first, _sample(formulas, first, look, lattice)
     looked = 0
     while True:
         own = parts.cell < owned
@@ -179,33 +181,39 @@ def leaves(
         size = np.linalg.norm(f, axis=-1)
         variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
         largest = comm.allreduce(float(np.abs(seen.values).max(initial=0.0)), MPI.MAX)
-        matters = (seen.between > ROUNDING * largest) & (seen.size > SMALLEST)
+        matters = (seen.between > VALUE_TOLERANCE * largest) & (seen.size > MIN_SIZE)
         unseen = np.where(matters, seen.area * seen.between, 0.0)
         most = comm.allreduce(float(unseen[own].max(initial=0.0)), MPI.MAX)
         left = comm.allreduce(float(unseen[own].sum()))
-        slight = SLIGHT * comm.allreduce(
+        slight = MAX_OPEN_INTEGRAL * comm.allreduce(
             float(area @ np.linalg.norm(seen.values, axis=-1).mean(axis=1))
         )
-        alike = OPEN * variation / max(comm.allreduce(int(own.sum())), 1)
-        again = (unseen > alike) & (unseen >= SHARE * min(most, np.finfo(float).max))
+        alike = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(own.sum())), 1)
+        again = (unseen > alike) & (unseen >= DIVIDED_SHARE * min(most, np.finfo(float).max))
         if (
-            left <= max(OPEN * variation, slight)
-            or looked > MOST
+            left <= max(MAX_OPEN_VARIATION * variation, slight)
+            or looked > MAX_PARTS
             or not comm.allreduce(int((again & own).sum()))
         ):
             break
         smaller = parts[again].divided()
-        parts = Parts.together([parts[~again], smaller])
-        seen = _Seen.together([seen.of(~again), _seen(formulas, smaller, look, lattice)])
+        parts = SubCells.together([parts[~again], smaller])
+        seen = _Samples.together([seen.of(~again), _sample(formulas, smaller, look, lattice)])
     away = (size**2).mean(axis=1)
     share = left / max(variation, np.finfo(float).tiny)
-    return Leaves(
-        parts, seen.area, seen.centre, seen.size, away, variation, share if looked > MOST else 0.0
+    return RefinedParts(
+        parts,
+        seen.area,
+        seen.centre,
+        seen.size,
+        away,
+        variation,
+        share if looked > MAX_PARTS else 0.0,
     )
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Samples:
     """Of each part area, centre, size, what may be between its values, and these (parts, places,
     formulas).
     """
@@ -216,11 +224,11 @@ class _Seen:
     between: Array
     values: Array
 
-    def of(self, which: NDArray[np.bool_]) -> "_Seen":
-        return _Seen(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+    def of(self, which: NDArray[np.bool_]) -> "_Samples":
+        return _Samples(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
     @classmethod
-    def together(cls, several: "Sequence[_Seen]") -> "_Seen":
+    def together(cls, several: "Sequence[_Samples]") -> "_Samples":
         return cls(
             *(
                 np.concatenate([getattr(one, name) for one in several])
@@ -229,21 +237,23 @@ class _Seen:
         )
 
 
-def _seen(formulas: FormulaGroup, parts: Parts, look: Look, lattice: Lattice) -> _Seen:
+def _sample(
+    formulas: FormulaGroup, parts: SubCells, look: PlacesOfParts, lattice: Lattice
+) -> _Samples:
     """A look at each part, with the box of its places and of what bulges between them."""
     x, area = look(parts)
     low, high = x.min(axis=1), x.max(axis=1)
     bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[
         :, None
     ]
-    bulge = np.where(bulge > ROUNDING, bulge, 0.0)
+    bulge = np.where(bulge > VALUE_TOLERANCE, bulge, 0.0)
     least, most, bent = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
-    most, least = (np.clip(v, -LARGEST, LARGEST) for v in (most, least))
+    most, least = (np.clip(v, -MAX_VALUE, MAX_VALUE) for v in (most, least))
     between = np.minimum(
-        np.maximum(most - least - BOTH * np.ptp(f, axis=1), 0.0), bent / lattice.count
+        np.maximum(most - least - STEP_SHARE * np.ptp(f, axis=1), 0.0), bent / lattice.count
     )
-    between = np.where(bent <= ALIKE * lattice.bent(f), 0.0, between).sum(axis=1)
-    return _Seen(area, x.mean(axis=1), (high - low).max(axis=1), between, f)
+    between = np.where(bent <= SLOPE_RATIO * lattice.bent(f), 0.0, between).sum(axis=1)
+    return _Samples(area, x.mean(axis=1), (high - low).max(axis=1), between, f)

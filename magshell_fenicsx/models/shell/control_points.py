@@ -9,12 +9,12 @@ import scipy
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-LEAST = 1e-10  # weights below it, relative to the largest, are left out
-FEW = 32  # points that are looked at first
+MIN_RELATIVE_WEIGHT = 1e-10  # weights below it, relative to the largest, are left out
+FIRST_NEIGHBOURS = 32  # points that are looked at first
 
 
 @dataclass(frozen=True)
-class Controls:
+class ControlPoints:
     """Control points, over R: each place has the mean of their values, weighted by distance.
 
         B(x) = sum_i w_i(x) B_i,    w_i ~ exp(-|x - x_i|^2/l^2),    sum_i w_i = 1
@@ -42,11 +42,11 @@ class Controls:
         """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
         at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.around else x
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
-        looked = min(FEW, count)
+        looked = min(FIRST_NEIGHBOURS, count)
         while True:
             distance, number = (v.reshape(len(at), looked) for v in tree.query(at, looked))
             w = np.exp((distance[:, :1] ** 2 - distance**2) / self.width**2)
-            if looked == count or w[:, -1].max(initial=0.0) < LEAST:
+            if looked == count or w[:, -1].max(initial=0.0) < MIN_RELATIVE_WEIGHT:
                 break
             looked = min(2 * looked, count)
         w /= w.sum(axis=1, keepdims=True)
@@ -55,14 +55,14 @@ class Controls:
 
 
 @dataclass(frozen=True)
-class ByControls:
+class ControlledPattern:
     """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those
     that turn.
 
     `frame` is as of `spatial_fields.Components`.
     """
 
-    controls: Controls
+    controls: ControlPoints
     values: Array
     frame: Array | None = None
 

@@ -15,8 +15,10 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law, work
 
-PAIRS = np.triu_indices(3)
-SIZE = 3 + 3 + 3 + 9 + 18  # of a field's polynomial: u*, B at r0, B*, G*, H* by pairs j <= k
+COMPONENT_PAIRS = np.triu_indices(3)
+FIELD_POLYNOMIAL_SIZE = (
+    3 + 3 + 3 + 9 + 18
+)  # of a field's polynomial: u*, B at r0, B*, G*, H* by pairs j <= k
 
 MagneticDensity = Callable[
     ..., Expr
@@ -125,10 +127,10 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
 
 
 def in_space(law: MagneticDensity) -> MagneticDensity:
-    """That of a field known by values, of (r0, u, Br, P): P as of `applied.around`; `law` as above."""
+    """That of a field known by values, of (r0, u, Br, P): P as of `field_at_displacement`; `law` as above."""
 
     def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **options: Any) -> Expr:
-        B, change = around(P, u.r)
+        B, change = field_at_displacement(P, u.r)
         return law(r0, u, Br, B, **options) - ufl.dot(change, Br)
 
     return magnetic_in_space
@@ -186,7 +188,7 @@ def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
     return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
-def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
+def swept_volume(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
     """The volume that the surface sweeps when its points move straight to r0 + u; per area of the
     coordinates.
 
@@ -197,18 +199,18 @@ def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
     return unit * ufl.dot(u.r, halfway + kin.area_vector(u) / 12)
 
 
-def following(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
+def follower_pressure_work(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
     """v . n da: the virtual work of p = 1 in that unit; per area of the coordinates."""
     return unit * ufl.dot(v.r, kin.area_vector(r0 + u))
 
 
-def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:
-    """B at the displacement u from the polynomial P (`SIZE`,), and less what it is at u = 0."""
+def field_at_displacement(P: Expr, u: Expr) -> tuple[Expr, Expr]:
+    """B at the displacement u from the polynomial P (`FIELD_POLYNOMIAL_SIZE`,), and less what it is at u = 0."""
     d = u - ufl.as_vector([P[i] for i in range(3)])
 
     def component(i: int) -> Expr:
         linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
-        pairs = enumerate(zip(*PAIRS, strict=True))
+        pairs = enumerate(zip(*COMPONENT_PAIRS, strict=True))
         return (
             P[6 + i]
             + linear

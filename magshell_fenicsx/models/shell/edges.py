@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.law import Law
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]
-FOLD = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
+FOLD_ANGLE = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 
 
 def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
@@ -111,7 +111,7 @@ def interior(
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
-def folded(
+def fold(
     r0: Sides,
     u: Sides,
     m: tuple[Expr, Expr],

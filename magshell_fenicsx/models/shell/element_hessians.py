@@ -30,8 +30,8 @@ from magshell_fenicsx.models.shell.kinematics import Jet, strain_components
 
 PointTerm = ShellTerm | HessianTerm
 Array = NDArray[np.float64]
-NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
-RANK = (
+JET_NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
+DERIVATIVE_RANK = (
     2,
     0,
     0,
@@ -41,7 +41,7 @@ RANK = (
 )  # pairs of first derivatives come first: the terms' pairs are then neighbours
 
 
-class Site:
+class HessianIntegral:
     """Where some terms live together: the cells, the interior edges, or some boundary edges.
 
     Parameters
@@ -233,8 +233,8 @@ def _strain(r0: Array, u: Array) -> Array:
 
 def _pairs(density: Density) -> BlockPairs:
     """Those of the parts that the density depends on, without those in which it is linear."""
-    parts = [NAMES.index(name) for name in density.parts]
-    linear = [NAMES.index(name) for name in density.linear]
+    parts = [JET_NAMES.index(name) for name in density.parts]
+    linear = [JET_NAMES.index(name) for name in density.linear]
 
     def coupled(pairs: Iterable[IndexPair]) -> tuple[IndexPair, ...]:
         return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
@@ -244,7 +244,7 @@ def _pairs(density: Density) -> BlockPairs:
 
 
 def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:
-    return max(RANK[pair[0]], RANK[pair[1]]), pair
+    return max(DERIVATIVE_RANK[pair[0]], DERIVATIVE_RANK[pair[1]]), pair
 
 
 def _jet(field: fem.Function, side: int) -> Jet:

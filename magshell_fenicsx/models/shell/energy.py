@@ -19,8 +19,8 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import AngleTerm, DensityTerm
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
-from magshell_fenicsx.models.shell.own_term import ByPlace, Free, OwnTerm
+from magshell_fenicsx.models.shell.kinematics import FIRST_DERIVATIVES, Jet
+from magshell_fenicsx.models.shell.own_term import FormulaParameter, Free, OwnTerm
 from magshell_fenicsx.platform import compat
 
 Parameter: TypeAlias = fem.Constant | fem.Function
@@ -60,7 +60,7 @@ class Density:
 
     of: Callable[..., Expr]
     parameters: tuple[Parameter, ...]
-    parts: tuple[str, ...] = FIRST
+    parts: tuple[str, ...] = FIRST_DERIVATIVES
     linear: tuple[str, ...] = ()
     facets: NDArray[np.int32] | None = None
     sides: int = 1
@@ -209,7 +209,7 @@ def constants_of(
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
     def made(
-        p: float | NDArray[np.float64] | Free | UserField | ByPlace | Coefficient,
+        p: float | NDArray[np.float64] | Free | UserField | FormulaParameter | Coefficient,
     ) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
             return constants.setdefault(p.name, constant(p.value))
@@ -223,7 +223,7 @@ def constants_of(
                 f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on this mesh, "
                 "see ms.Shell"
             )
-        assert not isinstance(p, ByPlace)  # a model has made a function of it
+        assert not isinstance(p, FormulaParameter)  # a model has made a function of it
         return constant(p)
 
     return tuple(made(p) for p in term.parameters)

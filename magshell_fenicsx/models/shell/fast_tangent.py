@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.energy import (
     cell_quadrature,
     edge_quadrature,
 )
-from magshell_fenicsx.models.shell.element_hessians import Site
+from magshell_fenicsx.models.shell.element_hessians import HessianIntegral
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Weighted = tuple[float, Array]
 
 
-class TangentSite(Protocol):
+class ElementIntegral(Protocol):
     """What `FastTangent` sums.
 
     Attributes
@@ -56,7 +56,7 @@ class TangentSite(Protocol):
         same: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add element matrices, see `Site.add`."""
+        """Add element matrices, see `HessianIntegral.add`."""
 
 
 class FastTangent:
@@ -77,9 +77,9 @@ class FastTangent:
     def __init__(
         self,
         u: fem.Function,
-        sites: Sequence[TangentSite],
+        sites: Sequence[ElementIntegral],
         held: Sequence[Constraint],
-        moving: tuple[NDArray[np.bool_], Sequence[TangentSite]] | None = None,
+        moving: tuple[NDArray[np.bool_], Sequence[ElementIntegral]] | None = None,
     ) -> None:
         V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
         self._u, self._sites, self._nodes = u, sites, V.dofmap.list
@@ -104,7 +104,7 @@ class FastTangent:
         self._matrix.clear()
         first = 0
         for site in self._sites:
-            if stress and isinstance(site, Site):
+            if stress and isinstance(site, HessianIntegral):
                 site.replace_strain(self._u.x.array, stress, self._moving)
             site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
             first += len(site.coupling)
@@ -119,7 +119,7 @@ class FastTangent:
         same = np.zeros(self._same.shape)
         for site in self._near:
 
-            def couple(batch: int, K: Array, site: TangentSite = site) -> None:
+            def couple(batch: int, K: Array, site: ElementIntegral = site) -> None:
                 first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)
                 add_coupling_products(product, K, first, second, x)
 
@@ -133,14 +133,14 @@ class FastTangent:
         self._matrix.add_coupling(first + batch, K)
 
 
-def make_sites(
+def hessian_integrals(
     r0: fem.Function,
     degree: int,
     terms: Iterable[Term],
     log: KernelLog,
     prestress: Density | None = None,
     chosen: CellMask = None,
-) -> list[Site]:
+) -> list[HessianIntegral]:
     """The sites of some terms: all cells and all interior edges together, boundary edges term by
     term. Collective.
 
@@ -154,13 +154,15 @@ def make_sites(
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
         of_rule = [t for t in cells if t.density.quadrature == rule]
         batches = cell_batches(V, rule or cell_quadrature(degree), chosen)
-        sites.append(Site(r0, batches, 1, of_rule, log, None if rule else prestress))
+        sites.append(HessianIntegral(r0, batches, 1, of_rule, log, None if rule else prestress))
     if interior:
         sites.append(
-            Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log)
+            HessianIntegral(
+                r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log
+            )
         )
     for term in nonlinear:
         if term.density.facets is not None:
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, chosen)
-            sites.append(Site(r0, batches, 1, [term], log))
+            sites.append(HessianIntegral(r0, batches, 1, [term], log))
     return sites

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import FormulaGroup
 from magshell_fenicsx.models.shell.adaptive_sampling import (
-    AT_ONCE,
+    BATCH_SIZE,
     CHILDREN,
     Lattice,
-    Parts,
-    leaves,
+    SubCells,
+    refine_where_hidden,
 )
 
 Array = NDArray[np.float64]
@@ -36,18 +36,22 @@ Values = Callable[
 ]  # places and normals (cells, n, 3) -> (cells, n, components)
 Element: TypeAlias = basix.finite_element.FiniteElement
 INTERVAL, TRIANGLE = basix.CellType.interval, basix.CellType.triangle
-AGREED = 1e-4  # of the integral of |f|: interpolated formulas differ by less
-SMOOTH = 1e-6  # of the largest value: cells that differ by less stay interpolated
-PART = 5e-8  # of the integral of |f|: a part of a cell that differs by more is divided
-DEEPEST, MOST = 9, 400_000  # divisions, parts of all cells
-VISIBLE = 0.01  # of what the polynomials leave: a cell that counts
-FIRST = {1: 8, 2: 2, 3: 2}  # divisions of every cell, by its dimension
-LATTICE = {1: 8, 2: 4, 3: 2}  # places along each side of a part whose range is compared with them
-RULE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
+INTERPOLATION_TOLERANCE = 1e-4  # of the integral of |f|: interpolated formulas differ by less
+SMOOTH_CELL_TOLERANCE = 1e-6  # of the largest value: cells that differ by less stay interpolated
+PART_TOLERANCE = 5e-8  # of the integral of |f|: a part of a cell that differs by more is divided
+MAX_DIVISIONS, MAX_PARTS = 9, 400_000  # divisions, parts of all cells
+VISIBLE_SHARE = 0.01  # of what the polynomials leave: a cell that counts
+FIRST_DIVISIONS = {1: 8, 2: 2, 3: 2}  # divisions of every cell, by its dimension
+LATTICE_DIVISIONS = {
+    1: 8,
+    2: 4,
+    3: 2,
+}  # places along each side of a part whose range is compared with them
+RULE_DEGREE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
 
 
 @dataclass(frozen=True)
-class Cells:
+class CellGeometry:
     """The cells of this rank with their places, polynomials in each.
 
     Attributes
@@ -97,7 +101,7 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Fit:
+class ProjectedFormula:
     """A formula on cells.
 
     Attributes
@@ -127,16 +131,16 @@ class Fit:
     open: float = 0.0
 
 
-def fitted(
+def project_formula(
     values: Values,
-    cells: Cells,
+    cells: CellGeometry,
     nodal: Array,
     element: Element,
     degree: int,
     *,
     bounded: bool = False,
     formulas: FormulaGroup | None = None,
-) -> Fit:
+) -> ProjectedFormula:
     """A formula whose values at the nodes of each cell are known; collective.
 
     Parameters
@@ -151,8 +155,8 @@ def fitted(
     formulas
         What varies in them, so that nothing between the places is missed.
     """
-    d, parts = cells.dimension, _alike(cells)
-    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
+    d, parts = cells.dimension, _uniform_parts(cells)
+    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.at(X)
     f = values(x, normals)
     off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
@@ -164,22 +168,29 @@ def fitted(
     size, differs, square = map(float, sums)
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
     narrow = (
-        _narrow(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
+        _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
         if formulas
-        else _Narrow.nothing(len(scale))
+        else _HiddenDetail.nothing(len(scale))
     )
     hidden = scale * narrow.hidden
     more = float(cells.sum(hidden))
     size += more
-    if not (differs + more > AGREED * size or more > AGREED * narrow.variation):
-        return Fit(nodal, smooth=True, size=size, open=narrow.open)
+    if not (
+        differs + more > INTERPOLATION_TOLERANCE * size
+        or more > INTERPOLATION_TOLERANCE * narrow.variation
+    ):
+        return ProjectedFormula(nodal, smooth=True, size=size, open=narrow.open)
     largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
-    chosen = np.flatnonzero((off @ w > SMOOTH * largest * w.sum()) | (hidden > PART * size))
+    chosen = np.flatnonzero(
+        (off @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum()) | (hidden > PART_TOLERANCE * size)
+    )
     ahead = narrow.parts(chosen, parts)
     space = basix.create_element(
         basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
     )
-    integrals = _moments(values, cells, chosen, scale, ahead, PART * size, space, nodal.shape[-1])
+    integrals = _moments(
+        values, cells, chosen, scale, ahead, PART_TOLERANCE * size, space, nodal.shape[-1]
+    )
     moments, sizes[chosen], squares, missed = integrals
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
@@ -188,7 +199,9 @@ def fitted(
     unshown[chosen] = scale[chosen] * np.maximum(lost, 0.0)
     size, rest = float(cells.sum(sizes)), float(cells.sum(unshown))
     side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
-    widest = cells.comm.allreduce(float(side[unshown > VISIBLE * rest].max(initial=0.0)), MPI.MAX)
+    widest = cells.comm.allreduce(
+        float(side[unshown > VISIBLE_SHARE * rest].max(initial=0.0)), MPI.MAX
+    )
     at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
     if bounded:
         mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
@@ -200,27 +213,29 @@ def fitted(
     nothing = np.finfo(float).tiny  # a formula that is zero but on a line
     square_of[chosen] = scale[chosen] * squares
     share = float(np.sqrt(rest / max(square, float(cells.sum(square_of)), nothing)))
-    return Fit(new, False, size, missed / max(size, nothing), share, widest, narrow.open)
+    return ProjectedFormula(
+        new, False, size, missed / max(size, nothing), share, widest, narrow.open
+    )
 
 
-def _alike(cells: Cells) -> Parts:
+def _uniform_parts(cells: CellGeometry) -> SubCells:
     """The parts in which every cell is looked at first."""
     d = cells.dimension
-    parts = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
-    for _ in range(FIRST[d]):
+    parts = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
+    for _ in range(FIRST_DIVISIONS[d]):
         parts = parts.divided()
     return parts
 
 
-def sampling(cells: Cells) -> tuple[Array, Array]:
+def sampling_points(cells: CellGeometry) -> tuple[Array, Array]:
     """Their places (parts, q, d) in the reference cell, and weights (parts, q)."""
-    return _alike(cells).rule(
-        *basix.make_quadrature(cells.element.cell_type, RULE[cells.dimension])
+    return _uniform_parts(cells).rule(
+        *basix.make_quadrature(cells.element.cell_type, RULE_DEGREE[cells.dimension])
     )
 
 
 @dataclass(frozen=True)
-class _Narrow:
+class _HiddenDetail:
     """What is between the places of whole cells.
 
     Attributes
@@ -232,21 +247,21 @@ class _Narrow:
     leaves, deep
         Parts of divided cells, and whether each cell is one (cells,).
     open
-        See `Fit`.
+        See `ProjectedFormula`.
     """
 
     hidden: Array
     variation: float
-    leaves: Parts
+    refine_where_hidden: SubCells
     deep: NDArray[np.bool_]
     open: float
 
     @classmethod
-    def nothing(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_Narrow":
-        none = Parts(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
+    def nothing(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_HiddenDetail":
+        none = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
         return cls(np.zeros(cells), variation, none, np.zeros(cells, bool), open_)
 
-    def parts(self, chosen: Numbers, alike: Parts) -> Parts:
+    def parts(self, chosen: Numbers, alike: SubCells) -> SubCells:
         """Of some cells: those that are alike, but of the divided ones the leaves, none larger."""
         deep = self.deep[chosen]
         if not deep.any():
@@ -255,32 +270,37 @@ class _Narrow:
             self.leaves[np.isin(self.leaves.cell, chosen)],
             1.001 * np.abs(alike.sides[0, 0]),
         )
-        small, wide = list[Parts](), np.abs(parts.sides[:, 0]) > largest
+        small, wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
         while wide.any():
             small.append(parts[~wide])
             parts = parts[wide].divided()
             wide = np.abs(parts.sides[:, 0]) > largest
-        return Parts.together([alike.of(chosen[~deep]), *small, parts])
+        return SubCells.together([alike.of(chosen[~deep]), *small, parts])
 
 
-def _narrow(values: Values, formulas: FormulaGroup, cells: Cells, coarse: Array) -> _Narrow:
+def _find_hidden_detail(
+    values: Values, formulas: FormulaGroup, cells: CellGeometry, coarse: Array
+) -> _HiddenDetail:
     """Integrals (cells, components) compared with those over leaves, see `adaptive_sampling.leaves`;
     collective.
     """
     d, kind = cells.dimension, cells.element.cell_type
-    lattice, (points, weights) = Lattice.of(kind, LATTICE[d]), basix.make_quadrature(kind, RULE[d])
+    lattice, (points, weights) = (
+        Lattice.of(kind, LATTICE_DIVISIONS[d]),
+        basix.make_quadrature(kind, RULE_DEGREE[d]),
+    )
 
-    def look(parts: Parts) -> tuple[Array, Array]:
+    def look(parts: SubCells) -> tuple[Array, Array]:
         X, w = parts.rule(
             lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places))
         )
         x, _, area = cells.at(X, parts.cell)
         return x, (area * w).sum(axis=1)
 
-    first = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(
+    first = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(
         np.arange(len(cells.nodal))
     )
-    seen = leaves(formulas, first, look, lattice, cells.owned, cells.comm)
+    seen = refine_where_hidden(formulas, first, look, lattice, cells.owned, cells.comm)
     deep = np.zeros(len(cells.nodal), bool)
     divided = np.abs(seen.parts.sides[:, 0]) < 1
     deep[seen.parts.cell[divided]] = True
@@ -291,16 +311,16 @@ def _narrow(values: Values, formulas: FormulaGroup, cells: Cells, coarse: Array)
         np.add.at(fine, some.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     hidden = np.linalg.norm(fine - coarse, axis=1)
     if not cells.sum(hidden) > 0:
-        return _Narrow.nothing(len(hidden), seen.variation, seen.open)
-    return _Narrow(hidden, seen.variation, parts, deep, seen.open)
+        return _HiddenDetail.nothing(len(hidden), seen.variation, seen.open)
+    return _HiddenDetail(hidden, seen.variation, parts, deep, seen.open)
 
 
 def _moments(
     values: Values,
-    cells: Cells,
+    cells: CellGeometry,
     chosen: Numbers,
     scale: Array,
-    ahead: Parts,
+    ahead: SubCells,
     threshold: float,
     space: Element,
     components: int,
@@ -310,11 +330,11 @@ def _moments(
 
     Over the reference cell, but of |f| and the error over the surface; collective.
     """
-    points, weights = basix.make_quadrature(space.cell_type, RULE[cells.dimension])
+    points, weights = basix.make_quadrature(space.cell_type, RULE_DEGREE[cells.dimension])
     number = np.zeros(len(cells.nodal), np.int64)
     number[chosen] = np.arange(len(chosen))
 
-    def evaluated(some: Parts) -> tuple[Array, Array, Array, Array]:
+    def evaluated(some: SubCells) -> tuple[Array, Array, Array, Array]:
         X, w = some.rule(points, weights)
         x, normals, area = cells.at(X, some.cell)
         return X, w, area * w, values(x, normals)
@@ -330,9 +350,9 @@ def _moments(
         len(CHILDREN[cells.dimension]),
     )
     whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
-    for depth in range(DEEPEST + 1):
-        last = depth == DEEPEST or cells.comm.allreduce(len(ahead.cell)) > MOST
-        rest, left = list[Parts](), list[Array]()
+    for depth in range(MAX_DIVISIONS + 1):
+        last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(ahead.cell)) > MAX_PARTS
+        rest, left = list[SubCells](), list[Array]()
         for now, before in zip(ahead.pieces(), whole, strict=True):
             smaller = now.divided()
             X, w, area, f = evaluated(smaller)
@@ -355,11 +375,11 @@ def _moments(
                 np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
             left.append(fine[~kept])
-        ahead = Parts.together(rest) if rest else ahead
+        ahead = SubCells.together(rest) if rest else ahead
         if not cells.comm.allreduce(len(ahead.cell)):
             break
         together = np.concatenate([np.empty((0, components)), *left])
-        whole = [together[i : i + AT_ONCE] for i in range(0, len(together), AT_ONCE)]
+        whole = [together[i : i + BATCH_SIZE] for i in range(0, len(together), BATCH_SIZE)]
     return by_cell, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
 
 

@@ -28,11 +28,11 @@ from magshell_fenicsx.assembly.point_kernels import (
 )
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.element_hessians import NAMES, fill, parameters_at
+from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, fill, parameters_at
 
 Array = NDArray[np.float64]
-CHUNK = 16384  # points at a time: their vectors stay within some ten megabytes
-FRAME = 4  # numbers of a cell's frame, see `cell_frames`
+CHUNK_POINTS = 16384  # points at a time: their vectors stay within some ten megabytes
+FRAME_SIZE = 4  # numbers of a cell's frame, see `cell_frames`
 
 
 class PointTerm(Protocol):
@@ -83,18 +83,23 @@ class PointGradient:
         log: KernelLog,
     ) -> None:
         self._size = terms[0].density.sides * len(parts) * 3
-        chunk = max(CHUNK // each, 1) * each
+        chunk = max(CHUNK_POINTS // each, 1) * each
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         points = self._points = PointStorage(max(min(count, chunk), 1))
         self._u, placement, place = (
             points.field(size) for size in (self._size, self._size, geometry.shape[1])
         )
-        self._given = [_Given(placement, r0), _Given(place, Memo(lambda: geometry, tuple))]
+        self._given = [
+            _KernelInput(placement, r0),
+            _KernelInput(place, Memo(lambda: geometry, tuple)),
+        ]
         self._names, self._log = [term.name for term in terms], log
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
-            self._given += [_Given(target, _following(field, values)) for target, field in varying]
+            self._given += [
+                _KernelInput(target, _field_values(field, values)) for target, field in varying
+            ]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
                 self._work.append(
@@ -150,7 +155,7 @@ class PointGradient:
 
 
 @dataclass
-class _Given:
+class _KernelInput:
     """What a kernel takes besides u.
 
     Attributes
@@ -174,7 +179,7 @@ class _Given:
             self.filled = chunk, self.values.version
 
 
-def _following(field: fem.Function, values: Callable[[fem.Function], Array]) -> Memo[Array]:
+def _field_values(field: fem.Function, values: Callable[[fem.Function], Array]) -> Memo[Array]:
     return Memo(lambda: values(field), lambda: (memo_input(field),))
 
 
@@ -202,7 +207,7 @@ def _energy(
     perhaps v.
     """
     sides = range(density.sides)
-    frames = [[place[FRAME * side + i] for i in range(FRAME)] for side in sides]
+    frames = [[place[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
     r0_jets = [_jet(fields[0], side, parts) for side in sides]
     others = [
         [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
@@ -210,7 +215,7 @@ def _energy(
     ]
     if not density.on_edges:
         return frames[0][-1] * density.at([r0_jets, *others], None, parameters)
-    first = FRAME * density.sides
+    first = FRAME_SIZE * density.sides
     m = [ufl.as_vector([place[first + 2 * side], place[first + 2 * side + 1]]) for side in sides]
     return density.at([r0_jets, *others], (m, place[first + 2 * density.sides]), parameters)
 
@@ -222,4 +227,4 @@ def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
         part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)])
         for number, part in enumerate(parts)
     }
-    return Jet(*(vectors.get(name, ufl.zero(3)) for name in NAMES))
+    return Jet(*(vectors.get(name, ufl.zero(3)) for name in JET_NAMES))

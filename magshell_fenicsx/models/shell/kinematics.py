@@ -20,10 +20,10 @@ else:
     ufl = lazy_import("ufl")
 
 Vectors: TypeAlias = Any  # several expressions (3,), or arrays (..., 3)
-FIRST = ("r1", "r2")
-SECOND = ("r11", "r12", "r22")
-CURVED = (*FIRST, *SECOND)
-MOVED = ("r", *FIRST)
+FIRST_DERIVATIVES = ("r1", "r2")
+SECOND_DERIVATIVES = ("r11", "r12", "r22")
+ALL_DERIVATIVES = (*FIRST_DERIVATIVES, *SECOND_DERIVATIVES)
+VALUE_AND_FIRST = ("r", *FIRST_DERIVATIVES)
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lowered
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lower_index
 
 Array = NDArray[np.float64]
-SAME = 1e-6  # of directions
+DIRECTION_TOLERANCE = 1e-6  # of directions
 Triple: TypeAlias = tuple[
     Scalar, Scalar, Scalar
 ]  # 11, 22 and 12 of a stress, or twice 12 of a strain
@@ -61,7 +61,10 @@ class Laminate:
             return
         unit = self.axes @ self.direction / np.linalg.norm(self.direction)
         within = np.linalg.norm(np.cross(normals, unit), axis=-1)
-        if comm.allreduce(float(within.max(axis=1).min(initial=1.0)), MPI.MIN) < SAME:
+        if (
+            comm.allreduce(float(within.max(axis=1).min(initial=1.0)), MPI.MIN)
+            < DIRECTION_TOLERANCE
+        ):
             raise MeshError(
                 "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no direction"
             )
@@ -209,7 +212,7 @@ class _Frame:
 
     def twice(self, across: tuple[Scalar, Scalar]) -> Triple:
         """The same of c c, where the covector c has these components with index up."""
-        c = lowered(across, self._up)
+        c = lower_index(across, self._up)
         one, two = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return one**2, two**2, 2 * one * two
 

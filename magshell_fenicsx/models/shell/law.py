@@ -207,7 +207,7 @@ class Koiter(Law):
 
 
 @dataclass(frozen=True)
-class OfShells(Law):
+class LawByShell(Law):
     """Several shells, each with its own law; the first one's is that of the units.
 
     Attributes
@@ -255,7 +255,7 @@ class OfShells(Law):
         return replace(self._each(lambda law: law.made_of(e, nu)), which=which)
 
     @property
-    def linear(self) -> "OfShells":
+    def linear(self) -> "LawByShell":
         return (
             self
             if all(law.linear is law for law in self.laws)
@@ -329,7 +329,7 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
     )
 
 
-def lowered(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
+def lower_index(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
     """The components with index down of a covector, from those with index up; `up` is the inverse
     metric (2, 2).
     """
@@ -343,7 +343,7 @@ def work(S: Components, T: Tensor) -> Scalar:
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
 
 
-def elastic(
+def elastic_density(
     density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None
 ) -> Density:
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.

@@ -23,7 +23,10 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell.law import Scalar, Tensor
 from magshell_fenicsx.models.shell.rubber import Incompressible, Stretched, root
 
-SMALL, TERMS = 0.02, 10  # w below which the series is taken, and its terms: the next is below 1e-20
+SERIES_LIMIT, SERIES_TERMS = (
+    0.02,
+    10,
+)  # w below which the series is taken, and its terms: the next is below 1e-20
 
 
 @dataclass(frozen=True)
@@ -115,22 +118,24 @@ def _uneven(at: Stretched) -> Scalar:
 def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """V(w) of the order a, and two derivatives."""
     c = [0.0, a**2]
-    for k in range(1, TERMS):
+    for k in range(1, SERIES_TERMS):
         c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
     series = [
         _horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w)
         for n in range(3)
     ]
-    if a == int(a) and abs(a) <= TERMS:  # a polynomial
+    if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
         return series[0], series[1], series[2]
-    small = ufl.lt(w, SMALL) if isinstance(w, Expr) else np.real(w) < SMALL
-    far = _where(small, SMALL, w)
+    small = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
+    far = _conditional(small, SERIES_LIMIT, w)
     y = 1 + far
     p = (y + root(far * (2 + far))) ** a
     V = (p + 1 / p) / 2 - 1
     V1 = a * (p - 1 / p) / (2 * root(far * (2 + far)))
     V2 = (a**2 * (1 + V) - y * V1) / (far * (2 + far))
-    one, two, three = (_where(small, near, f) for near, f in zip(series, (V, V1, V2), strict=True))
+    one, two, three = (
+        _conditional(small, near, f) for near, f in zip(series, (V, V1, V2), strict=True)
+    )
     return one, two, three
 
 
@@ -141,7 +146,7 @@ def _horner(c: list[float], w: Scalar) -> Scalar:
     return total
 
 
-def _where(small: Any, one: Scalar, two: Scalar) -> Scalar:
+def _conditional(small: Any, one: Scalar, two: Scalar) -> Scalar:
     return (
         ufl.conditional(small, one, two) if isinstance(small, Expr) else np.where(small, one, two)
     )

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.expressions import formula_function
 from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
+from magshell_fenicsx.models.shell.kinematics import (
+    ALL_DERIVATIVES,
+    FIRST_DERIVATIVES,
+    SECOND_DERIVATIVES,
+    Edge,
+    Jet,
+)
 from magshell_fenicsx.platform.lazy_import import lazy_import
 from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, mirrors_formula
@@ -32,12 +38,12 @@ else:
 
 Array = NDArray[np.float64]
 Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
-SAMPLES = 24  # random surfaces on which a symmetry is looked for
-SAME = 1e-10  # difference of two values that is rounding, over the larger
+SYMMETRY_SAMPLES = 24  # random surfaces on which a symmetry is looked for
+SYMMETRY_TOLERANCE = 1e-10  # difference of two values that is rounding, over the larger
 OTHER_COORDINATES = np.array(
     [[1.1, 0.7], [-0.4, 0.8]]
 )  # by the jets' own: turned, stretched and sheared
-IN_COORDINATES, SURELY = (
+COORDINATE_SAMPLES, COORDINATE_TOLERANCE = (
     4,
     1e-6,
 )  # samples in both; difference of values, over the larger, that is not rounding
@@ -62,7 +68,7 @@ class Free:
 
 
 @dataclass(frozen=True)
-class ByPlace:
+class FormulaParameter:
     """A parameter that is a formula of x, y, z over R at the undeformed place: a number that varies
     over the surface.
 
@@ -123,7 +129,7 @@ class OwnTerm:
     parameters
         Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as
         mu can. A dolfinx function on the mesh that the shell was given on is a number, or a vector,
-        of its value at each place; a formula of the place (`ByPlace`) is a number.
+        of its value at each place; a formula of the place (`FormulaParameter`) is a number.
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
@@ -149,7 +155,7 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr] | None
-    parameters: tuple[float | Array | Free | UserField | ByPlace | Coefficient, ...] = ()
+    parameters: tuple[float | Array | Free | UserField | FormulaParameter | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
@@ -180,7 +186,7 @@ class OwnTerm:
             )
         if self.density and not self.parts:
             raise ValueError(f"{self.name}: the density does not depend on the displacement")
-        if self.density and (curved := [part for part in self.parts if part in SECOND]):
+        if self.density and (curved := [part for part in self.parts if part in SECOND_DERIVATIVES]):
             raise ValueError(
                 f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; without a term on "
                 "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
@@ -211,7 +217,9 @@ class OwnTerm:
     def placed_parts(self) -> tuple[str, ...]:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
         return tuple(
-            name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic.r0))
+            name
+            for name in ("r", *ALL_DERIVATIVES)
+            if name in (*FIRST_DERIVATIVES, *self._found_in(self._symbolic.r0))
         )
 
     @property
@@ -225,13 +233,13 @@ class OwnTerm:
         return any(isinstance(p, UserField | ufl.Coefficient) for p in self.parameters)
 
     @property
-    def by_place(self) -> tuple[ByPlace, ...]:
+    def by_place(self) -> tuple[FormulaParameter, ...]:
         """Its parameters that are formulas of the place."""
-        return tuple(p for p in self.parameters if isinstance(p, ByPlace))
+        return tuple(p for p in self.parameters if isinstance(p, FormulaParameter))
 
     def with_functions(
         self,
-        made: Callable[[ByPlace], Coefficient],
+        made: Callable[[FormulaParameter], Coefficient],
         carried: Callable[[UserField], Coefficient] | None = None,
     ) -> OwnTerm:
         """With functions of numbers (size,) on a model's mesh in place of formulas and of fields
@@ -239,7 +247,7 @@ class OwnTerm:
         """
 
         def function_of(p: Any) -> Any:
-            if isinstance(p, ByPlace):
+            if isinstance(p, FormulaParameter):
                 return made(p)
             return carried(p) if carried and isinstance(p, UserField) else p
 
@@ -271,7 +279,8 @@ class OwnTerm:
             return of
 
         parameters = (
-            replace(p, turn=angle) if isinstance(p, ByPlace) else p for p in self.parameters
+            replace(p, turn=angle) if isinstance(p, FormulaParameter) else p
+            for p in self.parameters
         )
         return replace(
             self,
@@ -330,7 +339,10 @@ class OwnTerm:
         if self.varying:
             return False
         order, S = (
-            [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")],
+            [
+                ("r", *ALL_DERIVATIVES).index(name)
+                for name in ("r", "r2", "r1", "r22", "r12", "r11")
+            ],
             mirror.reflection,
         )
 
@@ -380,7 +392,7 @@ class OwnTerm:
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (
-            Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED))))
+            Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(ALL_DERIVATIVES))))
             for _ in range(2)
         )
         m = ufl.Coefficient(
@@ -420,12 +432,12 @@ class OwnTerm:
         for column, density in zip(
             ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
         ):
-            for sample in _random_samples()[:IN_COORDINATES]:
+            for sample in _random_samples()[:COORDINATE_SAMPLES]:
                 one, other = (
                     self._value(sample, density),
                     self._value(_in_other_coordinates(sample), density),
                 )
-                if abs(one - other) > SURELY * max(
+                if abs(one - other) > COORDINATE_TOLERANCE * max(
                     abs(one), abs(other)
                 ):  # nan: it has no value there
                     raise ValueError(
@@ -437,7 +449,9 @@ class OwnTerm:
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(
-            name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in coefficients
+            name
+            for name in ("r", *ALL_DERIVATIVES)
+            if getattr(jet, name).ufl_operands[0] in coefficients
         )
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
@@ -453,7 +467,7 @@ class OwnTerm:
         """Whether the density, and each that is observed, is the same at two samples."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
-            if not abs(first - second) <= SAME * max(
+            if not abs(first - second) <= SYMMETRY_TOLERANCE * max(
                 abs(first), abs(second)
             ):  # nan: no symmetry is known
                 return False
@@ -482,8 +496,11 @@ def _random_samples() -> list[Sample]:
     """Jets of r0 and u, and covectors, always the same."""
     # within a box about as large as a shell
     rng = np.random.default_rng(2026)
-    jets, covectors = rng.uniform(-1, 1, (SAMPLES, 2, 6, 3)), rng.uniform(-1, 1, (SAMPLES, 2))
-    return [(jets[i, 0], jets[i, 1] / 4, covectors[i]) for i in range(SAMPLES)]
+    jets, covectors = (
+        rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2, 6, 3)),
+        rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2)),
+    )
+    return [(jets[i, 0], jets[i, 1] / 4, covectors[i]) for i in range(SYMMETRY_SAMPLES)]
 
 
 def _in_other_coordinates(sample: Sample) -> Sample:
@@ -501,8 +518,10 @@ def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array | Free | UserField | ByPlace | Coefficient) -> Expr:
-    if isinstance(value, ByPlace):  # of any value
+def _as_expression(
+    value: float | Array | Free | UserField | FormulaParameter | Coefficient,
+) -> Expr:
+    if isinstance(value, FormulaParameter):  # of any value
         value = 1.0
     if isinstance(value, UserField):
         value = np.where(value.largest == 0, 1.0, value.largest)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import Rubberlike
 from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
-from magshell_fenicsx.models.shell.law import Koiter, Law, OfShells
+from magshell_fenicsx.models.shell.law import Koiter, Law, LawByShell
 from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.spatial_fields import Pattern
@@ -18,7 +18,7 @@ from magshell_fenicsx.models.shell.rubber import Rubber
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldComponents:
     """These components of the displacement are zero, rotations are free."""
 
     components: tuple[int, ...]
@@ -26,11 +26,11 @@ class Held:
 
 # "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is
 # described
-Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
+Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | HeldComponents
 
 
 @dataclass(frozen=True)
-class OwnMaterial:
+class ShellMaterial:
     """The material of one of several shells: modulus and density over those of the first shell,
     Poisson's ratio, and the number of its law in `Material.laws`.
 
@@ -62,7 +62,7 @@ class Material:
     h: float
     rubber: Rubberlike | None = None
     laminate: Laminate | None = None
-    shells: Mapping[str, OwnMaterial] | None = None
+    shells: Mapping[str, ShellMaterial] | None = None
     laws: tuple[Law, ...] = ()
     laminates: Mapping[str, Laminate] = field(default_factory=dict)
 
@@ -70,7 +70,9 @@ class Material:
     def law(self) -> Law:
         """How a shell of it resists strains."""
         if self.laws:
-            return OfShells(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
+            return (
+                LawByShell(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
+            )
         if self.laminate:
             return Laminated.of(self.laminate, self.h, self.nu)
         if isinstance(self.rubber, tuple):
@@ -84,7 +86,7 @@ class Material:
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
     def law_in(self, cells: NDArray[np.float64] | None) -> Law:
-        """That of cells with these `OwnMaterial.numbers` (cells, 4), for arrays (cells, n); None
+        """That of cells with these `ShellMaterial.numbers` (cells, 4), for arrays (cells, n); None
         where all have one.
         """
         if cells is None:

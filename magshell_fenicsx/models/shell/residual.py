@@ -32,18 +32,18 @@ from magshell_fenicsx.models.shell.energy import (
     edge_quadrature,
 )
 from magshell_fenicsx.models.shell.gradients import (
-    FRAME,
+    FRAME_SIZE,
     PointGradient,
     PointTerm,
     in_own_coordinates,
 )
-from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
-from magshell_fenicsx.models.shell.element_hessians import NAMES, at_points
+from magshell_fenicsx.models.shell.kinematics import ALL_DERIVATIVES, FIRST_DERIVATIVES, Jet
+from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, at_points
 
 Array = NDArray[np.float64]
 
 
-class _Site(Protocol):
+class _ResidualPart(Protocol):
     names: list[str]
 
     def energy(self, nodal: Array, name: str) -> float:
@@ -94,12 +94,12 @@ class FastResidual:
         def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
             return term.density.quadrature, term.amplitude, term.name if apart else ""
 
-        sites: list[_Site] = []
+        sites: list[_ResidualPart] = []
         for this in dict.fromkeys(map(kind, on_cells)):
             together = [term for term in on_cells if kind(term) == this]
-            sites.append(_Cells(r0, this[0] or cell_quadrature(degree), together, log))
+            sites.append(_CellTerms(r0, this[0] or cell_quadrature(degree), together, log))
         if on_edges:
-            sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
+            sites.append(_EdgeTerms(r0, edge_quadrature(degree), on_edges, log))
         self._sites = sites
         self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
@@ -128,7 +128,7 @@ class FastResidual:
         return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
 
 
-class _Cells:
+class _CellTerms:
     """Terms with one amplitude on the owned cells."""
 
     def __init__(
@@ -140,10 +140,10 @@ class _Cells:
         table, each = ShapeTable.tabulate(V.element.basix_element, X), len(X)
         parts = [
             name
-            for name in NAMES
-            if name in FIRST or any(name in term.density.jet_parts for term in terms)
+            for name in JET_NAMES
+            if name in FIRST_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
         ]
-        self._sheet = PointSampling(table, self._weights, [NAMES.index(part) for part in parts])
+        self._sheet = PointSampling(table, self._weights, [JET_NAMES.index(part) for part in parts])
         cells, frames = (
             np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32),
             cell_frames(V.mesh),
@@ -197,7 +197,7 @@ class _Cells:
             yield chunk, cells
 
 
-class _Edges:
+class _EdgeTerms:
     """Terms on edges, interior and boundary: the jets on the edges of all cells are found together."""
 
     def __init__(
@@ -212,11 +212,11 @@ class _Edges:
         table = ShapeTable.tabulate(V.element.basix_element, X)
         parts = [
             name
-            for name in NAMES
-            if name in CURVED or any(name in term.density.jet_parts for term in terms)
+            for name in JET_NAMES
+            if name in ALL_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
         ]
         self._width = 3 * len(parts)
-        self._sheet = PointSampling(table, w, [NAMES.index(part) for part in parts])
+        self._sheet = PointSampling(table, w, [JET_NAMES.index(part) for part in parts])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
         self._there, self._back = (np.empty((len(cells) * len(X), self._width)) for _ in range(2))
         self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
@@ -228,7 +228,7 @@ class _Edges:
                 for name, (rows, _) in on_terms.items()
             }
 
-        on_terms = {term.name: _where(V, term.density, frames, each) for term in terms}
+        on_terms = {term.name: _points_on_edges(V, term.density, frames, each) for term in terms}
         placed = Memo(placements, lambda: (r0.x.array,))
 
         def placed_on(name: str) -> Array:
@@ -298,7 +298,7 @@ def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequen
     return np.stack([getattr(jet, part) for part in parts], axis=2)
 
 
-def _where(
+def _points_on_edges(
     V: fem.FunctionSpace, density: Density, frames: Array, each: int
 ) -> tuple[NDArray[np.intp], Array]:
     """(points, sides) among those of all cells' edges, and the geometry that `PointGradient` asks
@@ -319,7 +319,7 @@ def _where(
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
     sides = [
-        frames[cells].reshape(-1, FRAME * density.sides),
+        frames[cells].reshape(-1, FRAME_SIZE * density.sides),
         m.reshape(-1, 2 * density.sides),
         width[:, None],
     ]
@@ -374,7 +374,8 @@ def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
     """The derivatives of those terms that a parameter enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
     derivatives = [
-        Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered
+        Slope(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
+        for term in entered
     ]
     points = serve(derivatives) if derivatives else None
     for slope in derivatives:
@@ -383,7 +384,7 @@ def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
     return derivatives
 
 
-def derived(density: Density, p: fem.Constant) -> Density:
+def derivative_by(density: Density, p: fem.Constant) -> Density:
     """The density's derivative by a parameter of it."""
 
     def of(*arguments: Any) -> Expr:

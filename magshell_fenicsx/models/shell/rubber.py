@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.law import (
     Law,
     Scalar,
     Tensor,
-    lowered,
+    lower_index,
     trace,
 )
 
@@ -78,7 +78,7 @@ class Incompressible(Law):
     def edge_moment(
         self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
     ) -> Scalar:
-        M, (c1, c2) = self.moment(E, K, up), lowered(across, up)
+        M, (c1, c2) = self.moment(E, K, up), lower_index(across, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(
@@ -87,7 +87,7 @@ class Incompressible(Law):
         of_square, of_mixed, _, of_drawn = self._stiffness(
             at := Stretched(E, up)
         )  # c c has no determinant
-        (c1, c2), (a11, a12, a22) = lowered(across, up), at.inverse
+        (c1, c2), (a11, a12, a22) = lower_index(across, up), at.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return of_square * T**2 - of_mixed * T * square + of_drawn * square**2
 

@@ -15,20 +15,30 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
 from magshell_fenicsx.mesh.user_mesh import lagrange_element
-from magshell_fenicsx.models.shell.formula_projection import Cells, Element, Fit, fitted
-from magshell_fenicsx.models.shell.own_term import ByPlace
+from magshell_fenicsx.models.shell.formula_projection import (
+    CellGeometry,
+    Element,
+    ProjectedFormula,
+    project_formula,
+)
+from magshell_fenicsx.models.shell.own_term import FormulaParameter
 
 Array = NDArray[np.float64]
-LARGEST = 1e6  # of a remanence's components
-FINER = 2  # degrees of a load by formula above that of the displacement: no part of the error
-INSIDE = 1e-10  # of the way from a node to the middle of its cell
-NEWTON, SETTLED = 30, 1e-13  # steps to a reference point, and a step that is rounding
+MAX_COMPONENT = 1e6  # of a remanence's components
+ADDED_LOAD_DEGREE = (
+    2  # degrees of a load by formula above that of the displacement: no part of the error
+)
+INWARD_SHARE = 1e-10  # of the way from a node to the middle of its cell
+MAX_NEWTON_STEPS, NEWTON_STEP_TOLERANCE = (
+    30,
+    1e-13,
+)  # steps to a reference point, and a step that is rounding
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
-Inside = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they are within a rim
+InsideRim = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they are within a rim
 
 
-class OfPlacement(fem.Function):  # type: ignore[misc]  # dolfinx has no types
+class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
     """A field that follows from the placement; `again` makes it from another one, which may jump
     from cell to cell.
     """
@@ -88,7 +98,7 @@ class WithinRims:
     overlap counts.
     """
 
-    within: tuple[tuple[Inside, Array], ...]
+    within: tuple[tuple[InsideRim, Array], ...]
     outside: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
@@ -111,7 +121,7 @@ class ByPatch:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PosedPattern:
     """The pattern of one shell of several in its own frame, times a factor."""
 
     pattern: Pattern
@@ -140,7 +150,7 @@ class PatternsByPatch:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class CellPolynomials:
     """What is given in each cell as a polynomial of its own; the places are the same in all cells.
 
     Attributes
@@ -153,7 +163,7 @@ class Carried:
 
     values: Array
     of: Element
-    cells: Cells
+    cells: CellGeometry
 
     def __call__(self, r0: Array, n0: Array | None = None) -> Array:
         table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[
@@ -178,17 +188,19 @@ class Carried:
         """The reference points (n, 2) of places (n, 3) of the first cell, by Newton's method."""
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
-        for _ in range(NEWTON):
+        for _ in range(MAX_NEWTON_STEPS):
             x, a1, a2 = (each[..., 0] @ nodal for each in element.tabulate(1, X))
             slopes = np.stack([a1, a2], axis=-1)
             step = np.einsum("nai,ni->na", np.linalg.pinv(slopes), places - x)
             X = X + step
-            if np.abs(step).max() < SETTLED:
+            if np.abs(step).max() < NEWTON_STEP_TOLERANCE:
                 break
         return X
 
 
-def carried(given: UserField, midsurface: Midsurface, cells: Cells) -> Carried:
+def user_field_polynomials(
+    given: UserField, midsurface: Midsurface, cells: CellGeometry
+) -> CellPolynomials:
     """What was given on the mesh, in the cells of this rank.
 
     Raises
@@ -201,7 +213,7 @@ def carried(given: UserField, midsurface: Midsurface, cells: Cells) -> Carried:
             f"{given.name}: is a function of degree {given.degree}; allowed is at most that of the displacement, "
             f"{cells.element.degree}"
         )
-    return Carried(midsurface.in_cells(given), lagrange_element(given.degree), cells)
+    return CellPolynomials(midsurface.in_cells(given), lagrange_element(given.degree), cells)
 
 
 def by_patch(
@@ -255,8 +267,8 @@ def pattern_field(
     name: str = "Br",
     key: str = "magnetic.remanent",
     size: int = 3,
-) -> tuple[OfPlacement, float | None]:
-    """The pattern in every cell, free to jump from cell to cell, see `shown`; collective.
+) -> tuple[PlacementField, float | None]:
+    """The pattern in every cell, free to jump from cell to cell, see `project_pattern`; collective.
 
     Parameters
     ----------
@@ -278,18 +290,20 @@ def pattern_field(
     """
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
-    nodes, n0 = places(r0, Q.element.basix_element.points)
-    field = OfPlacement(
+    nodes, n0 = positions_and_normals(r0, Q.element.basix_element.points)
+    field = PlacementField(
         Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
     )
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
-    fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
+    fit = project_pattern(
+        pattern, cell_geometry(r0), pattern(inside_cells(nodes), n0), Q.element.basix_element
+    )
     field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
     around = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
     return field, None if fit.smooth else around * fit.size
 
 
-def field_of_place(r0: fem.Function, parameter: ByPlace) -> fem.Function:
+def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
     """A formula in every cell, of shape (1,), see `pattern_field`; collective."""
     return pattern_field(
         Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
@@ -303,7 +317,7 @@ def pattern_on_edge(
     along them.
     """
     V = r0.function_space
-    field, _ = pattern_field(Nodal(pattern), r0, finer)
+    field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
     field.again = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
     Q, topology = field.function_space, V.mesh.topology
     topology.create_connectivity(1, 2)
@@ -331,9 +345,9 @@ def pattern_on_edge(
         len(cells), -1, 3
     )
     owned = int(np.sum(facets < topology.index_map(1).size_local))
-    edge = Cells(line, nodal, owned, V.mesh.comm)
+    edge = CellGeometry(line, nodal, owned, V.mesh.comm)
     x, normals, _ = edge.at(along.points)
-    fit = shown(pattern, edge, pattern(inside(x), normals), along)
+    fit = project_pattern(pattern, edge, pattern(inside_cells(x), normals), along)
     nodes = element.points
     near = [
         [int(np.argmin(np.linalg.norm(nodes - p, axis=1))) for p in side(along.points, i)]
@@ -348,7 +362,7 @@ def pattern_on_edge(
 
 
 @dataclass(frozen=True)
-class Nodal:
+class InterpolatedPattern:
     """A pattern that is interpolated, whatever it is."""
 
     pattern: Pattern
@@ -357,11 +371,11 @@ class Nodal:
         return self.pattern(r0, n0)
 
 
-def cells_of(r0: fem.Function) -> Cells:
+def cell_geometry(r0: fem.Function) -> CellGeometry:
     """The cells of a placement, or of a meridian's."""
     V = r0.function_space
     owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
-    return Cells(
+    return CellGeometry(
         V.element.basix_element,
         r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list],
         owned,
@@ -369,24 +383,26 @@ def cells_of(r0: fem.Function) -> Cells:
     )
 
 
-def shown(pattern: Pattern, cells: Cells, nodal: Array, element: Element) -> Fit:
+def project_pattern(
+    pattern: Pattern, cells: CellGeometry, nodal: Array, element: Element
+) -> ProjectedFormula:
     """A pattern in every cell from its values at the nodes: a formula as it has the same moments;
     collective.
     """
     if not getattr(pattern, "by_formula", False):
-        return Fit(nodal, smooth=True, size=0.0)
+        return ProjectedFormula(nodal, smooth=True, size=0.0)
     formulas = getattr(pattern, "formulas", None)
-    return fitted(pattern, cells, nodal, element, cells.element.degree, formulas=formulas)
+    return project_formula(pattern, cells, nodal, element, cells.element.degree, formulas=formulas)
 
 
-def inside(nodes: Array) -> Array:
+def inside_cells(nodes: Array) -> Array:
     """Places (cells, nodes, 3) just inside their cells: a formula that jumps between two cells has
     both its values.
     """
-    return np.asarray(nodes + INSIDE * (nodes.mean(axis=1, keepdims=True) - nodes))
+    return np.asarray(nodes + INWARD_SHARE * (nodes.mean(axis=1, keepdims=True) - nodes))
 
 
-def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
+def positions_and_normals(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
     """The nodes of every cell, or other reference points (n, 2), and the cell's normals there:
     (cells, n, 3) each.
 
@@ -405,15 +421,15 @@ def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
     return x, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
-def cells_of_body(V: fem.FunctionSpace) -> Cells:
+def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
     """The cells of a body."""
     owned = V.mesh.topology.index_map(3).size_local
-    return Cells(
+    return CellGeometry(
         V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm
     )
 
 
-def places_in_body(V: fem.FunctionSpace) -> tuple[Array, Array]:
+def body_positions_and_normals(V: fem.FunctionSpace) -> tuple[Array, Array]:
     """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3)
     each.
     """
@@ -448,11 +464,16 @@ def field_in_body(
     MeshError
         On every rank, if it has no finite value somewhere.
     """
-    nodes, normals = places_in_body(V)
+    nodes, normals = body_positions_and_normals(V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (size,)))
     field = fem.Function(Q, name=name)
     refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm, key)
-    fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
+    fit = project_pattern(
+        pattern,
+        body_cell_geometry(V),
+        pattern(inside_cells(nodes), normals),
+        Q.element.basix_element,
+    )
     field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
     return field
 
@@ -468,7 +489,7 @@ def refuse_unbounded(
         On every rank, if a vector is not finite.
     """
     refuse_places(
-        nodes[~(np.abs(vectors) <= LARGEST).all(axis=-1)],
-        f"{key}: has no finite value (or one above {LARGEST:g})",
+        nodes[~(np.abs(vectors) <= MAX_COMPONENT).all(axis=-1)],
+        f"{key}: has no finite value (or one above {MAX_COMPONENT:g})",
         comm,
     )

@@ -13,12 +13,17 @@ from magshell_fenicsx.input.expressions import FormulaGroup
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.mesh.patch import MeshError, UserField, refuse_places
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.formula_projection import Cells, fitted
-from magshell_fenicsx.models.shell.parameters import OwnMaterial
-from magshell_fenicsx.models.shell.spatial_fields import Carried, OfPlacement, cells_of, places
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry, project_formula
+from magshell_fenicsx.models.shell.parameters import ShellMaterial
+from magshell_fenicsx.models.shell.spatial_fields import (
+    CellPolynomials,
+    PlacementField,
+    cell_geometry,
+    positions_and_normals,
+)
 
 Array = NDArray[np.float64]
-LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
+MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR = 1e-3, 1e3
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Thickness:
     patches: "Mapping[str, float | PlacedFactor] | None" = None
     formulas: FormulaGroup | None = None
     given: UserField | None = None
-    carried: Carried | None = None
+    carried: CellPolynomials | None = None
 
     def at(self, x: Array) -> Array:
         """Its values at places (..., 3), without patches; of what is given in cells (cells, n, 3)."""
@@ -46,12 +51,12 @@ class Thickness:
             else np.ones(x.shape[:-1])
         )
 
-    def shown(self, cells: Cells, nodal: Array) -> Array:
-        """The values (cells, nodes) of a formula as `fitted`; collective."""
+    def shown(self, cells: CellGeometry, nodal: Array) -> Array:
+        """The values (cells, nodes) of a formula as `project_formula`; collective."""
         if self.of_position is None:
             return nodal
         element = cells.element
-        fit = fitted(
+        fit = project_formula(
             lambda x, n: self.at(x)[..., None],
             cells,
             nodal[..., None],
@@ -71,7 +76,7 @@ class PlacedFactor:
     place: ShellPose
     times: float
 
-    def in_cells(self, cells: Cells) -> Array:
+    def in_cells(self, cells: CellGeometry) -> Array:
         """Its values (cells, nodes) in cells in space, or on a meridian around its axis;
         collective.
         """
@@ -92,8 +97,8 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
         On every rank, if it is not positive somewhere.
     """
     refuse_places(
-        x[~((factors >= LEAST_FACTOR) & (factors <= MOST_FACTOR))],
-        f"shell.thickness_factor: is not within {LEAST_FACTOR:g} to {MOST_FACTOR:g}",
+        x[~((factors >= MIN_THICKNESS_FACTOR) & (factors <= MAX_THICKNESS_FACTOR))],
+        f"shell.thickness_factor: is not within {MIN_THICKNESS_FACTOR:g} to {MAX_THICKNESS_FACTOR:g}",
         comm,
     )
 
@@ -109,31 +114,31 @@ def thickness_field(
         On every rank, if it is not positive somewhere, or a patch is unknown.
     """
     V = r0.function_space
-    nodes, _ = places(r0)
+    nodes, _ = positions_and_normals(r0)
     values = thickness.at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     if thickness.carried:
         between, sampled = thickness.carried.between()
         refuse_unfit(between[..., 0], sampled, V.mesh.comm)
-    values = thickness.shown(cells_of(r0), values)
+    values = thickness.shown(cell_geometry(r0), values)
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
         values[inside] = (
-            factor.in_cells(some(cells_of(r0), inside))
+            factor.in_cells(select_cells(cell_geometry(r0), inside))
             if isinstance(factor, PlacedFactor)
             else factor
         )
     refuse_unfit(values, nodes, V.mesh.comm)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
-    field = OfPlacement(Q, "thickness", lambda r: thickness_field(thickness, r, patches))
+    field = PlacementField(Q, "thickness", lambda r: thickness_field(thickness, r, patches))
     field.x.array[Q.dofmap.list] = values
     return field
 
 
 def material_field(
-    shells: Mapping[str, OwnMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
+    shells: Mapping[str, ShellMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
 ) -> fem.Function:
-    """`OwnMaterial.numbers` of each cell; shape (4,).
+    """`ShellMaterial.numbers` of each cell; shape (4,).
 
     `patches` tell for each cell of this rank, ghosts too, whether it belongs to a shell.
     """
@@ -145,7 +150,7 @@ def material_field(
     return field
 
 
-def some(cells: Cells, which: NDArray[np.bool_]) -> Cells:
+def select_cells(cells: CellGeometry, which: NDArray[np.bool_]) -> CellGeometry:
     """Some of this rank's cells."""
     return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
 
@@ -166,7 +171,7 @@ def patch_of(
     return patches[name]
 
 
-def thick(density: Density, t: fem.Function, component: int = 0) -> Density:
+def thickness_weighted(density: Density, t: fem.Function, component: int = 0) -> Density:
     """A density per E h times a component of the field t; its first is by default the thickness
     over h.
     """

@@ -13,7 +13,7 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.densities import around
+from magshell_fenicsx.models.shell.densities import field_at_displacement
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
@@ -64,8 +64,8 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """That of a field known by values, without its value at u = 0; P as of `applied.around`."""
-    B, change = around(P, u)
+    """That of a field known by values, without its value at u = 0; P as of `field_at_displacement`."""
+    B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
@@ -86,17 +86,17 @@ def pressure(
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
 
 
-def swept(
+def swept_volume(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0
 ) -> Expr:
-    """As `models.shell.densities.swept`: the volume that a face sweeps, per area of its
+    """As `models.shell.densities.swept_volume`: the volume that a face sweeps, per area of its
     coordinates.
     """
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
 
 
-def following(
+def follower_pressure_work(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, v: Expr, unit: Expr
 ) -> Expr:
     """v . n da: the virtual work of p = 1 in that unit, per area of the face's coordinates."""
@@ -110,14 +110,16 @@ def sealing(
     return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
 
 
-def swept_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr) -> Expr:
-    """`swept` on a part of an end, per undeformed area."""
-    return swept(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit)
+def swept_volume_on_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr) -> Expr:
+    """`swept_volume` on a part of an end, per undeformed area."""
+    return swept_volume(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit)
 
 
-def following_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, v: Expr, unit: Expr) -> Expr:
-    """`following` on a part of an end, per undeformed area."""
-    return following(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), v, unit)
+def follower_pressure_work_on_end(
+    X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, v: Expr, unit: Expr
+) -> Expr:
+    """`follower_pressure_work` on a part of an end, per undeformed area."""
+    return follower_pressure_work(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), v, unit)
 
 
 def turning(

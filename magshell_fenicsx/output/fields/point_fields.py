@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.shell.spatial_fields import inside
+from magshell_fenicsx.models.shell.spatial_fields import inside_cells
 from magshell_fenicsx.models.shell.strains import (
     NaturalFrame,
     TangentFrame,
@@ -328,19 +328,19 @@ class PointFields:
         self._magnetisation, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
         self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
         if field and field.soft:
-            self.susceptibility = field.soft.at(inside(r0[0]), self.n0)[..., None]
+            self.susceptibility = field.soft.at(inside_cells(r0[0]), self.n0)[..., None]
         if field and field.soft and field.soft.alone:
             self._magnetisation, field = None, None
         if self._magnetisation:
             pattern = self._magnetisation.remanent
             self.Br = (
-                pattern(inside(r0[0]), self.n0)
+                pattern(inside_cells(r0[0]), self.n0)
                 if callable(pattern)
                 else np.broadcast_to(pattern, r0[0].shape)
             )
         if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
-            self.constant, self._torque = magnetic_loads(self._geometry(), field, inside(r0[0]), h)
+            self.constant, self._torque = magnetic_loads(self._geometry(), field, inside_cells(r0[0]), h)
 
     @property
     def jet(self) -> Array:
@@ -386,7 +386,7 @@ class PointFields:
                 deformed_area_vector, axis=-1, keepdims=True
             )
             fields["J"] = self._field.soft.polarisation(
-                inside(frame.jet[0]), self.n0, deformed_normal, fields["Ba"]
+                inside_cells(frame.jet[0]), self.n0, deformed_normal, fields["Ba"]
             )
         if self._torque:
             fields["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.models.shell.law import Law, OfShells
-from magshell_fenicsx.models.shell.spatial_fields import inside
+from magshell_fenicsx.models.shell.law import Law, LawByShell
+from magshell_fenicsx.models.shell.spatial_fields import inside_cells
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import (
     RecoveredShell,
@@ -199,12 +199,12 @@ class SurfaceGatherer:
         loads, fields = self._model.loads, self._fields
         prescribed = [fields.Br, fields.susceptibility]
         if loads.natural:
-            prescribed += loads.natural.at(inside(r), fields.n0)
+            prescribed += loads.natural.at(inside_cells(r), fields.n0)
         thickness = self._thickness(self._reference_nodes)
         if self._model.midsurface.shells:
             prescribed.append(self._shell_numbers())
         materials = self._cell_materials()
-        if isinstance(self._model.material.law, OfShells) and materials is not None:
+        if isinstance(self._model.material.law, LawByShell) and materials is not None:
             prescribed.append(np.repeat(materials[:, None, 3], r.shape[1], axis=1))
         if thickness is not None:
             prescribed.append(thickness)

@@ -13,10 +13,10 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyMesh, face_measure
 from magshell_fenicsx.models.shell.spatial_fields import (
     Pattern,
-    cells_of_body,
-    places_in_body,
+    body_cell_geometry,
+    body_positions_and_normals,
     refuse_unbounded,
-    shown,
+    project_pattern,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, within
@@ -55,7 +55,7 @@ class BodyMeasures:
         )
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        nodes, normals = places_in_body(self._V)
+        nodes, normals = body_positions_and_normals(self._V)
         z = self._body.at_nodes(
             self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
         )[self._V.dofmap.list]
@@ -65,8 +65,8 @@ class BodyMeasures:
         vectors = pattern(nodes - z[..., None] * normals, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
         if edge is None:
-            middle = replace(cells_of_body(self._V), nodal=nodes - z[..., None] * normals)
-            vectors = shown(
+            middle = replace(body_cell_geometry(self._V), nodal=nodes - z[..., None] * normals)
+            vectors = project_pattern(
                 pattern, middle, vectors, field.function_space.element.basix_element
             ).nodal
         field.x.array.reshape(-1, 3)[field.function_space.dofmap.list] = vectors

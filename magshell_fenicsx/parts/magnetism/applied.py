@@ -19,7 +19,7 @@ from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter,
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.assembly.terms import FormTerm, Term
-from magshell_fenicsx.models.shell.densities import PAIRS, SIZE
+from magshell_fenicsx.models.shell.densities import COMPONENT_PAIRS, FIELD_POLYNOMIAL_SIZE
 from magshell_fenicsx.models.shell.spatial_fields import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.moving_source import (
     FieldAtPlaces,
@@ -97,7 +97,7 @@ class AppliedField:
     ) -> None:
         V = u.function_space
         self._degree = degree
-        self.polynomial = PointField(V.mesh, degree, SIZE)
+        self.polynomial = PointField(V.mesh, degree, FIELD_POLYNOMIAL_SIZE)
         self._field_at_rest, self._moving_fields, self._u = field_at_rest, moving_fields, u
         self.mu = {name: 0.0 for field in moving_fields for name in field.names}
         self.lost = ""
@@ -127,7 +127,7 @@ class AppliedField:
         B, G, H = self._total_field(self._values_at_rest.renew(), x)
         is_lost = ~np.isfinite(B).all(axis=1)
         self.lost = self._lost_description(x[is_lost][0]) if is_lost.any() else self.lost
-        second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+        second = H[:, :, *COMPONENT_PAIRS] * np.where(COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0)
         columns = [array.reshape(*u.shape[:2], -1) for array in (u, self._B0, B, G, second)]
         return np.concatenate(columns, axis=-1)
 
@@ -140,7 +140,7 @@ class AppliedField:
             Whether they are about the present places; else they are changes of the polynomials
             there.
         """
-        field = PointField(self._u.function_space.mesh, self._degree, SIZE)
+        field = PointField(self._u.function_space.mesh, self._degree, FIELD_POLYNOMIAL_SIZE)
         field.compute_by(
             lambda: self._slopes(name, other, at_present_places=at_present_places),
             lambda: (self.polynomial.renew(),),

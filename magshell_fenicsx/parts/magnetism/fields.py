@@ -374,12 +374,12 @@ class MagneticSection(Section, Ability):
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.spatial_fields import (
-            LARGEST,
+            MAX_COMPONENT,
         )  # the solver takes long to import
 
         if self.remanent and isinstance(self.remanent.components, list):
             yield Formulas(
-                "magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0
+                "magnetic.remanent.components", self.remanent.components, -MAX_COMPONENT, MAX_COMPONENT, 1.0
             )
         if isinstance(self.susceptibility, str):
             yield Formulas(

@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.observables import Sight
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.model_base import Observed
+    from magshell_fenicsx.shells.model_base import ModelBase
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -75,7 +75,7 @@ class InteractionTerm:
 
     group, column = "magnetic", "magnetic"
 
-    def __init__(self, model: "Observed", u: fem.Function, interaction: Interaction) -> None:
+    def __init__(self, model: "ModelBase", u: fem.Function, interaction: Interaction) -> None:
         self.name = self.amplitude = AMPLITUDE
         self._acts_on_itself = interaction.itself
         self._model, self._u = model, u

@@ -14,12 +14,12 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.control_points import ByControls, Controls
+from magshell_fenicsx.models.shell.control_points import ControlledPattern, ControlPoints
 from magshell_fenicsx.models.shell.spatial_fields import (
     Components,
-    Inside,
+    InsideRim,
     Pattern,
-    Placed,
+    PosedPattern,
     WithinRims,
     radial,
     tangential,
@@ -58,7 +58,7 @@ Array = NDArray[np.float64]
 EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
 
 
-def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
+def by_points(section: RemanentSection, turn: float = 0.0) -> ControlledPattern:
     """Return a remanence by vectors at points, in a frame turned by `turn` about e3 (rad).
 
     Raises
@@ -68,14 +68,14 @@ def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
     """
     places, vectors = read_vectors(section.path, "magnetic.remanent.file", section.files)
     assert section.filter
-    return ByControls(Controls(places, section.filter), vectors, rotation(turn) if turn else None)
+    return ControlledPattern(ControlPoints(places, section.filter), vectors, rotation(turn) if turn else None)
 
 
 def magnetisation(
     magnetic: MagneticSection,
     context: Context,
     turn: float,
-    patch_rims: Mapping[str, Inside],
+    patch_rims: Mapping[str, InsideRim],
     to: Sequence[Direction] = (),
 ) -> Magnetisation:
     """Return the magnetisation of a case, in a frame turned by `turn` about e3 (rad).
@@ -134,7 +134,7 @@ def magnetisation(
 
 
 def soft_magnet(
-    context: Context, turn: float, patch_rims: Mapping[str, Inside]
+    context: Context, turn: float, patch_rims: Mapping[str, InsideRim]
 ) -> SoftMagnet | None:
     """Return the soft-magnetic material, in a frame turned by `turn` about e3 (rad).
 
@@ -179,12 +179,12 @@ def _on_patch(section: Direction, context: Context, turn: float) -> Array | Patt
     return (
         factor * remanence @ place.Q.T
         if isinstance(remanence, np.ndarray)
-        else Placed(remanence, place, factor)
+        else PosedPattern(remanence, place, factor)
     )
 
 
 def _remanence(
-    section: RemanentSection, context: Context, turn: float, patch_rims: Mapping[str, Inside]
+    section: RemanentSection, context: Context, turn: float, patch_rims: Mapping[str, InsideRim]
 ) -> NDArray[np.float64] | Pattern:
     """Return the remanence over its magnitude, without patches of a mesh."""
     if section.kind == "radial":
@@ -234,7 +234,7 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     patterns = {
         name: remanence
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
-        if isinstance(remanence, Placed)
+        if isinstance(remanence, PosedPattern)
     }
     for name, pattern in patterns.items():
         if pattern.pattern in (radial, tangential):

@@ -9,7 +9,7 @@ stretches: smooth at equal stretches too. In units and arguments as `densities`.
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.models.shell.densities import around
+from magshell_fenicsx.models.shell.densities import field_at_displacement
 
 STEPS = 3  # from sqrt(3 I): rounding after three, for any stretches from 0.05 to 20
 
@@ -29,8 +29,8 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """Return the energy of a field known by values, less its value at u = 0; P see `around`."""
-    B, change = around(P, u)
+    """Return the energy of a field known by values, less its value at u = 0; P see `field_at_displacement`."""
+    B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 

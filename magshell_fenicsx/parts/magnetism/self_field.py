@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Image, rotation
-from magshell_fenicsx.models.shell.spatial_fields import Uniform, pattern_field, places
+from magshell_fenicsx.models.shell.spatial_fields import Uniform, pattern_field, positions_and_normals
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charges import (
@@ -86,7 +86,7 @@ class SelfField:
 
     def _node_places(self) -> tuple[Array, Array]:
         """Return places and normals at the nodes of cells."""
-        return places(self._model.r0)
+        return positions_and_normals(self._model.r0)
 
     def _interpolation_element(self) -> Any:
         """Return the element that interpolates a remanence that rotates or is induced."""

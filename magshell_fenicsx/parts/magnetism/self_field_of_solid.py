@@ -10,7 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import QUADRATURE_DEGREE
-from magshell_fenicsx.models.shell.spatial_fields import field_in_body, places_in_body
+from magshell_fenicsx.models.shell.spatial_fields import field_in_body, body_positions_and_normals
 from magshell_fenicsx.parts.magnetism.charges import ChargedElements
 from magshell_fenicsx.parts.magnetism.charges_of_solid import (
     CellFaces,
@@ -38,7 +38,7 @@ class SelfFieldOfSolid(SelfField):
         return field_in_body(self._pattern, self._model.r0.function_space)
 
     def _node_places(self) -> tuple[Array, Array]:
-        return places_in_body(self._model.r0.function_space)
+        return body_positions_and_normals(self._model.r0.function_space)
 
     def _interpolation_element(self) -> Any:
         family, degree = (

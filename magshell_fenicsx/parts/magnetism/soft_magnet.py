@@ -22,7 +22,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.densities import around
+from magshell_fenicsx.models.shell.densities import field_at_displacement
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.parts.magnetism import saturation
 
@@ -121,7 +121,7 @@ class Sheet:
         count = len(self.amplitudes)
         numbers, parts = given[:count], given[count:]
         if self.field.in_space:
-            B, change = around(parts[0], u)
+            B, change = field_at_displacement(parts[0], u)
             return numbers[0] * B, numbers[0] * (B - change)
         B = sum((number * part for number, part in zip(numbers, parts, strict=False)), ufl.zero(3))
         if self.field.gradient is None:

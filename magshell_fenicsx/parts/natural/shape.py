@@ -33,15 +33,15 @@ from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
-from magshell_fenicsx.models.shell.formula_projection import Cells, fitted
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry, project_formula
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.spatial_fields import (
-    OfPlacement,
+    PlacementField,
     Pattern,
     by_patch,
-    cells_of,
-    cells_of_body,
-    places_in_body,
+    cell_geometry,
+    body_cell_geometry,
+    body_positions_and_normals,
 )
 
 Array = NDArray[np.float64]
@@ -164,7 +164,7 @@ def meridians(r0: Array, n0: Array) -> Array:
     return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
 
 
-def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.Function:
+def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -> fem.Function:
     """Return the natural shape as a field that may jump between cells of V; collective.
 
     Raises
@@ -183,12 +183,12 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
     if problems := [text for text in V.mesh.comm.allgather(message) if text]:
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
-    field = OfPlacement(
-        Q, "natural", lambda r: natural_field(natural, cells_of(r), r.function_space)
+    field = PlacementField(
+        Q, "natural", lambda r: natural_field(natural, cell_geometry(r), r.function_space)
     )
     values = _numbers(T, kappa, t)
     if any(getattr(value, "by_formula", False) for value in (natural.stretch, natural.curvature)):
-        fitted_numbers = fitted(
+        fitted_numbers = project_formula(
             lambda x, n: _numbers(*natural.at(x, n)),
             cells,
             values,
@@ -254,10 +254,10 @@ class Shape:
         """
         assert self.stretch is not None
         return np.asarray(
-            np.polynomial.polynomial.polyval(float(self.stretch.value), self.volumes(first, points))
+            np.polynomial.polynomial.polyval(float(self.stretch.value), self.volume_coefficients(first, points))
         )
 
-    def volumes(self, first: Array, points: Array) -> Array:
+    def volume_coefficients(self, first: Array, points: Array) -> Array:
         """Return the coefficients (4, cells, places) of det(1 + mu T) (1 + mu t) by powers of mu.
 
         mu is the amplitude of the stretch.
@@ -370,10 +370,10 @@ def body_shape(
         As `natural_field`, or if the body has no such patch.
     """
     natural = natural.on(body.patches, len(body.layer_bounds))
-    _, normals = places_in_body(V)
+    _, normals = body_positions_and_normals(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
-    numbers = natural_field(natural, cells_of_body(V), V)
+    numbers = natural_field(natural, body_cell_geometry(V), V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
     field = fem.Function(Q, name="natural")
     rows = field.x.array.reshape(-1, HEIGHT_AT + 1)

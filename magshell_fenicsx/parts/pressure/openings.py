@@ -4,7 +4,7 @@ p int n . v da is the variation of p V, V the volume between the surface and a p
 edge is held or stays in a plane through that point. Else a line integral over the edge remains. Its
 curl, p int (v x w) . dx for two motions v and w of the edge (Romano 1972, Buefler 1984,
 Schweizerhof and Ramm 1984), vanishes where the edge moves in a single direction or in its own
-plane: then the pressure has a potential, `densities.swept`. Elsewhere it has none.
+plane: then the pressure has a potential, `densities.swept_volume`. Elsewhere it has none.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence, Set
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def moving(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Conditio
 
 def closes(condition: Condition) -> bool:
     """Whether an edge is held, or lies in a plane of symmetry."""
-    if isinstance(condition, Held):
+    if isinstance(condition, HeldComponents):
         return len(condition.components) == 3
     return condition != "free"
 
@@ -55,7 +55,7 @@ def without_potential(
 
     def has(name: str) -> bool:
         condition = conditions.get(name, "free")
-        if not isinstance(condition, Held):
+        if not isinstance(condition, HeldComponents):
             return False
         axes = list(condition.components)
         return len(axes) == 2 or bool(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.parts.supports.supports import MIN_CROSSING_COSINE, no_mirror
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
         end = meridian.ends[name] if name in meridian.ends else meridian.facets_at(name)
-        components = set(condition.components) if isinstance(condition, Held) else set()
+        components = set(condition.components) if isinstance(condition, HeldComponents) else set()
         if condition in ("clamped", "simply supported"):
             components = {*HORIZONTAL, AXIAL}
         if condition == "plane":

@@ -14,7 +14,7 @@ from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TUR
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.shells.model_base import Observed
+    from magshell_fenicsx.shells.model_base import ModelBase
 
 Array = NDArray[np.float64]
 
@@ -113,7 +113,7 @@ class ReactionsSeen(Seen):
 
 
 def observed_reactions(
-    model: "Observed",
+    model: "ModelBase",
     state: "State",
     mirror: Mirror | None,
     frame: Array,

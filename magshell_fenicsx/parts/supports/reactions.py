@@ -14,7 +14,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.supports.support_motion import PRECEDENCE
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.model_base import Observed
+    from magshell_fenicsx.shells.model_base import ModelBase
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class Reaction:
         )
 
 
-def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
+def reactions(model: "ModelBase", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
     """Return the reactions of all supports in the model's frame; collective.
 
     A point has the force of its node; edges and patches that hold a node together share it equally.
@@ -91,7 +91,7 @@ def reactions(model: "Observed", state: State, mirror: Mirror | None = None) -> 
     return _of_whole(by_support, mirror) if mirror else by_support
 
 
-def weights(model: "Observed", name: str, direction: Array, mirror: Mirror | None = None) -> Array:
+def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | None = None) -> Array:
     """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a
     way (3,).
 
@@ -109,7 +109,7 @@ def weights(model: "Observed", name: str, direction: Array, mirror: Mirror | Non
     return np.asarray(_shares(model)[name] * np.tile(components, system.size // axes))
 
 
-def _shares(model: "Observed") -> dict[str, Array]:
+def _shares(model: "ModelBase") -> dict[str, Array]:
     """Return the share that each support has in the force at the owned unknowns.
 
     A point has the force of its node alone, edges and patches share it equally, and a mirror plane

@@ -20,7 +20,7 @@ from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, sy
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
 from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
-from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.supports.support_motion import Support
 
@@ -110,8 +110,8 @@ def refuse_unknown(
 
     for name, condition in conditions.items():
         allowed = set(edges)
-        allowed |= set(points) - {"pole"} if isinstance(condition, Held) else set()
-        allowed |= set(patches) if isinstance(condition, Held) or condition == "clamped" else set()
+        allowed |= set(points) - {"pole"} if isinstance(condition, HeldComponents) else set()
+        allowed |= set(patches) if isinstance(condition, HeldComponents) or condition == "clamped" else set()
         if name not in allowed:
             refuse_joined(f"boundary.{name}", name)
             allowed_names = ", ".join(sorted(allowed)) or "none"
@@ -371,7 +371,7 @@ def supports(
     named_supports: dict[str, Support] = {}
     supports_on_planes: dict[str, Support] = {}
     for name, condition in conditions.items():
-        components = condition.components if isinstance(condition, Held) else ALL_COMPONENTS
+        components = condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
         if condition in ("free", "symmetry"):
             continue
         nodes = None if condition == "clamped" else is_in_middle

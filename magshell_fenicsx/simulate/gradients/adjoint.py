@@ -32,18 +32,18 @@ from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step_control import Gas
 from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_control import Gas
 from magshell_fenicsx.shells.mass import mass_along
 from magshell_fenicsx.shells.meridian import MeridianModel
-from magshell_fenicsx.shells.model_base import Observed
+from magshell_fenicsx.shells.model_base import ModelBase
+from magshell_fenicsx.simulate.contact_control import refuse_touching_shells
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import fold_at, stage_at
-from magshell_fenicsx.simulate.steps import enclosed, held_by
-from magshell_fenicsx.simulate.touch import refuse_meeting
+from magshell_fenicsx.simulate.sensitivity import fold_at, stage_of_record
+from magshell_fenicsx.simulate.steps import enclosed_gas, held_conjugates_of_step
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
@@ -204,7 +204,7 @@ def adjoint_of_instability(
             + ": only of folds, and of waves"
         )
     fold = fold or fold_at(scene, record)
-    stage = stage_at(scene, record)
+    stage = stage_of_record(scene, record)
     system = stage.newton.system
     pull = dot(
         system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
@@ -233,7 +233,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         model.waves,
         model.system.with_moved_supports(record.point.state),
     )
-    refuse_meeting(scene, state, f"instability: {record.mode}")
+    refuse_touching_shells(scene, state, f"instability: {record.mode}")
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})
@@ -272,7 +272,7 @@ def variation(
 
 
 def by_amplitude(
-    model: Observed, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
+    model: ModelBase, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
 ) -> list[tuple[FormTerm, float]]:
     """The derivatives of energies by an amplitude that multiplies some of them and may enter
     others; with factors.
@@ -398,7 +398,9 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             assert place
             law = step.load.hold[name]
             if isinstance(law, Gas):
-                share, slope = enclosed(scene, law.gas, state_before).by_begin(place.state.mu[name])
+                share, slope = enclosed_gas(scene, law.gas, state_before).by_begin(
+                    place.state.mu[name]
+                )
                 c[name], by_mu[name] = -row * share, row * slope
                 continue
             potential_now, potential_before = (
@@ -534,7 +536,7 @@ def held_at(
     held_conjugates = dict[str, float | Conjugate]()
     step = scene.problem.programme[record.step - 1] if record.step else None
     if hold is None and step:
-        held_conjugates |= held_by(scene, step, state)
+        held_conjugates |= held_conjugates_of_step(scene, step, state)
         if step.load.by_conjugate(at_target=record.label == "target"):
             held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, how in (hold or {}).items():

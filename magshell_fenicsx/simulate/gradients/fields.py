@@ -25,8 +25,8 @@ from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_o
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell import spatial_fields
-from magshell_fenicsx.models.shell.spatial_fields import OfPlacement, Uniform
 from magshell_fenicsx.models.shell.residual import Slope
+from magshell_fenicsx.models.shell.spatial_fields import PlacementField, Uniform
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
@@ -39,7 +39,7 @@ from magshell_fenicsx.simulate.gradients.shape import (
     rates,
 )
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import magnetic_terms, touch_as_in
+from magshell_fenicsx.simulate.sensitivity import expand_shell_contact, magnetic_terms
 from magshell_fenicsx.simulate.transfer import transfer
 
 if TYPE_CHECKING:  # one of them is built
@@ -101,11 +101,11 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         )
 
     def at_place(
-        number: int, place: AdjointState, coefficient_or_name: str | OfPlacement
+        number: int, place: AdjointState, coefficient_or_name: str | PlacementField
     ) -> tuple[fem.Function, list[Array]]:
         """The field, of a name or itself, and what a place gives, whose state is set."""
         if origin:
-            touch_as_in(origin.scene, scene, origin.places[number].state)
+            expand_shell_contact(origin.scene, scene, origin.places[number].state)
         shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
         coefficient = (
             coefficient_or_name
@@ -150,7 +150,7 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces
 
-    def over_all_places(coefficient_or_name: str | OfPlacement) -> tuple[fem.Function, Array]:
+    def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
         parts = [
             model.system.at_state(place.state).evaluate(
                 partial(at_place, number, place, coefficient_or_name)
@@ -385,7 +385,7 @@ def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
     """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
     model, nodes = scene.model, f.function_space.element.basix_element.points
     places, normals = model.places(nodes)
-    return spatial_fields.inside(places), normals
+    return spatial_fields.inside_cells(places), normals
 
 
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:

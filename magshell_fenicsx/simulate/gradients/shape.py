@@ -22,7 +22,7 @@ from magshell_fenicsx.assembly.field_gradient import WeightedTerm, broken_space
 from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.spatial_fields import OfPlacement
+from magshell_fenicsx.models.shell.spatial_fields import PlacementField
 from magshell_fenicsx.parts.forces.load_vectors import by_vertex_normal
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
@@ -109,15 +109,17 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
     return total
 
 
-def fields_of_placement(terms: Sequence[FormTerm]) -> list[OfPlacement]:
+def fields_of_placement(terms: Sequence[FormTerm]) -> list[PlacementField]:
     """The fields in terms that follow from the placement."""
     coefficients = (
-        c for term in terms for c in term.form.coefficients() if isinstance(c, OfPlacement)
+        c for term in terms for c in term.form.coefficients() if isinstance(c, PlacementField)
     )
     return list(dict.fromkeys(coefficients))
 
 
-def rates(model: ShellModel | MeridianModel, field: OfPlacement, normals: Array) -> Iterator[Array]:
+def rates(
+    model: ShellModel | MeridianModel, field: PlacementField, normals: Array
+) -> Iterator[Array]:
     """Derivative of a field (own cells, nodes, size) by a motion of each node of all cells along
     its normal; collective.
 

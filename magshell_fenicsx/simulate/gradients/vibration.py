@@ -26,7 +26,14 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes, seen_on
+from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes, mode_space
+from magshell_fenicsx.simulate.contact_control import (
+    contact_expanded_about,
+    refuse_touching_shells,
+    shell_penetrations,
+    stiffened_equilibrium,
+    touching_bodies,
+)
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NO_BEGINS,
     WAVE,
@@ -45,7 +52,6 @@ from magshell_fenicsx.simulate.gradients.instabilities import LostResult
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import between, pressed_as_at, pressing, refuse_meeting, rigid
 
 FIRST_FREQUENCIES = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
@@ -120,7 +126,7 @@ def vibrations(
     LostResult
         If it cannot be computed.
     """
-    if seen_on(scene.model).model is not scene.model:
+    if mode_space(scene.model).model is not scene.model:
         raise LostResult(
             f"{result}: a sector has the modes of its own planes alone: take symmetry: half or none"
         )
@@ -129,7 +135,9 @@ def vibrations(
     while True:
         count += 1
         try:
-            modes = ShellModes(scene.model).vibrations(state, count, loose=scene.loose)
+            modes = ShellModes(scene.model).vibrations(
+                state, count, loose=scene.allows_rigid_motion
+            )
         except ModesNotFound as e:
             raise LostResult(f"no frequencies here: {e}") from None
         if number > len(modes):
@@ -206,8 +214,8 @@ def adjoints_of_vibrations(
         If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave
         where shells touch.
     """
-    state = rigid(scene, scene.model.system.with_moved_supports(record.point.state))
-    if bodies := pressing(scene, state):
+    state = stiffened_equilibrium(scene, scene.model.system.with_moved_supports(record.point.state))
+    if bodies := touching_bodies(scene, state):
         raise CaseError(
             f"{result}: has no gradient where a body touches the shell ({bodies[0].body}): where "
             "it touches changes within "
@@ -235,11 +243,11 @@ def _adjoint(
     value = frequency(scene.problem, result, vibration.value)
     rate = 1.0 if result.startswith("omega2") else value / (2 * vibration.value)
     c = rate / len(vibration.modes)
-    contact_state = state if any(deep > 0 for _, deep in between(scene, state)) else None
+    contact_state = state if any(deep > 0 for _, deep in shell_penetrations(scene, state)) else None
     if contact_state and _wave(vibration.modes[0]) is not None:
-        refuse_meeting(scene, state, f"{result}: {vibration.modes[0].label}")
+        refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")
     largest_step = MAX_DIFFERENCE_STEP_IN_CONTACT if contact_state else MAX_DIFFERENCE_STEP
-    with pressed_as_at(scene, contact_state):
+    with contact_expanded_about(scene, contact_state):
         slopes = [
             _slopes(scene, state, mode, list(held_conjugates), largest_step)
             for mode in vibration.modes
@@ -249,7 +257,7 @@ def _adjoint(
     # nothing displaces a shell that nothing loads, whatever changes
     w, rows = (
         (0.0 * by_u, {})
-        if scene.loose
+        if scene.allows_rigid_motion
         else solved(scene, state, Functional(value, by_u, by_mu), held_conjugates)
     )
     places, directions = [AdjointState(state, w, rows)], list[EnergyDirection]()

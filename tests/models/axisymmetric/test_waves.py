@@ -17,7 +17,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.waves import Banded
+from magshell_fenicsx.shells.waves import BandedMatrices
 
 Array = np.ndarray
 FIELD = Magnetisation(radial, E3, gradient=np.diag([0.5, 0.5, -1.0]))
@@ -191,7 +191,7 @@ def test_definite_or_not(seed: int, triangle: bool) -> None:
     A += 100 * np.eye(n)  # definite, and so is A + t (B - A) for small t alone
     rows, columns = np.nonzero(np.triu(near) if triangle else near)
     held = np.array([0, 7], dtype=np.int32)
-    banded = Banded(rows, columns, held)
+    banded = BandedMatrices(rows, columns, held)
     bands = banded.bands([A[rows, columns], B[rows, columns]])
     free = np.setdiff1d(np.arange(n), held)
 

@@ -10,7 +10,7 @@ from conftest import hemisphere, random_displacement
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
+from magshell_fenicsx.models.shell.fast_tangent import FastTangent, hessian_integrals
 from magshell_fenicsx.models.shell.parameters import Force, Material
 from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
@@ -39,7 +39,7 @@ def alone(model: ShellModel, name: str) -> FiniteElementSystem:
     assert isinstance(pattern, FormTerm)
     term = next(t for t in model.system.terms if t.name == name)
     degree = model.V.element.basix_element.degree
-    tangent = FastTangent(model.u, make_sites(model.r0, degree, [term], KernelLog()), [])
+    tangent = FastTangent(model.u, hessian_integrals(model.r0, degree, [term], KernelLog()), [])
     return FiniteElementSystem(model.u, [term], [], pattern, 1.0, tangent)
 
 

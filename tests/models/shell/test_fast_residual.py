@@ -109,8 +109,8 @@ def test_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """What varies from point to point is renewed with every chunk; the last one is shorter."""
     field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]))
     found = []
-    for chunk in (gradients.CHUNK, 50):
-        monkeypatch.setattr(gradients, "CHUNK", chunk)
+    for chunk in (gradients.CHUNK_POINTS, 50):
+        monkeypatch.setattr(gradients, "CHUNK_POINTS", chunk)
         model = ShellModel(
             hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, Loads(magnetic=field)
         )

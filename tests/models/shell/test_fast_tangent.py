@@ -18,7 +18,7 @@ from magshell_fenicsx.continuation.system import extrapolated_stress
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
-from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
+from magshell_fenicsx.models.shell.fast_tangent import FastTangent, hessian_integrals
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
@@ -53,7 +53,7 @@ def test_term_alone(shell: Shells, name: str) -> None:
     """To 1e-12 at random nodal values, nothing held."""
     model = shell(2, half=name == "mirror edges", energy=TERMS[name])
     term = next(t for t in model.system.terms if t.name == name)
-    assembler = FastTangent(model.u, make_sites(model.r0, 2, [term], KernelLog()), [])
+    assembler = FastTangent(model.u, hessian_integrals(model.r0, 2, [term], KernelLog()), [])
     system = FiniteElementSystem(model.u, [term], [], pattern(model.system), 1.0, assembler)
     assert difference(system, random_displacement(model, 1e-3), MU) <= 1e-12
 

@@ -14,8 +14,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulaGroup, formula
-from magshell_fenicsx.models.shell.formula_projection import fitted
-from magshell_fenicsx.models.shell.spatial_fields import cells_of
+from magshell_fenicsx.models.shell.formula_projection import project_formula
+from magshell_fenicsx.models.shell.spatial_fields import cell_geometry
 from magshell_fenicsx.problem.formulas import adaptive_cells
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shape.outline import outline
@@ -118,16 +118,16 @@ def test_all_of_a_narrow_potential_is_there() -> None:
 
 def test_moments_of_a_step_on_coarse_cells_and_a_polynomial_that_stays():
     model = Scene(dead("1 + x*y + x", degree=3, size=0.35)).model
-    cells, element = cells_of(model.r0), model.V.element.basix_element
+    cells, element = cell_geometry(model.r0), model.V.element.basix_element
 
     def step(x, n):
         return np.sign(0.05**2 - (x[..., :1] - 0.31) ** 2 - (x[..., 1:2] - 0.23) ** 2) / 2 + 0.5
 
     x, normals, _ = cells.at(element.points)
-    fit = fitted(step, cells, step(x, normals), element, 3)
+    fit = project_formula(step, cells, step(x, normals), element, 3)
     assert not fit.smooth
     assert fit.size == pytest.approx(over_sphere(np.ones_like, 0.05), rel=1e-3)
-    flat = fitted(lambda x, n: x, cells, x, element, 3)
+    flat = project_formula(lambda x, n: x, cells, x, element, 3)
     assert flat.smooth
     assert flat.nodal is x
 

@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     EdgeForce,
     EdgeMoment,
-    Held,
+    HeldComponents,
     Material,
     PointForce,
 )
@@ -80,7 +80,7 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
         panel(),
         MATERIAL,
         2,
-        {"bottom": "plane", "left": "plane", "top": Held((0, 1)), "right": Held((0, 1))},
+        {"bottom": "plane", "left": "plane", "top": HeldComponents((0, 1)), "right": HeldComponents((0, 1))},
         Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(

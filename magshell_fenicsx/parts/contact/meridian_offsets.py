@@ -1,0 +1,126 @@
+"""Offsets of faces on meridians whose thickness varies or changes: see `face_offsets`.
+
+The area at a node, over 2 pi, is J = rho |r'|; on the axis, where that is zero, rho' |r'| stands
+for it. With b = U, a = r' . (U', W') and q the part of (U', W') across r' its derivatives along
+(U, W) are
+
+    J,u = |r'| b + rho a/|r'|,    J,uu = rho q^2/|r'| + 2 a b/|r'|.
+
+Along a wave (U cos, V sin, W cos) of m theta the first has b = U + m V and varies with cos; twice
+the mean of the second is, with P = m U + V and f = rho V' - rho' P - m z' W,
+
+    rho (q^2 + V'^2)/|r'| + 2 a b/|r'| + |r'| (P^2 + m^2 W^2)/rho - f^2/(rho |r'|).
+"""
+
+from copy import copy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
+from magshell_fenicsx.parts.contact.meridian_projection import AXIS_TOLERANCE, MeridianCurves
+from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
+
+Array = NDArray[np.float64]
+Longs = NDArray[np.int64]
+IN_PLANE = [0, 2]  # of (U, V, W)
+
+
+class MeridianOffsets(FaceOffsets):
+    """Half the thickness at all nodes of meridians, over R.
+
+    Parameters
+    ----------
+    r0
+        (nodes, 2) undeformed rho and z.
+    h, volume_factors, keeps_volume, amplitude
+        See `FaceOffsets`.
+    """
+
+    _wave_number: float | None = None
+
+    def __init__(
+        self,
+        curves: MeridianCurves,
+        r0: Array,
+        h: float,
+        volume_factors: Array,
+        keeps_volume: NDArray[np.bool_],
+        amplitude: SettableNumber | None = None,
+    ) -> None:
+        self._slopes, rho = curves.slopes_at_nodes, r0[curves.nodes, 0]
+        slope = np.einsum("qk,ck->cq", self._slopes, rho)
+        on_axis = (np.abs(rho) < AXIS_TOLERANCE)[..., None]
+        self._value_table = np.where(
+            on_axis, np.sign(slope)[..., None] * self._slopes, np.eye(rho.shape[1])
+        )
+        self._on_axis = on_axis[..., 0]
+        super().__init__(curves, r0, h, volume_factors, keeps_volume, np.arange(len(r0)), amplitude)
+
+    def waves(self, m: float) -> "MeridianOffsets":
+        """Return the offsets for waves (U, V, W) of m theta at a displacement (U, W).
+
+        H then changes as cos m theta.
+        """
+        other = copy(self)
+        other._wave_number, other._components = m, 3
+        return other
+
+    def undeformed_tangents(self) -> Array:
+        """Return tangents (2, cells, nodes, 3) along the undeformed meridian, and around."""
+        rho, tangent = self._radius_and_tangent(self._r0, slice(None))
+        tangents = np.zeros((2, *rho.shape, 3))
+        tangents[0, ..., IN_PLANE], tangents[1, ..., 1] = np.moveaxis(tangent, -1, 0), rho
+        return tangents
+
+    def _radius_and_tangent(self, r: Array, cells: Any) -> tuple[Array, Array]:
+        """Return rho and r' at the nodes of some cells."""
+        nodal = r[self._cells.nodes[cells]]
+        rho = np.einsum("cqk,ck->cq", self._value_table[cells], nodal[..., 0])
+        return rho, np.einsum("qk,cki->cqi", self._slopes, nodal)
+
+    def _areas(self, r: Array, cells: Any) -> Array:
+        rho, tangent = self._radius_and_tangent(r, cells)
+        return np.asarray(rho * np.linalg.norm(tangent, axis=-1))
+
+    def _area_rows(self, u: Array, cells: Longs) -> tuple[Array, Array, Array, Array]:
+        """Return rho, |r'|, and the rows a and b (cells, places, functions, 3) by (U, V, W) of nodes.
+        """
+        rho, tangent = self._radius_and_tangent(self._r0 + u, cells)
+        a, b = np.zeros((2, *rho.shape, rho.shape[1], 3))
+        a[..., IN_PLANE] = self._slopes[..., None] * tangent[:, :, None]
+        b[..., 0], b[..., 1] = self._value_table[cells], (self._wave_number or 0.0) * self._value_table[cells]
+        return rho, np.linalg.norm(tangent, axis=-1), a, b
+
+    def _by_unknowns(self, rows: Array) -> Array:
+        """Return rows by the unknowns (cells, places, dofs), of those by (U, V, W)."""
+        rows = rows if self._wave_number is not None else rows[..., IN_PLANE]
+        return np.asarray(rows.reshape(*rows.shape[:2], rows.shape[2] * rows.shape[3]))
+
+    def _area_slopes(self, u: Array, cells: Longs) -> Array:
+        rho, speed, a, b = self._area_rows(u, cells)
+        slopes = self._by_unknowns(speed[..., None, None] * b + (rho / speed)[..., None, None] * a)
+        if not self._wave_number:
+            return slopes
+        # on the axis there is one value all around
+        return np.where(self._on_axis[cells][..., None], 0.0, slopes)
+
+    def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
+        rho, speed, a, b = self._area_rows(u, cells)
+        m, tangent = self._wave_number or 0.0, self._radius_and_tangent(self._r0 + u, cells)[1]
+        rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]
+        q, p, c, f, v = np.zeros((5, *a.shape))
+        value = self._value_table[cells]
+        q[..., 0], q[..., 2] = (each * self._slopes / speed[..., None] for each in (-z1, rho1))
+        p[..., 0], p[..., 1] = m * value, value
+        c[..., 2], v[..., 1] = m * value, self._slopes
+        f[..., :] = rho[..., None, None] * v - rho1[..., None] * p
+        f[..., 2] -= m * z1 * value
+        a, b, q, p, c, f, v = (self._by_unknowns(each) for each in (a, b, q, p, c, f, v))
+        w_stretch, w_turn = w * rho / speed, w * speed / rho
+        w_shear = -w / (rho * speed)
+        squares = (w_stretch, q), (w_stretch, v), (w_turn, p), (w_turn, c), (w_shear, f)
+        H = sum(np.einsum("cqm,cqn->cmn", weight[..., None] * row, row) for weight, row in squares)
+        mixed = np.einsum("cqm,cqn->cmn", (w / speed)[..., None] * a, b)
+        return np.asarray(H + mixed + np.swapaxes(mixed, 1, 2))

@@ -1,0 +1,283 @@
+"""The contacts of a model: from its mid-surface on each rank to the cells that contacts search.
+
+In goes the mid-surface as a model has it (`ModelSurface`), out come the terms of all pairs of a case
+(`surface_contacts`). The cells are gathered on all ranks, and those of a half or a sector are copied
+until they make the whole. See `surface_contact` for the energy, and docs/theory.md, Contact.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+from dolfinx import fem, mesh
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
+from magshell_fenicsx.assembly.global_mesh import GlobalCells, gather_rows, global_values
+from magshell_fenicsx.mesh.mirror import Image, Mirror
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL, Pair
+from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
+from magshell_fenicsx.parts.contact.field_derivatives import ContactFields
+from magshell_fenicsx.parts.contact.projection import Cells, Longs
+from magshell_fenicsx.parts.contact.segments import Segments
+from magshell_fenicsx.parts.contact.surface_contact import ContactGeometry, SurfaceContact
+from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages, Images
+from magshell_fenicsx.parts.gap import GrownSurface
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+PENETRATION_TOLERANCE = 1e-6  # over h: an undeformed penetration below that is rounding
+
+
+@dataclass(frozen=True)
+class ModelSurface:
+    """The mid-surface of a model on this rank, as contact needs it.
+
+    Attributes
+    ----------
+    r0, u
+        Undeformed placement and displacement, in one space.
+    patches
+        Name -> whether each cell of this rank, ghosts included, belongs to the patch.
+    h
+        Thickness over R; where it varies, that of the first shell.
+    degree
+        Of the quadrature.
+    thickness
+        Factor of h, (1,) per node; None for 1.
+    thins
+        1 in the cells (cells, 1) whose thickness follows from their area, as of rubber, or for all;
+        else 0.
+    images
+        Of a half or a sector the copies that make the whole, itself first; none of a whole.
+    facets_on_planes
+        Of a half or a sector the facets of this rank on its planes of symmetry.
+    natural
+        The natural shape; None if it is the undeformed one.
+    planes
+        The planes of symmetry.
+    """
+
+    r0: fem.Function
+    u: fem.Function
+    patches: Mapping[str, Flags]
+    h: float
+    degree: int
+    thickness: fem.Function | None = None
+    thins: Array | int = 0
+    images: Sequence[Image] = ()
+    facets_on_planes: Sequence[NDArray[np.int32]] = ()
+    natural: GrownSurface | None = None
+    planes: Sequence[Mirror] = ()
+
+    @property
+    def space(self) -> fem.FunctionSpace:
+        """The space of the placement and the displacement."""
+        return self.r0.function_space
+
+    @property
+    def topology(self) -> mesh.Topology:
+        """The topology of the mesh."""
+        return self.space.mesh.topology
+
+    @cached_property
+    def own_nodes(self) -> Longs:
+        """(own cells, functions): local numbers of the nodes of this rank's own cells."""
+        return np.asarray(self.space.dofmap.list[: self.topology.index_map(2).size_local])
+
+    @cached_property
+    def keeps_volume(self) -> Flags:
+        """(local cells,): whether the thickness of each cell follows from its area."""
+        index_map = self.topology.index_map(2)
+        count = index_map.size_local + index_map.num_ghosts
+        return np.broadcast_to(np.asarray(self.thins) > 0, (count, 1))[:, 0]
+
+    @property
+    def grows(self) -> bool:
+        """Whether the volume depends on an amplitude."""
+        return self.natural is not None and self.natural.stretch is not None
+
+    @property
+    def volume_factors(self) -> Array:
+        """(powers, own cells, functions): the volume over h J0 at nodes, by powers of the growth.
+
+        One power where nothing grows: the factor of the thickness.
+        """
+        factor = np.ones(self.own_nodes.shape)
+        if self.thickness is not None:
+            dofs = self.thickness.function_space.dofmap.list[: len(factor)]
+            factor = self.thickness.x.array[dofs]
+        if not (self.natural and self.grows):
+            return np.array([factor])
+        V = self.space
+        element = V.element.basix_element
+        slopes = element.tabulate(1, element.points)[1:, ..., 0]
+        nodal = self.r0.x.array.reshape(-1, 3)[V.dofmap.list]
+        tangents = np.einsum("dqk,nki->dnqi", slopes, nodal)
+        rates = self.natural.volume_coefficients(tangents, element.points)
+        rates[:, ~self.keeps_volume] = np.eye(4)[0][:, None, None]
+        return np.asarray(factor * rates[:, : len(factor)])
+
+
+@dataclass(frozen=True)
+class _AllCells:
+    """The cells that contacts search, with what each has; of all ranks.
+
+    Attributes
+    ----------
+    r0
+        (nodes, 3) undeformed.
+    same_place
+        (nodes,) for each node the first of those at its place.
+    volume_factors, keeps_volume
+        See `ModelSurface`.
+    patches
+        Name -> whether each cell belongs to the patch; with that of all.
+    images
+        The copies among the cells; None without.
+    """
+
+    cells: Cells
+    r0: Array
+    same_place: Longs
+    volume_factors: Array
+    keeps_volume: Flags
+    patches: Mapping[str, Flags]
+    images: Images | None = field(default=None)
+
+    @classmethod
+    def gather(cls, surface: ModelSurface, gathered: GlobalCells) -> "_AllCells":
+        """Gather the cells of all ranks; collective."""
+        topology, count = surface.topology, len(gathered.own_range)
+        own_corners = topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
+        corners = topology.index_map(0).local_to_global(own_corners).reshape(-1, 3)
+        element = surface.space.element.basix_element
+        cells = Cells(element, gathered.nodes, gathered.gather_values(corners))
+        r0 = global_values(surface.r0)
+        factors = [gathered.gather_values(each) for each in surface.volume_factors]
+        patches = {
+            name: gathered.gather_values(inside) for name, inside in surface.patches.items()
+        }
+        patches[WHOLE_SHELL] = np.ones(len(cells.nodes), dtype=bool)
+        keeps_volume = gathered.gather_values(surface.keeps_volume)
+        same_place = np.arange(len(r0))
+        return cls(cells, r0, same_place, np.array(factors), keeps_volume, patches)
+
+    def with_images(self, surface: ModelSurface) -> "_AllCells":
+        """Return the cells of all copies of a half or a sector; collective."""
+        images, facets = Images(surface.images, len(self.r0)), surface.facets_on_planes
+        nodes = _nodes_of_facets(surface.space, facets)
+        vertices = _vertices_of_facets(surface.topology, facets)
+        return replace(
+            self,
+            cells=images.cells(self.cells, self.r0, vertices),
+            r0=images.places(self.r0),
+            same_place=images.shared_numbers(self.r0, nodes).ravel(),
+            volume_factors=np.array([images.repeat(each) for each in self.volume_factors]),
+            keeps_volume=images.repeat(self.keeps_volume),
+            patches={name: images.repeat(inside) for name, inside in self.patches.items()},
+            images=images,
+        )
+
+
+def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[SurfaceContact]:
+    """Return the contacts of pairs on a mid-surface; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the surfaces of a pair overlap undeformed.
+    """
+    if not pairs:
+        return []
+    for dims in ((2, 0), (0, 2), (1, 0)):
+        surface.topology.create_connectivity(*dims)
+    gathered, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
+    all_cells = _AllCells.gather(surface, gathered)
+    own_dofs = 3 * index_map.local_range[0], 3 * index_map.size_local
+    if surface.images:
+        all_cells = all_cells.with_images(surface)
+    geometry = _contact_geometry(surface, gathered, all_cells, own_dofs)
+    made = list[SurfaceContact]()
+    for pair in pairs:
+        sides = all_cells.patches[pair.names[0]], all_cells.patches[pair.names[1]]
+        contact = (
+            ContactWithImages(all_cells.images, own_dofs, pair, geometry, sides)
+            if all_cells.images
+            else SurfaceContact(pair, geometry, sides)
+        )
+        _refuse_overlap(contact, surface.h)
+        made.append(contact)
+    return made
+
+
+def _contact_geometry(
+    surface: ModelSurface, gathered: GlobalCells, all_cells: _AllCells, own_dofs: tuple[int, int]
+) -> ContactGeometry:
+    """Return what the contacts of all pairs share."""
+    cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
+    element, first_cell = surface.space.element.basix_element, gathered.own_range.start
+    displacement: Callable[[], Array] = partial(global_values, surface.u)
+    if images:
+        own_dofs = 0, r0.size
+
+        def displacement() -> Array:
+            return images.displacements(global_values(surface.u))
+
+    growth: SettableNumber | None = surface.natural.stretch if surface.natural else None
+    offsets = None
+    if surface.thickness is not None or all_cells.keeps_volume.any():
+        offsets = FaceOffsets(
+            cells,
+            r0,
+            surface.h,
+            all_cells.volume_factors,
+            all_cells.keeps_volume,
+            all_cells.same_place,
+            growth,
+        )
+    own_cells, degrees = np.array(gathered.own_range), (surface.degree, element.degree)
+    segments = Segments(cells, own_cells, r0, degrees, surface.h, surface.planes)
+    own = slice(first_cell, gathered.own_range.stop)
+    return ContactGeometry(
+        cells,
+        r0,
+        displacement,
+        surface.h,
+        segments,
+        ContactFields(surface.r0, surface.thickness, gathered.nodes, own),
+        offsets,
+        own_dofs,
+        (first_cell, len(surface.keeps_volume)),
+        surface.space.mesh.comm,
+    )
+
+
+def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
+    """Raise a MeshError if the surfaces of a contact overlap undeformed; collective."""
+    penetration, x = contact.deepest_penetration()
+    if penetration > PENETRATION_TOLERANCE * h:
+        where = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)
+        raise MeshError(
+            f"contact: {contact.pair.words} overlap undeformed, by {penetration / h:.4g} h at "
+            f"({where}) R: move them apart"
+        )
+
+
+def _nodes_of_facets(V: fem.FunctionSpace, facets: Sequence[NDArray[np.int32]]) -> Longs:
+    """Return the global numbers of the nodes of facets of all ranks; collective."""
+    all_facets = np.concatenate([*facets, np.empty(0, np.int32)])
+    local = fem.locate_dofs_topological(V, 1, all_facets, remote=False)
+    numbers = V.dofmap.index_map.local_to_global(local)
+    return np.asarray(np.unique(gather_rows(V.mesh.comm, numbers)))
+
+
+def _vertices_of_facets(topology: mesh.Topology, facets: Sequence[NDArray[np.int32]]) -> Longs:
+    """Return the global numbers of the vertices of facets of all ranks; collective."""
+    vertices_of_facet = topology.connectivity(1, 0)
+    local = [vertices_of_facet.links(int(facet)) for facet in np.concatenate(facets)]
+    flat = np.concatenate([*local, np.empty(0, np.int32)]).astype(np.int32)
+    numbers = topology.index_map(0).local_to_global(flat)
+    return np.asarray(np.unique(gather_rows(topology.comm, numbers)))

@@ -1,0 +1,654 @@
+"""Contact of a shell with itself or of its patches with each other: the penalty of the gap between
+their faces.
+
+Each mid-surface has quadrature points. The gap of a point x is |x - y| - h with its projection y,
+the closest point of the other mid-surface: the faces are half a thickness from both. Both surfaces
+have points, so that each has half of the penalty. The gap is a function of the state alone, and has
+no sign of a side: see `SurfaceContact.passes_through` for steps across a surface. The points are
+those of a rule on each cell; where cells face others, they are on segments, see `segments`.
+
+With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
+
+    d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),   A = F,ab
+
+where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact
+Mechanics, Springer 2006, sec. 4.1 and 9; docs/theory.md, Contact.
+
+Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of
+|x - y| - H(y), less H(x), plus h, so that |x - y| need not be the least. Of shells that get thinner
+H follows from the displacement (`FaceOffsets`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.global_mesh import add_to_owners, global_values
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
+from magshell_fenicsx.parts.contact.closest_points import (
+    BLUR_DISTANCE,
+    DISTANCE_TOLERANCE,
+    ClosestPointSearch,
+    no_projections,
+)
+from magshell_fenicsx.parts.contact.contact_section import Pair
+from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets, unknown_numbers
+from magshell_fenicsx.parts.contact.field_derivatives import (
+    ContactFields,
+    ContactState,
+    EnergyWeights,
+    by_factor,
+    by_place,
+)
+from magshell_fenicsx.parts.contact.frozen_contact import FrozenContact
+from magshell_fenicsx.parts.contact.gap_derivatives import (
+    distance_slopes,
+    gap_geometry,
+    gap_hessians,
+    joint_entries,
+)
+from magshell_fenicsx.parts.contact.projection import Cells, JoinedPlaces, Longs, Projections
+from magshell_fenicsx.parts.contact.segments import ContactPoints, Cuts, Segments, divisions_of
+from magshell_fenicsx.parts.contact.time_averaging import (
+    ContactTerm,
+    SampleCache,
+    SampleRates,
+    StateNumber,
+)
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION, penalty
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Penalty = tuple[Array, Array, Array]
+SEARCH_REACH = 4.0  # thicknesses: places farther than that are not looked for
+PATTERN_REACH = 1.0  # thicknesses: cells nearer than that have entries in the sparsity pattern
+FULL_CONTACT_SHARE = 1 - 1e-9  # of a cell's area, but for rounding
+BLOCKS_PER_CHUNK = 1000  # pairs of cells whose blocks of the tangent are computed at a time
+MAX_ASTRAY_FORCE = 0.1  # share of the force on points that left their cell, with the old cuts
+MAX_DIVISIONS = 8  # of triangles in a zone of contact: each halves the distance of its points
+MAX_MOTION_PER_SAMPLE = 0.25  # thicknesses that points move between two samples of a step
+CROSSING_DISTANCE = 0.5  # thicknesses: mid-surfaces nearer than that pass through each other
+
+
+@dataclass(frozen=True)
+class ContactGeometry:
+    """The cells of a model between which contact is sought, and where they are.
+
+    Attributes
+    ----------
+    cells
+        All cells of all ranks, with the images of a half or a sector.
+    r0
+        (nodes, 3) undeformed places of their nodes, over R.
+    displacement
+        Returns the present displacement (nodes, 3) of these nodes; collective.
+    h
+        Thickness over R: that of the penalty, and of the search where the thickness varies.
+    segments
+        Gives the quadrature points on the cells of this rank, also where these face others.
+    fields
+        The fields that gaps depend on.
+    offsets
+        Half the thickness at nodes where it varies or changes with the state; None where it is h/2.
+    owned_dofs
+        Number of the first degree of freedom of this rank, and how many it has.
+    local_cells
+        Number of the first cell of this rank, and how many it has, ghosts included.
+    """
+
+    cells: Cells
+    r0: Array
+    displacement: Callable[[], Array]
+    h: float
+    segments: Segments
+    fields: ContactFields
+    offsets: FaceOffsets | None
+    owned_dofs: tuple[int, int]
+    local_cells: tuple[int, int]
+    comm: MPI.Comm
+
+
+class SurfaceContact(ContactTerm):
+    """The contact energy of a pair on surfaces; a `Term` and a `NonlocalTerm` of `assembly`.
+
+    Parameters
+    ----------
+    sides
+        (cells,) whether each cell belongs to the first member of the pair, and to the second.
+    """
+
+    def __init__(self, pair: Pair, geometry: ContactGeometry, sides: tuple[Flags, Flags]) -> None:
+        super().__init__(pair, geometry.fields, geometry.offsets)
+        self.cuts = StateNumber(0.0)
+        self._cells, self._segments, self._h = geometry.cells, geometry.segments, geometry.h
+        self._rule = geometry.segments.rule
+        self._r0, self._find_displacement = geometry.r0, geometry.displacement
+        self._owned_dofs, self._local_cells = geometry.owned_dofs, geometry.local_cells
+        self._comm = geometry.comm
+        self._components = 4 if geometry.offsets else 3  # of vectors, see `projection`
+        self._sides = sides
+        self._search = ClosestPointSearch(
+            self._cells, self._rule, self._may_touch, self._h, self._r0, self._offsets, self._comm
+        )
+        self._nodes_of_pair = np.unique(self._cells.nodes[sides[0] | sides[1]])
+        thickest = 2 * float(self._search.half_thickness[self._nodes_of_pair].max())
+        self._reach = self._h + (SEARCH_REACH - 1) * thickest
+        self._at = np.full_like(self._r0, np.nan)
+        self._growth = 0.0  # the natural stretch at that displacement
+        self._cuts = Cuts(self._segments, self._near, self._gaps, self._r0)
+        self._points, self._places = self._rule, no_projections()
+        self._places_left_to_edges = no_projections()
+        self._joined = JoinedPlaces.join(self._places, 1.0)
+        self._active_sets = SampleCache[tuple[Projections, Projections, JoinedPlaces]]()
+        self._cell_values = SampleCache[tuple[Array, Array, Flags]]()
+        self._frozen: FrozenContact | None = None
+        self._cached_entries: tuple[Projections | None, float, Entries] = None, 0.0, no_entries()
+
+    def _may_touch(self, cell: Longs, other: Longs) -> Flags:
+        """Return whether points of cells (n,) may touch the other cells (n,)."""
+        first, second = self._sides
+        return np.asarray((first[cell] & second[other]) | (second[cell] & first[other]))
+
+    # as a term
+
+    @property
+    def history(self) -> dict[str, tuple[StateNumber, float]]:
+        """The penalty's stiffness and the number of the cuts, see `FiniteElementSystem`.
+
+        A state without a number of its own has the cuts of the undeformed surfaces.
+        """
+        return super().history | {self.pair.cuts: (self.cuts, 0.0)}
+
+    def energy(self) -> float:
+        """Return the energy of this rank's points over E h R^2."""
+        places, joined, (value, _, _) = self._active_set()
+        return float(self._points.weight[places.point[joined.first]] @ value) / 2
+
+    def _entries(self) -> Entries:
+        """Return the tangent's entries: cached at the present state, computed at a sample."""
+        places, *_ = self._active_set()
+        cached_places, cached_stiffness, cached = self._cached_entries
+        if cached_places is places and cached_stiffness == self.stiffness.value and not self.sample:
+            return cached
+        entries = self._entries_by_place_and_offset()
+        if self._offsets:
+            entries = self._offsets.entries(self._at, entries, self._forces()[:, 3])
+        if not self.sample:
+            self._cached_entries = places, self.stiffness.value, entries
+        return entries
+
+    @property
+    def pattern_key(self) -> float:
+        """The number of the cuts, by which the sparsity pattern is known; see `NonlocalTerm`."""
+        return self.cuts.value
+
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """Return pairs of nodes of cells that touched, or nearly did, where the cuts were made.
+
+        See `NonlocalTerm`.
+        """
+        self._active_set()
+        u = self._cuts.displacement(self.cuts.value)
+        reach = self._h + PATTERN_REACH * (self._reach - self._h) / (SEARCH_REACH - 1)
+        places = self._search.projections_in_cells(
+            self._points, u, self._search.places_of_nodes(u), reach
+        )
+        keys = np.unique(self._pair_keys(places))
+        cell, other = np.divmod(keys, len(self._cells.nodes))
+        nodes = np.concatenate([self._cells.nodes[cell], self._cells.nodes[other]], axis=1)
+        return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
+
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Return the derivative by the thickness or the placement; collective.
+
+        See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+        """
+        field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
+        if field is None:
+            return None
+        state = self._state()
+        weights = EnergyWeights(self._of_copies(global_values(direction)), energy, force)
+        if name == "thickness":
+            of_cells = self._comm.allreduce(self._in_modelled(by_factor(state, weights)))
+            return field, of_cells[self._fields.own, :, None]
+        forces = self._comm.allreduce(self._on_modelled(by_place(state, weights)))
+        return field, self._fields.shared_by_cells(forces)
+
+    def _state(self) -> ContactState:
+        places, joined, penalties = self._active_set()
+        geometry = self._cells, self._r0, self._at, self._offsets, self._points
+        derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
+        return ContactState(*geometry, places, joined, penalties, self._forces(), *derivatives)
+
+    def _add(self, b: Array, forces: Array) -> None:
+        """Add forces (nodes, 3) of this rank's points to the owners' vectors; collective."""
+        add_to_owners(b, forces, self._owned_dofs, self._comm)
+
+    def _entries_by_place_and_offset(self) -> Entries:
+        """Return entries of the second derivative by the places of nodes and the offsets H there.
+
+        Blocks of places in the same pair of cells are summed.
+        """
+        places, joined, (_, slope, curvature) = self._active_set()
+        if not len(places.point):
+            return no_entries()
+        is_blurred = joined.several[joined.group]
+        first = slope[joined.group]
+        second = np.where(is_blurred, first / (BLUR_DISTANCE * self._h), curvature[joined.group])
+        weight = joined.weight * self._points.weight[places.point] / 2
+        order = np.argsort(self._pair_keys(places), kind="stable")
+        blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
+        rows, columns, values = (list(parts) for parts in zip(*blocks, strict=True))
+        if joined.several.any():
+            for parts, added in zip((rows, columns, values), self._entries_of_joints(), strict=True):
+                parts.append(added)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def _blocks(
+        self, places: Projections, weight: Array, first: Array, second: Array
+    ) -> list[Entries]:
+        """Return the entries of places that are ordered by pairs of cells, in chunks.
+
+        Parameters
+        ----------
+        weight, first, second
+            (n,) weights, and derivatives of the penalty by the penetration.
+        """
+        keys = self._pair_keys(places)
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        positions = self._search.places_of_nodes(self._at)
+        blocks = list[Entries]()
+        for starts_of_chunk in np.array_split(starts, max(1, len(keys) // BLOCKS_PER_CHUNK)):
+            if not len(starts_of_chunk):
+                continue
+            later = starts[np.searchsorted(starts, starts_of_chunk[-1]) + 1 :]
+            chunk = slice(starts_of_chunk[0], later[0] if len(later) else len(keys))
+            chunk_places = places.select(chunk)
+            geometry = self._geometry(chunk_places)
+            penalties = weight[chunk], first[chunk], second[chunk]
+            H = gap_hessians(self._cells, chunk_places, geometry, positions, penalties)
+            begins = starts_of_chunk - starts_of_chunk[0]
+            sums = np.add.reduceat(H, begins, axis=0)
+            dofs = unknown_numbers(geometry[3][begins], len(self._r0), self._components)
+            i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+            blocks.append((i.ravel(), j.ravel(), sums.ravel()))
+        return blocks
+
+    def _entries_of_joints(self) -> Entries:
+        """Return what places that are joined as one have besides the entries of each."""
+        places, joined, (_, slope, curvature) = self._active_set()
+        is_blurred = joined.several[joined.group]
+        _, n, beta, nodes = self._geometry(places.select(is_blurred))
+        slopes = joined.weight[is_blurred, None, None] * distance_slopes(n, beta, self._components)
+        weight = self._points.weight[places.point[joined.first]] / 2
+        of_joints = weight * (curvature - slope / (BLUR_DISTANCE * self._h))
+        return joint_entries(slopes, nodes, joined.group[is_blurred], of_joints, len(self._r0))
+
+    def _pair_keys(self, places: Projections) -> Longs:
+        """Return a number (n,) of the point's cell and the cell that each place is in."""
+        return np.asarray(self._points.cell[places.point] * len(self._cells.nodes) + places.cell)
+
+    # what is observed
+
+    def force(self) -> float:
+        """Return the integral of the pressure over the contact, over E h R; collective."""
+        places, joined, (_, slope, _) = self._active_set()
+        weight = self._points.weight[places.point[joined.first]]
+        return float(self._comm.allreduce(float(weight @ slope / 2)))
+
+    def least_gap(self) -> float:
+        """Return the least gap over R; nan where no faces are within the reach. Collective."""
+        self._active_set()
+        least = self._search.least_distance(self._displacement(), self._reach, self._points)
+        return least - self._h if least < self._reach else np.nan
+
+    def penetration(self) -> float:
+        """Return the largest penetration over R, 0 without contact; collective."""
+        places, *_ = self._active_set()
+        own = float((self._h - places.distance).max(initial=0.0))
+        return float(self._comm.allreduce(own, MPI.MAX))
+
+    def relative_penetration(self) -> float:
+        """Return the largest penetration over the undeformed thickness there; collective."""
+        places, *_ = self._active_set()
+        own = 0.0
+        if len(places.point):
+            thickness = self._search.thickness(self._points, places)
+            own = float(((self._h - places.distance) / thickness).max(initial=0.0))
+        return float(self._comm.allreduce(own, MPI.MAX))
+
+    def deepest_penetration(self) -> tuple[float, Array]:
+        """Return the largest penetration over R, and its place (3,) over R; collective."""
+        places, *_ = self._active_set()
+        own = (0.0, np.zeros(3))
+        if len(places.point):
+            deepest = int(places.distance.argmin())
+            nodes = self._r0 + self._displacement()
+            point = places.point[[deepest]]
+            x = self._search.places_of_points(self._points, nodes, point)[0]
+            own = (float(self._h - places.distance[deepest]), x)
+        penetration, x = max(self._comm.allgather(own), key=lambda each: each[0])
+        return float(penetration), np.asarray(x)
+
+    def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
+        """Return what each local cell has, computed once for a state; collective.
+
+        Returns
+        -------
+        pressure
+            (cells,) the mean over E h/R; 0 of ghosts.
+        gap
+            (cells,) the least over R, up to the reach; the reach of ghosts.
+        is_full
+            (cells,) whether all of the cell is pressed.
+
+        Notes
+        -----
+        Where an edge alone presses on a face, half of its points' forces acts on each, as in the
+        energy.
+        """
+        self._active_set()
+        if self._frozen:
+            return self._compute_pressures_and_gaps()
+        state = self._at, self.cuts.value, self._growth, self.stiffness.value
+        return self._cell_values.get(state, self._compute_pressures_and_gaps)
+
+    def _compute_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
+        places, joined, (_, slope, _) = self._active_set()
+        points, (first_cell, count) = self._points, self._local_cells
+        nearest = places.select(joined.first)
+        normals = self._cuts.points(self.cuts.value, self._displacement())[1]
+        is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
+        force = points.weight[nearest.point] * slope
+        on_faced = np.bincount(nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes))
+        on_faced = self._in_modelled(on_faced.astype(np.float64)[:, None])[:, 0]
+        on_faced = self._comm.allreduce(on_faced)[self._fields.own]
+        area, pressure = np.ones(count), np.zeros(count)
+        np.add.at(area, points.cell - first_cell, points.weight)
+        area[: len(np.unique(points.cell))] -= 1.0
+        pressure[: len(on_faced)] = on_faced
+        own_share = force * (1 - is_edge_alone / 2)
+        np.add.at(pressure, points.cell[nearest.point] - first_cell, own_share)
+        gap = np.full(count, self._reach - self._h)
+        near = self._search.projections(
+            self._displacement(), self._reach, points, least_only=True
+        )
+        np.minimum.at(gap, points.cell[near.point] - first_cell, near.distance - self._h)
+        pressed_area, pressed_points = np.zeros(count), np.unique(nearest.point)
+        pressed_cells = points.cell[pressed_points] - first_cell
+        np.add.at(pressed_area, pressed_cells, points.weight[pressed_points])
+        return pressure / area, gap, pressed_area > FULL_CONTACT_SHARE * area
+
+    def halves(self) -> tuple[Array, Array]:
+        """Return half the thickness (nodes,) over R, undeformed and at present; collective."""
+        undeformed = self._search.half_thickness
+        if not self._offsets:
+            return undeformed, undeformed
+        return undeformed, self._offsets.half_thickness(self._displacement())
+
+    def least_thickness(self, *displacements: Array) -> float:
+        """Return the least thickness of the pair over R, undeformed and at displacements."""
+        halves = [self._search.half_thickness]
+        if self._offsets:
+            halves += [self._offsets.half_thickness(u) for u in displacements]
+        return 2 * min(float(half[self._nodes_of_pair].min()) for half in halves)
+
+    def come_near(self, u: Array, v: Array) -> bool:
+        """Return whether any cells come near each other between two displacements; collective."""
+        return self._search.come_near(self._of_copies(u), self._of_copies(v))
+
+    def gap(self, u: Array) -> float:
+        """Return the least gap over R at a displacement, of uncut cells, up to the reach.
+
+        Collective.
+        """
+        return self._search.least_distance(self._of_copies(u), self._reach) - self._h
+
+    def gap_at_supports(self, held: Longs, u: Array) -> float:
+        """Return the least gap over R at nodes that supports hold.
+
+        See `ClosestPointSearch.gap_at_supports`.
+        """
+        return self._search.gap_at_supports(held, self._of_copies(u))
+
+    def passes_through(self, u: Array, v: Array) -> bool:
+        """Return whether points pass through a surface on the straight way from u to v; collective.
+
+        Between two samples no point moves, relative to another, by more than a part of the least
+        thickness.
+        """
+        return self.images_pass_through(self._of_copies(u), self._of_copies(v))
+
+    def images_pass_through(self, u: Array, v: Array) -> bool:
+        """Return `passes_through` of displacements (nodes, 3) of all cells; collective."""
+        least = self.least_thickness(u, v)
+        motion = (v - u) - (v - u).mean(axis=0)
+        farthest = 2 * np.linalg.norm(motion, axis=1).max()
+        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least)))
+        if not self._search.come_near(u, v):
+            return False
+        for k in range(1, count):
+            near = self._search.projections(
+                u + k / count * (v - u), CROSSING_DISTANCE * least, to_faces=False
+            )
+            if self._comm.allreduce(len(near.point)):
+                return True
+        return False
+
+    # in a step in time, see `TimeAveragedContact`
+
+    @property
+    def displacement(self) -> Array:
+        """The present displacement (nodes, 3) of all cells; collective."""
+        return np.array(self._displacement())
+
+    def sample_rates(self, motion: Array) -> SampleRates:
+        """Return the penalty of the points with its rates along a motion (nodes, 3)."""
+        places, joined, _ = self._active_set()
+        if self._offsets:
+            motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
+        _, n, beta, nodes = self._geometry(places)
+        slopes = distance_slopes(n, beta, self._components)
+        closing = -np.einsum("nki,nki->n", slopes, motion[nodes])
+        closing = np.bincount(joined.group, joined.weight * closing, len(joined.first))
+        return SampleRates.sum_over_points(
+            len(self._points.weight),
+            places.point[joined.first],
+            self._h - joined.distance,
+            closing,
+            self.stiffness.value,
+            SOFT_PENETRATION * self._h,
+        )
+
+    # the cuts of cells
+
+    def improved_cuts(self) -> float | None:
+        """Return the number of the present displacement if cuts there are better; collective.
+
+        None if they are not. The measure is the share of the force on points that do not face the
+        cell they faced where the cuts were made, or face an edge that was steep there and is not
+        now, or the other way round.
+        """
+        u = self._displacement()
+        places, *_ = self._active_set()
+        normals, left = self._segments.normals(self._r0 + u), self._places_left_to_edges
+        is_left = self._search.are_left_to_edges(self._points, places, normals)
+        stays_left = self._search.are_left_to_edges(self._points, left, normals)
+        changed = self._force(self._points, places.select(is_left))
+        changed += self._force(self._points, left.select(~stays_left))
+        astray = self._astray_share(self._points, places, changed)
+        if astray <= MAX_ASTRAY_FORCE:
+            return None
+        points, counted = self._with_cuts_at(u, self._divisions)
+        is_better = self._astray_share(points, counted) < astray / 2
+        return self._cuts.number_at_key(u, self._divisions) if is_better else None
+
+    def finer_cuts(self) -> float | None:
+        """Return the number of cuts here whose triangles in contact are divided once more.
+
+        None without contact, or after `MAX_DIVISIONS`. Collective.
+        """
+        u, divisions = self._displacement(), self._divisions
+        places, *_ = self._active_set()
+        if divisions == MAX_DIVISIONS or not self._comm.allreduce(len(places.point)):
+            return None
+        return self._cuts.number_at_key(u, divisions + 1)
+
+    def present_cuts(self) -> float:
+        """Return the number of the present displacement, for cuts there; collective."""
+        return self._cuts.number_at_key(self._displacement(), self._divisions)
+
+    @property
+    def _divisions(self) -> int:
+        return divisions_of(self.cuts.value)
+
+    def _with_cuts_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Projections]:
+        """Return the points with cuts at a displacement, and their places that count there."""
+        points, normals = self._cuts.at(u, divisions)
+        places = self._search.projections(u, self._h, points)
+        is_left = self._search.are_left_to_edges(points, places, normals)
+        return points, places.select(~is_left)
+
+    def recall_cuts(self, number: float) -> None:
+        """Let a number stand for the present displacement; collective.
+
+        It may be the number of a run on other ranks.
+        """
+        self._cuts.recall(number, self._displacement())
+
+    def _astray_share(
+        self, points: ContactPoints, places: Projections, changed: float = 0.0
+    ) -> float:
+        """Return the share of the force on points that do not face the cell that they faced.
+
+        Also on those in triangles that are divided less often than in the zone of contact.
+
+        Parameters
+        ----------
+        changed
+            Further force of this rank that counts.
+        """
+        faces_another = points.faces[places.point] != places.cell
+        is_coarse = points.divisions[places.point] < self._divisions
+        astray = self._force(points, places.select(faces_another | is_coarse)) + changed
+        total, astray = self._comm.allreduce(np.array([self._force(points, places), astray]))
+        return float(astray / total) if total else float(astray > 0)
+
+    def _force(self, points: ContactPoints, places: Projections) -> float:
+        """Return twice the force of this rank's points on their nearest of some places."""
+        nearest = places.select(places.firsts)
+        soft = SOFT_PENETRATION * self._h
+        pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft)[1]
+        return float(points.weight[nearest.point] @ pressures)
+
+    def _near(self, u: Array) -> Projections:
+        """Return the places in all cells that may press on this rank's cells at a displacement."""
+        reach = self._h + self._segments.cover_distance
+        near = self._search.projections_in_cells(
+            self._rule, u, self._search.places_of_nodes(u), float(reach.max())
+        )
+        is_near = near.distance < reach[self._rule.cell[near.point]]
+        return self._search.select_distant_cells(self._rule, near.select(is_near))
+
+    def _gaps(self, points: ContactPoints, u: Array) -> Array:
+        """Return the gaps (n,) over R of points at a displacement, up to the reach."""
+        places = self._search.projections(u, self._reach, points)
+        distance = np.full(len(points.cell), self._reach)
+        np.minimum.at(distance, places.point, places.distance)
+        return np.asarray(distance - self._h)
+
+    # geometry
+
+    def _displacement(self) -> Array:
+        return self.sample.u if self.sample else self._find_displacement()
+
+    def _of_copies(self, u: Array) -> Array:
+        """Return the displacement of all cells, of that of the nodes that are modelled."""
+        return u
+
+    def _in_modelled(self, values: Array) -> Array:
+        """Return derivatives by values in modelled cells, of those by values in all cells."""
+        return values
+
+    def _on_modelled(self, forces: Array) -> Array:
+        """Return the forces (nodes, 3) on modelled nodes, of those on all nodes."""
+        return forces
+
+    def _forces(self) -> Array:
+        """Return the derivative (nodes, 3) of this rank's energy by the places of all nodes.
+
+        (nodes, 4) with the derivative by the offset H where that varies.
+        """
+        places, joined, (_, slope, _) = self._active_set()
+        forces = np.zeros((len(self._r0), self._components))
+        if len(places.point):
+            _, n, beta, nodes = self._geometry(places)
+            weight = joined.weight * self._points.weight[places.point] / 2
+            pressure = weight * slope[joined.group]
+            slopes = distance_slopes(n, beta, self._components)
+            np.add.at(forces, nodes, -pressure[:, None, None] * slopes)
+        return forces
+
+    def _active_set(self) -> tuple[Projections, JoinedPlaces, Penalty]:
+        """Return the places in contact, how they are joined, and the penalty of each joined one.
+
+        The penalty has its two derivatives by the penetration. At the present state, or sample.
+        """
+        soft = SOFT_PENETRATION * self._h
+        if self._frozen:
+            self._at, self._points = np.array(self._displacement()), self._frozen.points
+            is_held = self.held is not None
+            return self._frozen.evaluate(
+                self._search, self._at, self.stiffness.value, self._h, with_third_order=is_held
+            )
+        u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
+        points, normals = self._cuts.points(self.cuts.value, u)
+        has_moved = growth != self._growth or not np.array_equal(u, self._at)
+        if points is not self._points or has_moved:
+            self._points, self._growth, self._at = points, growth, np.array(u)
+            self._places, self._places_left_to_edges, self._joined = self._active_sets.get(
+                (u, self.cuts.value, growth), lambda: self._find_places(points, normals, u)
+            )
+        joined = self._joined
+        penalties = penalty(self._h - joined.distance, self.stiffness.value, soft)
+        if self.sample:
+            penalties = self.sample.weigh(self._places.point[joined.first], penalties)
+        return self._places, joined, penalties
+
+    def _find_places(
+        self, points: ContactPoints, normals: Array, u: Array
+    ) -> tuple[Projections, Projections, JoinedPlaces]:
+        """Return the places that count, those left to edges, and how the former are joined."""
+        places = self._search.projections(u, (1 + DISTANCE_TOLERANCE) * self._h, points)
+        is_left = self._search.are_left_to_edges(points, places, normals)
+        counted = places.select(~is_left)
+        joined = JoinedPlaces.join(counted, BLUR_DISTANCE * self._h)
+        return counted, places.select(is_left), joined
+
+    def freeze(self) -> FrozenContact:
+        """Return the contact of the present state, with its active set fixed; collective."""
+        self._active_set()
+        return FrozenContact.at_state(
+            self._cells, self._r0, self._h, self._points, self._places, self._joined
+        )
+
+    def expand_about(self, frozen: FrozenContact) -> None:
+        """Take the frozen contact of another scene on the same mesh for good."""
+        self._cached_entries = None, 0.0, self._cached_entries[2]
+        self._frozen = frozen.on_surface(self._r0)
+
+    def _geometry(self, places: Projections) -> tuple[Array, Array, Array, Longs]:
+        """Return distances, normals, and beta with its nodes; see `gap_geometry`."""
+        return gap_geometry(self._cells, self._points, self._r0 + self._at, places)
+
+
+def no_entries() -> Entries:
+    """Return a matrix without entries."""
+    return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)

@@ -1,0 +1,168 @@
+"""Contact where a half or a sector is modelled: its points face the cells of all images too.
+
+Images move as the model does, with their matrices Q: the unknowns of all copies are u' = P u. The
+points on the modelled cells have their part of the energy, Pi(u'), so that the forces are
+P^T Pi,u' and the tangent is P^T Pi,u'u' P. Of additions v that are antisymmetric to a plane the
+mirrored half has -Q v.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.mesh.mirror import Image
+from magshell_fenicsx.parts.contact.contact_section import Pair
+from magshell_fenicsx.parts.contact.projection import Cells, Longs
+from magshell_fenicsx.parts.contact.surface_contact import ContactGeometry, SurfaceContact
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+SAME_PLACE_TOLERANCE = 1e-9  # over the extent: images of a vertex nearer than that are one
+
+
+@dataclass(frozen=True)
+class Images:
+    """The copies that make the whole, numbered one after the other; the first is the model.
+
+    Attributes
+    ----------
+    count
+        Number of nodes of the model.
+    parity
+        Factor of the displacement of mirrored copies: 1, or -1 of an antisymmetric one.
+    """
+
+    images: Sequence[Image]
+    count: int
+    parity: float = 1.0
+
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        """P (3 copies count, 3 count)."""
+        matrices = [image.Q * (self.parity if image.sign < 0 else 1.0) for image in self.images]
+        identity = scipy.sparse.eye_array(self.count)
+        return scipy.sparse.vstack([scipy.sparse.kron(identity, Q) for Q in matrices]).tocsr()
+
+    def displacements(self, u: Array) -> Array:
+        """Return the displacements (copies count, 3) of all copies, of that (count, 3) of one."""
+        return np.asarray((self.matrix @ u.ravel()).reshape(-1, 3))
+
+    def places(self, r0: Array) -> Array:
+        """Return the places (copies count, 3) of the nodes of all copies."""
+        return np.concatenate([image.apply(r0) for image in self.images])
+
+    def repeat(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values of the cells of all copies, of those of one."""
+        return np.concatenate([values] * len(self.images))
+
+    def cells(self, cells: Cells, r0: Array, vertices_on_planes: Longs) -> Cells:
+        """Return the cells of all copies, which share the vertices on their planes.
+
+        Parameters
+        ----------
+        r0
+            (count, 3) undeformed.
+        vertices_on_planes
+            Numbers of these vertices.
+        """
+        x = np.zeros((int(cells.corners.max()) + 1, 3))
+        x[cells.corners] = cells.at_corners @ r0[cells.nodes]
+        numbers = self.shared_numbers(x, vertices_on_planes)
+        return Cells(
+            cells.element,
+            np.concatenate([cells.nodes + k * self.count for k in range(len(self.images))]),
+            np.concatenate([number[cells.corners] for number in numbers]),
+        )
+
+    def shared_numbers(self, x: Array, on_planes: Longs) -> Longs:
+        """Return numbers (copies, n) of places (n, 3), one for images at the same place.
+
+        Parameters
+        ----------
+        on_planes
+            Rows of the places that are on planes of symmetry.
+        """
+        images = [image.apply(x[on_planes]) for image in self.images]
+        tolerance = SAME_PLACE_TOLERANCE * np.ptp(x, axis=0).max()
+        numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
+        for k, places in enumerate(images):
+            for earlier in range(k - 1, -1, -1):
+                is_same = np.linalg.norm(places - images[earlier], axis=1) < tolerance
+                numbers[k, on_planes[is_same]] = numbers[earlier, on_planes[is_same]]
+        return numbers
+
+    def sum_forces(self, forces: Array) -> Array:
+        """Return the forces (3 count,) on the model, of those on all copies."""
+        return np.asarray(self.matrix.T @ forces)
+
+    def sum_entries(self, entries: Entries) -> Entries:
+        """Return the entries of the model's tangent, of those of all copies' tangent."""
+        rows, columns, values = entries
+        size = self.matrix.shape[0]
+        K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
+        i, j, v = scipy.sparse.find(self.matrix.T @ K @ self.matrix)
+        return i.astype(np.int64), j.astype(np.int64), v
+
+
+class ContactWithImages(SurfaceContact):
+    """The contact of a pair of which a half or a sector is modelled.
+
+    Parameters
+    ----------
+    modelled_dofs
+        Number of the first degree of freedom of this rank, and how many it has.
+    geometry
+        With the cells and nodes of all copies; its own degrees of freedom are all of theirs.
+    sides
+        See `SurfaceContact`.
+    """
+
+    def __init__(
+        self,
+        images: Images,
+        modelled_dofs: tuple[int, int],
+        pair: Pair,
+        geometry: ContactGeometry,
+        sides: tuple[Flags, Flags],
+    ) -> None:
+        super().__init__(pair, geometry, sides)
+        self._images, self._modelled_dofs = images, modelled_dofs
+
+    def antisymmetric(self) -> "ContactWithImages":
+        """Return this term for additions to u that are antisymmetric to the plane.
+
+        The state stays symmetric.
+        """
+        other = copy(self)
+        other._images = replace(self._images, parity=-1.0)
+        return other
+
+    def _add(self, b: Array, forces: Array) -> None:
+        of_copies = np.zeros(self._images.matrix.shape[0])
+        super()._add(of_copies, forces)
+        start, size = self._modelled_dofs
+        b[:size] += self._images.sum_forces(of_copies)[start : start + size]
+
+    def entries(self) -> Entries:
+        return self._images.sum_entries(super().entries())
+
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        rows, columns = super().coupled_pairs()
+        return rows % self._images.count, columns % self._images.count
+
+    def _of_copies(self, u: Array) -> Array:
+        return self._images.displacements(u)
+
+    def _in_modelled(self, values: Array) -> Array:
+        copies = len(self._images.images)
+        return np.asarray(values.reshape(copies, -1, values.shape[1]).sum(axis=0))
+
+    def _on_modelled(self, forces: Array) -> Array:
+        return self._images.sum_forces(forces.ravel()).reshape(-1, 3)
