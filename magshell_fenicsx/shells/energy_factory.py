@@ -13,7 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets, HeldEdge
+from magshell_fenicsx.models.domains import Energy, Facets, HeldEdge, IntegrationDomain
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
@@ -29,8 +29,8 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.kinematics import (
     ALL_DERIVATIVES,
     FIRST_DERIVATIVES,
-    VALUE_AND_FIRST,
     SECOND_DERIVATIVES,
+    VALUE_AND_FIRST,
     Edge,
     Jet,
 )

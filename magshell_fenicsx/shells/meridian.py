@@ -48,8 +48,8 @@ from magshell_fenicsx.parts.supports.support_motion import (
 )
 from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresisted
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.energy_factory import INTERIOR, EnergyFactory
+from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.waves import SymmetryBreakingWaves, Waves, largest_wave_number
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets
+from magshell_fenicsx.models.domains import Energy, Facets, IntegrationDomain
 from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.formula_projection import CellGeometry
 from magshell_fenicsx.models.shell.law import Law

@@ -25,10 +25,10 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.parts.supports.supports import rigid_motions
 from magshell_fenicsx.shells.mass import (
     Model,
-    mass_matrix,
     displacement_product,
-    wave_product,
     mass_factor,
+    mass_matrix,
+    wave_product,
 )
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.sector_modes import SectorModes

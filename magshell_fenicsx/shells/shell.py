@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
@@ -17,37 +18,36 @@ from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem,
 from magshell_fenicsx.assembly.free_parameters import FreeParameter, PlacementAmplitudes
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
-from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, triangle_sides
+from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, EdgePressure, triangle_sides
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import (
     SECOND_SYMMETRY_EDGE,
-    SYMMETRY_EDGE,
     Y0_PLANE,
     Mirror,
     Sector,
 )
-from magshell_fenicsx.mesh.patch import Deviation, Embedding, MeshError
+from magshell_fenicsx.mesh.patch import Deviation, Embedding
 from magshell_fenicsx.models.domains import surface_domain
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD_ANGLE, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, hessian_integrals
+from magshell_fenicsx.models.shell.formula_projection import CellGeometry
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     Force,
-    HeldComponents,
     Material,
     default_penalty,
 )
+from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.spatial_fields import (
-    user_field_polynomials,
     cell_geometry,
     formula_field,
     positions_and_normals,
+    user_field_polynomials,
 )
-from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
 from magshell_fenicsx.parts.forces.load_vectors import (
     SurfaceMeasures,
@@ -62,28 +62,24 @@ from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import beside, on_cells, on_each, openings
 from magshell_fenicsx.parts.supports.support_motion import (
-    Support,
-    SupportKind,
     enclosed,
     motions_of,
     moving,
     pressed_edges,
-    rotation_of,
 )
 from magshell_fenicsx.parts.supports.supports import (
     closing_point,
-    held_at_vertex,
-    held_on,
-    plane_of,
     put_in_plane,
     refuse_unknown,
 )
-from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
+from magshell_fenicsx.shells.model_base import ThinModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
+from magshell_fenicsx.shells.shell_supports import ShellSupports
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+    from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 
 
 class ShellModel(ThinModel):
@@ -144,270 +140,337 @@ class ShellModel(ThinModel):
         thickness: Thickness | None = None,
         mirror: Mirror = Y0_PLANE,
     ) -> None:
-        self._given = material, degree, conditions, loads, sigma, thickness
+        self._arguments = material, degree, conditions, loads, sigma, thickness
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
-        for name in ("magnetic", "remanence"):
-            if field := getattr(loads, name):
-                topology = midsurface.mesh.topology.index_map(2)
-                cells = topology.size_local + topology.num_ghosts
-                loads = replace(loads, **{name: field.on(midsurface.patches, cells)})
+        loads = _magnetisation_by_cell(loads, midsurface)
         self.midsurface, self.material, self.degree = midsurface, material, degree
-        self.load_size, self.load_sizes = {}, {}
-        sides = {
-            name: plane
-            for name, plane in mirror.planes.items()
-            if conditions.get(name) == "symmetry"
+        self.mirror, self._conditions = mirror, conditions
+        self._mirror_planes = {
+            edge: plane
+            for edge, plane in mirror.planes.items()
+            if conditions.get(edge) == "symmetry"
         }
-        self.multiplicity = mirror.copies if sides else 1
-        self.kernels = KernelLog()
-        self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
-        self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
-        in_cells = cell_geometry(self.r0)
-        for name, laminate in material.every_laminate.items():
-            cells = midsurface.patches[name] if name else slice(None)
-            laminate.refuse_normal(positions_and_normals(self.r0)[1][cells], midsurface.mesh.comm)
-        for name in ("magnetic", "remanence"):
-            if (field := getattr(loads, name)) and field.given:
-                vectors = user_field_polynomials(field.given, midsurface, in_cells)
-                loads = replace(loads, **{name: replace(field, remanent=vectors)})
-        of_place = partial(formula_field, self.r0)
-        loads = self.loads = replace(
-            loads,
-            own=tuple(term.with_functions(of_place, midsurface.function) for term in loads.own),
-        )
-        if thickness and thickness.given:
-            thickness = replace(
-                thickness, carried=user_field_polynomials(thickness.given, midsurface, in_cells)
-            )
+        self.multiplicity = mirror.copies if self._mirror_planes else 1
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        for name in [
-            name for name, c in conditions.items() if c == "plane" and not midsurface.from_mesh_file
-        ]:
-            put_in_plane(self.r0, midsurface.edges[name])
-        shapes = {
-            name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()
-        }
-        self.growing = PlacementAmplitudes(self.r0, shapes, material.h) if shapes else None
-        self.thickness = factor = (
-            thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
-        )
+        self.load_size, self.load_sizes = {}, {}
+        self.kernels = KernelLog()
+        self.V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
+        self.r0, self.u = midsurface.placement(self.V), fem.Function(self.V, name="u")
+        cells = cell_geometry(self.r0)
+        self._refuse_normal_plies()
+        self.loads = self._with_functions(loads, cells)
+        self._put_edges_in_planes()
+        self.growing = self._growing_placement()
+        self.thickness = self._thickness_field(thickness, cells)
         self.made_of = None
         if material.shells:
             self.made_of = material_field(material.shells, midsurface.mesh, midsurface.patches)
-        free, shape = dict[str, fem.Constant](), None
-        if loads.natural:
-            cells = midsurface.mesh.topology.index_map(2)
-            count = cells.size_local + cells.num_ghosts
-            grown = loads.natural.on(
-                midsurface.patches,
-                count,
-                lambda given: user_field_polynomials(given, midsurface, in_cells),
-            )
-            loads = self.loads = replace(loads, natural=grown)
-            shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
-        folded = midsurface.kinked and largest_fold(self.r0, degree) > FOLD_ANGLE
-        carrier = surface_domain(self.r0, self.growing and self.growing.initial_placement)
-        of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
-        creases = Creases.of(loads.joints, midsurface) if loads.joints else None
-        pressed = on_cells(loads.pressed, midsurface) if loads.pressed else None
-        self.factory = factory = EnergyFactory(
-            carrier, self.u, *of_shell, pressed=pressed, creases=creases, made_of=self.made_of
-        )
-        interior = factory.term(factory.interior_edges())
+        self.factory = self._make_factory(cells)
+        self._pattern_term = self.factory.term(self.factory.interior_edges())
         terms: list[Term] = [
-            factory.term(factory.membrane()),
-            factory.term(factory.bending()),
-            interior,
+            self.factory.term(self.factory.membrane()),
+            self.factory.term(self.factory.bending()),
+            self._pattern_term,
         ]
-        held: list[Constraint] = []
-        mirrored: list[Constraint] = []
-        planes: list[Mirror] = []
-
-        def facets(condition: Condition) -> NDArray[np.int32]:
-            held_unknowns = [
-                midsurface.edges[name]
-                for name, c in conditions.items()
-                if c == condition and name in midsurface.edges
-            ]
-            return (
-                np.unique(np.concatenate(held_unknowns)).astype(np.int32)
-                if held_unknowns
-                else np.empty(0, np.int32)
-            )
-
-        for name, side in sides.items():
-            planes.append(side)
-            where = midsurface.edges[name]
-            edge = "mirror edges" if name == SYMMETRY_EDGE else f"{name} mirror edges"
-            self._mirror_term = factory.term(factory.mirror_edges(where, side.normal, edge))
-            terms.append(self._mirror_term)
-            mirrored.append(support_along(V, 1, where, side.normal))
-        clamped = [
-            name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges
-        ]
-        self.supports: dict[str, Support] = {}
-        on_planes: dict[str, Support] = {}
-        for name, condition in conditions.items():
-            components = (
-                condition.components if isinstance(condition, HeldComponents) else (0, 1, 2)
-            )
-            if condition in ("free", "symmetry"):
-                continue
-            if condition == "plane":
-                planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
-                plies = (
-                    each
-                    for of, each in material.every_laminate.items()
-                    if not of or name.startswith(f"{of}_")
-                )
-                if not all(laminate.mirrored(plane) for laminate in plies):
-                    raise MeshError(
-                        f"boundary: {name}: its plane does not mirror the plies, which are neither along nor across it"
-                    )
-                mirrored_edges = factory.mirror_edges(
-                    midsurface.edges[name], plane.normal, f"{name} mirror edges"
-                )
-                terms.append(factory.term(mirrored_edges))
-                held.append(support_along(V, 1, midsurface.edges[name], plane.normal))
-                on_edge = held_on(V, 1, midsurface.edges[name], components)
-                on_planes[name] = Support.of(on_edge, f"{name} mirror edges", kind="plane")
-                continue
-            edge, turn = "", None
-            if name in clamped:
-                edge, turn = (
-                    f"{name} clamped edges" if len(clamped) > 1 else "clamped edges",
-                    rotation_of(loads, name, V),
-                )
-                terms.append(
-                    factory.term(factory.clamped_edges(edge, midsurface.edges[name], turn))
-                )
-            if name in midsurface.edges:
-                conditions_of_part = held_on(V, 1, midsurface.edges[name], components)
-            elif name in midsurface.patches:
-                conditions_of_part = held_on(
-                    V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components
-                )
-            else:
-                conditions_of_part = held_at_vertex(
-                    V, midsurface.points[name], components, midsurface.cells_of_point(name)
-                )
-            held += conditions_of_part
-            kind: SupportKind = "point" if name in midsurface.points else "part"
-            self.supports[name] = Support.of(conditions_of_part, edge, turn, kind=kind)
-        self.supports |= on_planes
-        self.planes = tuple(planes)
-        closing = closing_point(planes)
-        open_at = beside(midsurface.edges, pressed) if pressed else midsurface.edges
-        free_edges, self.without_potential = openings(self.r0, open_at, conditions)
-        closed = enclosed(loads, free_edges, self.without_potential)
-        swept = loads.pressure or closed
-        volume = (
-            factory.swept_volume()
-            if swept
-            else factory.volume_change(np.zeros(3) if closing is None else closing)
+        supports = ShellSupports(
+            self.r0,
+            midsurface,
+            conditions,
+            self._mirror_planes,
+            material.every_laminate,
+            self.loads,
+            self.factory,
         )
-        if loads.magnetic:
-            terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
-        if loads.pressure:
-            terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
-        if loads.interaction:
-            from magshell_fenicsx.parts.magnetism.interacting import (
-                InteractionTerm,
-            )  # few shells have one
-
-            terms.append(interacting := InteractionTerm(self, self.u, loads.interaction))
-        terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
+        terms += supports.terms
+        self._mirror_term, self._constraints = supports.mirror_term, supports.constraints
+        self.supports, self.planes = supports.by_name, tuple(supports.planes)
+        opening_edges, is_enclosed = self._find_openings()
+        origin = closing_point(self.planes)
+        volume = self._volume_form(origin, is_enclosed=is_enclosed)
+        terms += self._field_and_pressure_terms()
+        interaction = self._interaction_term()
+        if interaction is not None:
+            terms.append(interaction)
+        terms += [self.factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {
             name: vertex_normal(self.r0, x, midsurface.cells_of_point(name))
             for name, x in midsurface.points.items()
         }
-        terms += [self._force(name, force) for name, force in loads.forces.items()]
-        on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
-        for name, dead in loads.dead.items():
-            assert on
-            terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
-            terms += [
-                factory.term(energy)
-                for energy in factory.dead_energies(name, dead, midsurface.edges)
-            ]
-        meeting: Sequence[SurfaceContact] = ()
-        if loads.pairs:
-            from magshell_fenicsx.parts.contact.model_surface import shell_contacts
-
-            of_images = mirror.images if sides else (), [midsurface.edges[name] for name in sides]
-            thick = carrier.contact_rule, factor, factory.law_of_cells.thins
-            surfaces = self.r0, self.u, midsurface.patches
-            meeting = shell_contacts(
-                loads.pairs, *surfaces, material.h, *thick, *of_images, shape, self.planes
-            )
-            terms += meeting
-        self.shell_contacts = meeting
-        if loads.joints or midsurface.t_junctions:
-            from magshell_fenicsx.shells.t_junctions import t_junction_terms
-
-            terms += t_junction_terms(self)
-        self._sites = hessian_integrals(self.r0, degree, terms, self.kernels, factory.prestress())
-        at_edges = None
-        if closed:
-            in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
-            curves = {
-                name: EdgeCurve.from_facets(V, side, triangle_sides(), pressed and on_each(pressed))
-                for name, side in open_at.items()
-                if name in in_planes or motions_of(loads, name)
-            }
-            unit = material.classical_pressure / material.h
-            at_edges = pressed_edges(self.r0, curves, in_planes, loads, unit, closing)
-        self.moving = moving(self.r0, self.supports, loads, at_edges)
-        near = None
-        if self.moving:
-            near = (
-                self.moving.cells,
-                hessian_integrals(self.r0, degree, terms, self.kernels, chosen=self.moving.cells),
-            )
-        fast = FastTangent(self.u, self._sites, held + mirrored, near)
-        dense = [term for term in terms if isinstance(term, ShellTerm)]
-
-        def serve(terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
-            return FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart)
-
-        gradients = serve(dense)
-        gradients.begin(energies=True)
-        for term in dense:
-            if not (
-                self.growing and term.amplitude == "pressure"
-            ):  # whose form measures from the drawn placement
-                term.points = gradients
-        parameters: dict[str, FreeParameter] = {
-            **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
-        }
-        parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
-        for each in meeting:
-            parameters |= each.entered(parameters)
-        self.fields = factory.fields
-        if self.growing:
-            parameters |= self.growing.parameters(terms, parameters, gradients)
-        stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        for each in meeting:
-            stiffnesses |= each.history
-        self.system = FiniteElementSystem(
-            self.u,
-            terms,
-            held + mirrored,
-            interior,
-            material.h,
-            fast,
-            gradients,
-            SystemVariables(parameters, self.moving, stiffnesses),
+        terms += self._force_terms()
+        self.shell_contacts = self._make_shell_contacts()
+        terms += self.shell_contacts
+        terms += self._t_junction_terms()
+        self._hessians = hessian_integrals(
+            self.r0, degree, terms, self.kernels, self.factory.prestress()
         )
-        self._interior, self._held, self.mirror = interior, held, mirror
-        self._on_mirror = facets("symmetry")
+        edge_pressure = self._edge_pressure(opening_edges, origin) if is_enclosed else None
+        self.moving = moving(self.r0, self.supports, self.loads, edge_pressure)
+        constraints = supports.constraints + supports.mirror_constraints
+        self.fields = self.factory.fields
+        self.system = self._make_system(terms, constraints)
+        self._mirrored_facets = self._facets_on_mirror()
         self.observe(
             self.kernels.compile("volume energy", volume),
             midsurface.points,
             midsurface.cells_of_point,
         )
-        if loads.interaction:
-            interacting.refuse_near()  # now that all is there which it reads
+        if interaction is not None:
+            interaction.refuse_near()  # now that all is there which it reads
+
+    def _refuse_normal_plies(self) -> None:
+        """Refuse plies whose direction is normal to the surface of their shell."""
+        for shell, laminate in self.material.every_laminate.items():
+            cells = self.midsurface.patches[shell] if shell else slice(None)
+            normals = positions_and_normals(self.r0)[1][cells]
+            laminate.refuse_normal(normals, self.midsurface.mesh.comm)
+
+    def _with_functions(self, loads: Loads, cells: CellGeometry) -> Loads:
+        """Return the loads with functions on the mesh in place of fields and formulas.
+
+        They are the user's fields of magnetisation, and the parameters of terms.
+        """
+        for name in ("magnetic", "remanence"):
+            magnetisation = getattr(loads, name)
+            if magnetisation and magnetisation.given:
+                vectors = user_field_polynomials(magnetisation.given, self.midsurface, cells)
+                loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
+        formula_to_field = partial(formula_field, self.r0)
+        own = (
+            term.with_functions(formula_to_field, self.midsurface.function) for term in loads.own
+        )
+        return replace(loads, own=tuple(own))
+
+    def _put_edges_in_planes(self) -> None:
+        """Move the nodes of edges with the condition "plane" into their planes."""
+        if self.midsurface.from_mesh_file:
+            return
+        for name, condition in self._conditions.items():
+            if condition == "plane":
+                put_in_plane(self.r0, self.midsurface.edges[name])
+
+    def _growing_placement(self) -> PlacementAmplitudes | None:
+        """Return the placement with amplitudes of imperfections; None if none of them grows."""
+        shapes = {
+            name: self.midsurface.growth(self.V, deviations)
+            for name, deviations in self.loads.growing.items()
+        }
+        return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
+
+    def _thickness_field(
+        self, thickness: Thickness | None, cells: CellGeometry
+    ) -> fem.Function | None:
+        """Return h(x)/h; None for 1."""
+        if thickness is None:
+            return None
+        if thickness.given:
+            values = user_field_polynomials(thickness.given, self.midsurface, cells)
+            thickness = replace(thickness, carried=values)
+        return thickness_field(thickness, self.r0, self.midsurface.patches)
+
+    def _make_factory(self, cells: CellGeometry) -> EnergyFactory:
+        """Return what makes the energies of this shell."""
+        midsurface, loads = self.midsurface, self.loads
+        free_constants: dict[str, fem.Constant] = {}
+        natural_shape = self._natural_shape(cells, free_constants)
+        is_folded = midsurface.kinked and largest_fold(self.r0, self.degree) > FOLD_ANGLE
+        initial_placement = self.growing and self.growing.initial_placement
+        domain = surface_domain(self.r0, initial_placement)
+        creases = Creases.of(self.loads.joints, midsurface) if loads.joints else None
+        return EnergyFactory(
+            domain,
+            self.u,
+            self.material,
+            self.sigma,
+            self.kernels,
+            self.thickness,
+            natural_shape,
+            free_constants,
+            is_folded,
+            pressed=on_cells(loads.pressed, midsurface) if loads.pressed else None,
+            creases=creases,
+            made_of=self.made_of,
+        )
+
+    def _natural_shape(
+        self, cells: CellGeometry, free_constants: dict[str, fem.Constant]
+    ) -> Shape | None:
+        """Return the natural shape, None if it is the drawn one; its amplitudes are added to the
+        constants of free parameters.
+        """
+        if not self.loads.natural:
+            return None
+        natural = self.loads.natural.on(
+            self.midsurface.patches,
+            _cell_count(self.midsurface),
+            lambda given: user_field_polynomials(given, self.midsurface, cells),
+        )
+        self.loads = replace(self.loads, natural=natural)
+        return Shape.of(natural_field(natural, cells, self.V), natural, free_constants)
+
+    def _find_openings(self) -> tuple[Mapping[str, NDArray[np.int32]], bool]:
+        """Return the edges where the pressed surface ends, and whether moving supports close it.
+
+        Sets `without_potential`.
+        """
+        edges, pressed_cells = self.midsurface.edges, self.factory.pressed
+        opening_edges = beside(edges, pressed_cells) if pressed_cells else edges
+        free_edges, self.without_potential = openings(self.r0, opening_edges, self._conditions)
+        return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
+
+    def _volume_form(self, origin: NDArray[np.float64] | None, *, is_enclosed: bool) -> ufl.Form:
+        """Return Delta V/R^3 of the modelled part; `origin` lies on all its symmetry planes."""
+        if self.loads.pressure or is_enclosed:
+            return self.factory.swept_volume()
+        return self.factory.volume_change(np.zeros(3) if origin is None else origin)
+
+    def _field_and_pressure_terms(self) -> list[Term]:
+        """Return the terms of magnetisation in an applied field and of a live pressure."""
+        factory, loads, terms = self.factory, self.loads, list[Term]()
+        if loads.magnetic:
+            terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
+        if loads.pressure:
+            terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
+        return terms
+
+    def _interaction_term(self) -> "InteractionTerm | None":
+        """Return the term by which magnetised parts act on each other; None if they do not."""
+        if not self.loads.interaction:
+            return None
+        # few shells have one
+        from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
+
+        return InteractionTerm(self, self.u, self.loads.interaction)
+
+    def _force_terms(self) -> list[Term]:
+        """Return the terms of forces at points, then those of dead loads."""
+        loads = self.loads
+        terms: list[Term] = [self._force(name, force) for name, force in loads.forces.items()]
+        if not loads.dead:
+            return terms
+        measures = SurfaceMeasures(self.r0, self.midsurface, self.degree)
+        for name, dead in loads.dead.items():
+            vectors = assemble_dead_loads(dead, self.V, measures, self.kernels)
+            terms.append(self.load_with(name, vectors))
+            energies = self.factory.dead_energies(name, dead, self.midsurface.edges)
+            terms += [self.factory.term(energy) for energy in energies]
+        return terms
+
+    def _make_shell_contacts(self) -> "Sequence[SurfaceContact]":
+        """Return the contacts of parts of the shell with each other."""
+        if not self.loads.pairs:
+            return ()
+        from magshell_fenicsx.parts.contact.model_surface import ModelSurface, surface_contacts
+
+        factory, edges = self.factory, self.midsurface.edges
+        surface = ModelSurface(
+            self.r0,
+            self.u,
+            self.midsurface.patches,
+            self.material.h,
+            factory.carrier.contact_rule,
+            self.thickness,
+            factory.law_of_cells.thins,
+            self.mirror.images if self._mirror_planes else (),
+            [edges[name] for name in self._mirror_planes],
+            factory.natural,
+            self.planes,
+        )
+        return surface_contacts(self.loads.pairs, surface)
+
+    def _t_junction_terms(self) -> Sequence[Term]:
+        """Return the terms that tie edges to other shells."""
+        if not (self.loads.joints or self.midsurface.t_junctions):
+            return ()
+        from magshell_fenicsx.shells.t_junctions import t_junction_terms
+
+        return t_junction_terms(self)
+
+    def _edge_pressure(
+        self,
+        opening_edges: Mapping[str, NDArray[np.int32]],
+        origin: NDArray[np.float64] | None,
+    ) -> EdgePressure:
+        """Return the work of a live pressure on lids at the edges that move."""
+        pressed_cells, loads = self.factory.pressed, self.loads
+        in_planes = {
+            name
+            for name, condition in self._conditions.items()
+            if condition in ("symmetry", "plane")
+        }
+        cell_sides = pressed_cells and on_each(pressed_cells)
+        curves = {
+            name: EdgeCurve.from_facets(self.V, facets, triangle_sides(), cell_sides)
+            for name, facets in opening_edges.items()
+            if name in in_planes or motions_of(loads, name)
+        }
+        unit = self.material.classical_pressure / self.material.h
+        return pressed_edges(self.r0, curves, in_planes, loads, unit, origin)
+
+    def _make_system(
+        self, terms: Sequence[Term], constraints: list[Constraint]
+    ) -> FiniteElementSystem:
+        """Return the system of all terms, with tangents and residuals from points."""
+        moving_cells = None
+        if self.moving:
+            cells = self.moving.cells
+            moving_cells = (
+                cells,
+                hessian_integrals(self.r0, self.degree, terms, self.kernels, chosen=cells),
+            )
+        tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
+        density_terms = [term for term in terms if isinstance(term, ShellTerm)]
+        residual = self._point_residual(density_terms)
+        residual.begin(energies=True)
+        for term in density_terms:
+            # the form of a pressure on a growing shape measures from the drawn placement
+            if not (self.growing and term.amplitude == "pressure"):
+                term.points = residual
+        parameters = self._free_parameters(terms, density_terms, residual)
+        histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
+        for contact in self.shell_contacts:
+            histories |= contact.history
+        return FiniteElementSystem(
+            self.u,
+            terms,
+            constraints,
+            self._pattern_term,
+            self.material.h,
+            tangent,
+            residual,
+            SystemVariables(parameters, self.moving, histories),
+        )
+
+    def _point_residual(self, terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
+        """Return the residual of terms from their densities at points."""
+        return FastResidual(self.r0, self.u, self.degree, terms, self.kernels, apart=apart)
+
+    def _free_parameters(
+        self, terms: Sequence[Term], density_terms: Sequence[ShellTerm], residual: FastResidual
+    ) -> dict[str, FreeParameter]:
+        """Return the parameters that vary, by name."""
+        factory = self.factory
+        one_by_one = partial(self._point_residual, apart=True)
+        parameters: dict[str, FreeParameter] = {
+            **point_parameters(factory.free, density_terms, one_by_one)
+        }
+        parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
+        for contact in self.shell_contacts:
+            parameters |= contact.entered(parameters)
+        if self.growing:
+            parameters |= self.growing.parameters(terms, parameters, residual)
+        return parameters
+
+    def _facets_on_mirror(self) -> NDArray[np.int32]:
+        """Return the facets of all edges with the condition "symmetry"."""
+        edges = self.midsurface.edges
+        facets = [
+            edges[name]
+            for name, condition in self._conditions.items()
+            if condition == "symmetry" and name in edges
+        ]
+        if not facets:
+            return np.empty(0, np.int32)
+        return np.unique(np.concatenate(facets)).astype(np.int32)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | SectorModes | None:
@@ -419,12 +482,12 @@ class ShellModel(ThinModel):
             return None
         if isinstance(self.mirror, Sector):
             return SectorModes(self, self._as_half)
-        edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
-        held = self._held + [
-            support_along(self.V, 1, self._on_mirror, along)
+        edges = self.factory.antisymmetric_edges(self._mirrored_facets, self.mirror.normal)
+        held = self._constraints + [
+            support_along(self.V, 1, self._mirrored_facets, along)
             for along in self.mirror.in_plane_vectors
         ]
-        sites = self._sites + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
+        sites = self._hessians + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]
@@ -434,7 +497,7 @@ class ShellModel(ThinModel):
                 self.u,
                 terms,
                 held,
-                self._interior,
+                self._pattern_term,
                 system.length,
                 fast,
                 system.gradients,
@@ -444,14 +507,14 @@ class ShellModel(ThinModel):
 
     def _as_half(self, midsurface: Midsurface) -> "ShellModel":
         """The same shell on the mid-surface of a half."""
-        material, degree, conditions, loads, sigma, thickness = self._given
+        material, degree, conditions, loads, sigma, thickness = self._arguments
         conditions = {name: c for name, c in conditions.items() if name != SECOND_SYMMETRY_EDGE}
         plane = Mirror.through_axis(self.mirror.azimuth)
         return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness, plane)
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:
-        return self._on_mirror
+        return self._mirrored_facets
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement."""
@@ -489,3 +552,18 @@ class ShellModel(ThinModel):
         else:
             entries = point_entries(self.V, x, inward, beside)
         return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)
+
+
+def _cell_count(midsurface: Midsurface) -> int:
+    """Return the number of cells of this rank, ghosts included."""
+    index_map = midsurface.mesh.topology.index_map(2)
+    return int(index_map.size_local + index_map.num_ghosts)
+
+
+def _magnetisation_by_cell(loads: Loads, midsurface: Midsurface) -> Loads:
+    """Return the loads with magnetisations in each cell in place of those of patches."""
+    for name in ("magnetic", "remanence"):
+        if magnetisation := getattr(loads, name):
+            in_cells = magnetisation.on(midsurface.patches, _cell_count(midsurface))
+            loads = replace(loads, **{name: in_cells})
+    return loads

@@ -33,8 +33,8 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     ByPatch,
     Components,
     body_cell_geometry,
-    field_in_body,
     body_positions_and_normals,
+    field_in_body,
 )
 from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.forces.load_vectors import assemble_dead_loads

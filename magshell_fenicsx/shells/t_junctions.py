@@ -36,8 +36,8 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.parts.contact.projection import Cells, places_near
+from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.platform import compat
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.nonlocal_terms import Factors
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
-from magshell_fenicsx.models.domains import IntegrationDomain, HeldEdge
+from magshell_fenicsx.models.domains import HeldEdge, IntegrationDomain
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet

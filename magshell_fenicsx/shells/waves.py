@@ -32,9 +32,9 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.wave_hessians import WaveHessians
-from magshell_fenicsx.models.domains import IntegrationDomain, Energy
-from magshell_fenicsx.parts.supports.on_meridian import Supports
+from magshell_fenicsx.models.domains import Energy, IntegrationDomain
 from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
+from magshell_fenicsx.parts.supports.on_meridian import Supports
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.t_junctions import MeridianTJunction
