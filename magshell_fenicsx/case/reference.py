@@ -5,8 +5,9 @@ They are docs/case.schema.json and docs/case.md.
 
 import json
 import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import BaseModel
@@ -24,6 +25,8 @@ _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}
 Schema = dict[str, Any]
 TITLE_OF_CASE = "The whole case"
 TAG_KEYS = ("geometry", "kind")
+REQUIRED = "required"
+COMMON_KEYS = "keys of several kinds"
 HEAD = """\
 # The case file
 
@@ -175,16 +178,107 @@ def _without_noise(part: Any, *, names: bool = False) -> Any:
     return cleaned
 
 
+@dataclass(frozen=True)
+class KeyText:
+    """What is said of a key of a section: its meaning, what is allowed, and its default."""
+
+    key: str
+    meaning: str
+    allowed: str
+    default: str
+
+    def item(self, kinds: str = "") -> str:
+        """Return the key as an item of a list, with words for the kinds that have it."""
+        default = self.default and (
+            self.default if self.default == REQUIRED else f"default {self.default}"
+        )
+        facts = "; ".join(filter(None, (self.allowed, default, kinds)))
+        meaning = f"{self.meaning.removesuffix('.')}. " if self.meaning else ""
+        return f"- `{self.key}`: {meaning}*{facts}*"
+
+
 def reference() -> str:
-    """Return the content of docs/case.md."""
+    """Return the content of docs/case.md.
+
+    Sections that a tag such as `kind` tells apart have many keys in common, which one list has
+    before them.
+    """
     of_case = schema()
-    sections = of_case["$defs"]
-    titles = {
-        name: _title(paths, sections[name]) for name, paths in _places(of_case, sections).items()
-    }
+    sections, places = of_case["$defs"], _places(of_case, of_case["$defs"])
+    titles = {name: _title(paths, sections[name]) for name, paths in places.items()}
+    families = defaultdict[str, list[Schema]](list)
+    for name, title in titles.items():
+        if _tag_key(sections[name]):
+            families[_family(title)].append(sections[name])
     parts = [HEAD, _section(TITLE_OF_CASE, of_case, titles)]
-    parts += [_section(title, sections[name], titles) for name, title in titles.items()]
+    common_of_family = dict[str, set[KeyText]]()
+    for name, title in titles.items():
+        family = _family(title)
+        if family in families and family not in common_of_family:
+            text, common_of_family[family] = _common_keys(family, families[family], titles)
+            parts += [text] if text else []
+        common = common_of_family[family] if _tag_key(sections[name]) else set()
+        parts.append(_section(title, sections[name], titles, common))
     return "\n".join([*parts, columns_page()])
+
+
+def _family(title: str) -> str:
+    """Return the keys under which sections are that a tag tells apart, from a title of one."""
+    return title.split(", ")[0]
+
+
+def _tag_key(section: Schema) -> str | None:
+    """Return the key that tells a section from others under the same keys; None without one."""
+    return next((key for key in TAG_KEYS if key in section.get("required", [])), None)
+
+
+def _tags(section: Schema) -> list[str]:
+    tag = section["properties"][_tag_key(section)]
+    return list(tag.get("enum", [tag.get("const")]))
+
+
+def _common_keys(
+    family: str, sections: Sequence[Schema], titles: dict[str, str]
+) -> tuple[str, set[KeyText]]:
+    """Return the list of the keys that several sections have alike, and what is said of them.
+
+    Keys that differ in their default alone are one item of the list.
+    """
+    kinds_of_text = defaultdict[KeyText, list[str]](list)
+    counts = Counter[KeyText]()
+    for section in sections:
+        for text in _key_texts(section, titles):
+            kinds_of_text[text] += _tags(section)
+            counts[replace(text, default="")] += 1
+    items, common = list[str](), set[KeyText]()
+    all_kinds = [kind for section in sections for kind in _tags(section)]
+    for without_default in (text for text, count in counts.items() if count > 1):
+        texts = [text for text in kinds_of_text if replace(text, default="") == without_default]
+        texts.sort(key=lambda text: -len(kinds_of_text[text]))
+        default = "; ".join(
+            text.default + (f" ({', '.join(kinds_of_text[text])})" if i else "")
+            for i, text in enumerate(texts)
+            if text.default
+        )
+        kinds = [kind for text in texts for kind in kinds_of_text[text]]
+        items.append(
+            replace(without_default, default=default).item(_kinds_in_words(kinds, all_kinds))
+        )
+        common.update(texts)
+    if not items:
+        return "", common
+    head = f"\n## {family}: {COMMON_KEYS}\n\n`{_tag_key(sections[0])}` is required.\n"
+    return "\n".join([head, *items, ""]), common
+
+
+def _kinds_in_words(kinds: Sequence[str], all_kinds: Sequence[str]) -> str:
+    """Return which kinds have a key; empty if all have it."""
+    others = [kind for kind in all_kinds if kind not in kinds]
+    if not others:
+        return ""
+    if len(others) < len(kinds):
+        return f"all but {', '.join(others)}"
+    return f"of {', '.join(kinds)}"
 
 
 def _places(of_case: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
@@ -222,29 +316,38 @@ def _references(part: Any) -> Iterator[str]:
 
 def _title(paths: list[str], section: Schema) -> str:
     """Return the keys of a section, and the tag that tells it from others under these keys."""
-    for key in TAG_KEYS:
-        if key in section.get("required", []):
-            tag = section["properties"][key]
-            return f"{paths[0]}, {key}: {', '.join(tag.get('enum', [tag.get('const')]))}"
-    return ", ".join(paths)
+    key = _tag_key(section)
+    return f"{paths[0]}, {key}: {', '.join(_tags(section))}" if key else ", ".join(paths)
 
 
-def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
-    """Return the text of a section, with a table of its keys."""
+def _section(
+    title: str, section: Schema, titles: dict[str, str], common: Collection[KeyText] = ()
+) -> str:
+    """Return the text of a section, with the keys that are not among the common ones."""
     lines = ["", f"## {title}", "", section["description"], ""]
-    if section["properties"]:
-        lines += ["| key | allowed | unit | default | meaning |", "| --- | --- | --- | --- | --- |"]
-        required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
-        # the tag that tells it from others comes first
-        keys = sorted(section["properties"].items(), key=lambda item: item[0] not in TAG_KEYS)
-        lines += [_row(key, value, key in required, titles) for key, value in keys]
-    else:
-        lines += [f"Allowed: {_allowed(section, titles)}."]
+    if not section["properties"]:
+        return "\n".join([*lines, f"Allowed: {_allowed(section, titles)}."]) + "\n"
+    texts = _key_texts(section, titles)
+    own = [text.item() for text in texts if text not in common]
+    shared = ", ".join(f"`{text.key}`" for text in texts if text in common)
+    if shared:
+        link = f"[{COMMON_KEYS}](#{anchor(f'{_family(title)}: {COMMON_KEYS}')})"
+        own += ["", f"And {link}: {shared}."] if own else [f"It has {link}: {shared}."]
+    lines += own
     return "\n".join(lines) + "\n"
 
 
-def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
-    """Return the row of a key in the table of its section."""
+def _key_texts(section: Schema, titles: dict[str, str]) -> list[KeyText]:
+    """Return what is said of the keys of a section, but for a tag that its title says all of."""
+    required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
+    return [
+        _key_text(key, value, key in required, titles)
+        for key, value in section["properties"].items()
+        if key != _tag_key(section) or "description" in value
+    ]
+
+
+def _key_text(key: str, part: Schema, required: bool, titles: dict[str, str]) -> KeyText:
     meaning_and_unit = re.fullmatch(
         r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split())
     )
@@ -252,16 +355,15 @@ def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
     value = part.get("default")
     default = ""
     if required:
-        default = "**required**"
+        default = REQUIRED
     elif value is not None and not isinstance(value, dict):
         default = f"`{_value_text(value)}`"
-    cells = (
-        f"`{key}`",
-        _allowed(part, titles),
-        meaning_and_unit[2] or "",
-        default,
-        meaning_and_unit[1],
-    )
+    unit = f"; unit: {meaning_and_unit[2]}" if meaning_and_unit[2] else ""
+    return KeyText(key, meaning_and_unit[1], f"{_allowed(part, titles)}{unit}", default)
+
+
+def _line(cells: Sequence[str]) -> str:
+    """Return a line of a table in Markdown."""
     return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 
@@ -269,7 +371,8 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
     """Return words for what a value may be."""
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
-        return f"[{title.split(': ')[-1]}](#{anchor(title)})"
+        words = title.split(": ")[-1] if ": " in title else title.split(", ")[0]
+        return f"[{words}](#{anchor(title)})"
     for alternatives in ("anyOf", "oneOf"):
         if alternatives in part:
             words = [
@@ -361,5 +464,4 @@ def _in_units(q: Quantity) -> str:
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return [f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |" for line in lines]
+    return [_line(cells) for cells in (head, ["---"] * len(head), *rows)]
