@@ -11,7 +11,7 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.follow import BEYOND, follow_alone
+from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
 from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.gradient import derivative
@@ -30,7 +30,7 @@ from magshell_fenicsx.simulate.gradients.vibration import FIRST_FREQUENCIES, adj
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.simulate.scene_reuse import SceneReuse
 from magshell_fenicsx.studies.design_variables import Variables
 from magshell_fenicsx.studies.runner import Case
 
@@ -72,7 +72,7 @@ def evaluate(
     results: Sequence[str],
     targets: Mapping[str, Target],
     comm: MPI.Comm,
-    scene_cache: Standing,
+    scene_cache: SceneReuse,
 ) -> DesignEvaluation:
     """Follow the path of a case, and differentiate its results; collective.
 
@@ -117,7 +117,7 @@ def evaluate(
 
 
 @dataclass
-class _Path:
+class _ComputedPath:
     """The records of a path as far as results need it, and why it was lost, if it was."""
 
     records: list[Record] = field(default_factory=list)
@@ -134,9 +134,9 @@ def _refuse_missing_results(
             refuse_no_result(scene, [result], named_sections[result], extra_results=[MASS])
 
 
-def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _Path:
+def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _ComputedPath:
     """Follow the path of a scene as far as the results need it; collective."""
-    path, remarks = _Path(), list[str]()
+    path, remarks = _ComputedPath(), list[str]()
     try:
         for record in follow_alone(scene, remark=remarks.append):
             path.records.append(record)
@@ -145,7 +145,7 @@ def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _Path:
                 break
     except Stopped as e:
         path.lost_reason = str(e)
-    remarks_on_end = (text for text in remarks if text.startswith(BEYOND))
+    remarks_on_end = (text for text in remarks if text.startswith(BEYOND_INSTABILITY))
     path.lost_reason = path.lost_reason or next(remarks_on_end, "")
     return path
 
@@ -164,7 +164,7 @@ def _add_mass(
 
 
 def _adjoints(
-    scene: Scene, path: _Path, result: str, targets: Mapping[str, Target]
+    scene: Scene, path: _ComputedPath, result: str, targets: Mapping[str, Target]
 ) -> tuple[list[tuple[str, Adjoint]], str]:
     """Return the adjoints of a result, or of its lowest modes, and a note about them."""
     if result in LOWEST:
