@@ -80,14 +80,14 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
     conditions = {**problem.conditions, "top": edge}
     model = MeridianModel(meridian, problem.material, 4, conditions, problem.loads)
-    waves, carrier = model.excluded_modes.waves, model.factory.carrier
+    waves, domain = model.symmetry_breaking_modes.waves, model.factory.domain
     v = ufl.TestFunction(waves.V)
     along = domains.wave_jets(v, fem.Constant(meridian.mesh, float(M)))[0].r
-    form = np.pi * carrier.over_area()(
-        -ufl.dot(kin.normal(carrier.j0), along)
+    form = np.pi * domain.over_area()(
+        -ufl.dot(kin.normal(domain.j0), along)
     )  # of the pressure E h/R
     f = fem.assemble_vector(fem.form(form)).array.copy()
-    for support in waves.held(M):
+    for support in waves.constraints(M):
         f[support.dof_indices()[0]] = 0
     factors = waves.factor_at(State(model.zero(), {"load": 0.0}), M)
     energy = float(f @ factors.solve(f)) / 2  # over E h R^2 at p = E h/R; half of the shell

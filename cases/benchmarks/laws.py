@@ -32,9 +32,9 @@ def largest_strains(scene: Scene, record: Record) -> tuple[float, float]:
     """
     model, state = scene.model, record.point.state
     assert isinstance(model, MeridianModel)
-    jets_of, h = model.carrier.tables(model.V, PLACES), model.material.h
+    jets_of, h = model.domain.tables(model.V, PLACES), model.material.h
     r0, u = (jets_of(x) for x in (model.r0.x.array, state.u))
-    frame = TangentFrame.of(r0)
+    frame = TangentFrame.from_jet(r0)
     E, K = frame.membrane_strain(u), frame.curvature_change(u)
     away = np.hypot(r0[0, ..., 0], r0[0, ..., 1]) > h
 

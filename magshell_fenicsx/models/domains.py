@@ -1,7 +1,7 @@
 """Where the densities of a shell are integrated: its mid-surface, or the meridian of what is closed
 around e3.
 
-A carrier gives the jets of fields, the measures of cells, of the edges between them and of the
+A domain gives the jets of fields, the measures of cells, of the edges between them and of the
 boundary's edges, and how wide the cells are there. Whoever writes an energy writes its density
 alone.
 
@@ -105,38 +105,38 @@ class Energy:
 
     Attributes
     ----------
-    of
-        Of the jet of u: the energy on the carrier, of which `IntegrationDomain.whole` times as much is
+    form_of
+        Of the jet of u: the energy on the domain, of which `IntegrationDomain.revolution_factor` times as much is
         modelled.
     work
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
     density
         What is integrated; None for a load that is known by its vector.
-    drawn
+    from_initial
         Whether it counts from the drawn placement.
     group, column
         As of a `Term`; the group of "" is the name.
-    counted
+    reference_turn
         Of a moment: the turn that its angle is counted from, and -Pi of one radian.
     """
 
     name: str
-    of: Callable[[Jet], ufl.Form]
+    form_of: Callable[[Jet], ufl.Form]
     amplitude: str | None = None
     linear: bool = False
     work: Callable[[Jet, Jet], ufl.Form] | None = None
     density: Density | None = None
-    drawn: bool = False
-    counted: tuple[fem.Constant, float] | None = None
+    from_initial: bool = False
+    reference_turn: tuple[fem.Constant, float] | None = None
     group: str = ""
     column: str = ""
 
-    def added(self, u: Jet, v: Jet) -> ufl.Form:
+    def perturbed_form(self, u: Jet, v: Jet) -> ufl.Form:
         """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its
         symmetric part.
         """
         if self.work is None:
-            return self.of(u + v)
+            return self.form_of(u + v)
         return 0.25 * (self.work(u + v, v) - self.work(u - v, v))
 
 
@@ -177,9 +177,9 @@ class IntegrationDomain:
         function from nodal values, with ghosts, to jets (6, cells, places, 3).
     variant
         Of discontinuous fields, which are known at places where the coordinates are regular.
-    whole
+    revolution_factor
         What integrals are multiplied by: 2 pi on a meridian, where they are per radian.
-    drawn
+    initial_placement
         The placement that volumes count from; None for r0.
     """
 
@@ -192,8 +192,8 @@ class IntegrationDomain:
     contact_rule: int
     tables: Callable[[fem.FunctionSpace, Array], Callable[[Array], Array]]
     variant: basix.LagrangeVariant
-    whole: float = 1.0
-    drawn: fem.Function | None = None
+    revolution_factor: float = 1.0
+    initial_placement: fem.Function | None = None
 
     @property
     def mesh(self) -> mesh.Mesh:
@@ -228,9 +228,9 @@ class IntegrationDomain:
 
     def ds(self, facets: Facets) -> ufl.Measure:
         """Of some edges of the boundary."""
-        return self.each_ds([facets])[0]
+        return self.measures_on([facets])[0]
 
-    def each_ds(self, parts: Sequence[Facets]) -> list[ufl.Measure]:
+    def measures_on(self, parts: Sequence[Facets]) -> list[ufl.Measure]:
         """Of some parts of the boundary that do not overlap, each of one measure: a form may have
         one alone.
         """
@@ -258,11 +258,11 @@ class IntegrationDomain:
         """The undeformed length of some edges."""
         return kin.conormal(self.j0, self.covector)[2] * self.ds(facets)
 
-    def from_drawn(self, u: Jet) -> tuple[Jet, Jet]:
+    def jets_from_initial(self, u: Jet) -> tuple[Jet, Jet]:
         """The jets of the drawn placement and of the displacement from there."""
-        if self.drawn is None:
+        if self.initial_placement is None:
             return self.j0, u
-        drawn = self.jet(self.drawn)
+        drawn = self.jet(self.initial_placement)
         return drawn, self.j0 + u - drawn
 
     def measure(self, density: Density) -> ufl.Measure:
@@ -274,7 +274,7 @@ class IntegrationDomain:
         return self.dx(density.quadrature) if density.facets is None else self.ds(density.facets)
 
     def value(self, density: Density, u: Jet, *, drawn: bool = False) -> Expr:
-        """Of a density; `drawn`: of what counts from the drawn placement."""
+        """Of a density; `initial_placement`: of what counts from the drawn placement."""
         r0 = self.j0
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
@@ -282,10 +282,12 @@ class IntegrationDomain:
             sided = [
                 (p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters
             ]
-            return density.of(*pairs, m, self.widths[0], *sided)
+            return density.function(*pairs, m, self.widths[0], *sided)
         if density.facets is not None:
-            return density.of(r0, u, self.covector, self.widths[1], *density.parameters)
-        return density.of(*(self.from_drawn(u) if drawn else (r0, u)), *density.parameters)
+            return density.function(r0, u, self.covector, self.widths[1], *density.parameters)
+        return density.function(
+            *(self.jets_from_initial(u) if drawn else (r0, u)), *density.parameters
+        )
 
     def integral(self, density: Density, u: Jet) -> ufl.Form:
         """Of a density."""
@@ -300,7 +302,7 @@ class IntegrationDomain:
         drawn: bool = False,
         **others: Any,
     ) -> Energy:
-        """That of a density; `drawn` as of `value`, `others` are attributes of `Energy`."""
+        """That of a density; `initial_placement` as of `value`, `others` are attributes of `Energy`."""
         virtual, over = density.work, self.measure(density)
 
         def of(u: Jet) -> ufl.Form:
@@ -316,7 +318,7 @@ class IntegrationDomain:
             amplitude,
             work=work if virtual else None,
             density=density,
-            drawn=drawn,
+            from_initial=drawn,
             **others,
         )
 
@@ -335,7 +337,7 @@ def surface_domain(r0: fem.Function, drawn: fem.Function | None = None) -> Integ
         contact_rule=3 * degree,  # the pressure at the rim of a contact is narrower than an element
         tables=_tables_on_surface,
         variant=basix.LagrangeVariant.gll_warped,
-        drawn=drawn,
+        initial_placement=drawn,
     )
 
 
@@ -359,8 +361,8 @@ def meridian_domain(r0: fem.Function, drawn: fem.Function | None = None) -> Inte
         contact_rule=6 * degree,  # points are cheap here
         tables=_tables_on_meridian,
         variant=basix.LagrangeVariant.gl_isaac,  # inside: on the axis the coordinates are singular
-        whole=2 * np.pi,
-        drawn=drawn,
+        revolution_factor=2 * np.pi,
+        initial_placement=drawn,
     )
 
 

@@ -68,7 +68,7 @@ def thickness_ratio(r0: Jet, u: Jet, natural: Forms | None = None, thins: Expr |
 
 
 def thickness_ratio_at_points(
-    carrier: IntegrationDomain, u: fem.Function, natural: GrownSurface | None, thins: Array | int = 1
+    domain: IntegrationDomain, u: fem.Function, natural: GrownSurface | None, thins: Array | int = 1
 ) -> ThicknessRatio:
     """Return `thickness_ratio` as arrays, at the present displacement and natural shape.
 
@@ -77,11 +77,11 @@ def thickness_ratio_at_points(
     thins
         (cells, 1) 1 in the cells that get thinner, or 1 for all.
     """
-    r0, V = carrier.r0, u.function_space
+    r0, V = domain.r0, u.function_space
     natural_values = natural.values if natural else None
 
     def ratio_at(points: Array) -> Memo[Array]:
-        jets_of = carrier.tables(V, points)
+        jets_of = domain.tables(V, points)
 
         def values() -> Array:
             first = jets_of(r0.x.array)[1:3]

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.course import Course, Target
-from magshell_fenicsx.parts.part import Account, Context, KeyAbility, Modelled
+from magshell_fenicsx.parts.step_control import Course, Target
+from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.parts.path_step import FactorStep
-from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.observables import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -279,7 +279,7 @@ class Creases:
         def of(*arguments: Any, **options: Any) -> Any:
             *given, (plus, minus), k, angle, has, grown = arguments
             r0, u, m = given[:3]
-            within, springs, joined = density.of(*given, **options), 0, 0
+            within, springs, joined = density.function(*given, **options), 0, 0
             stretch = (
                 sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
             )
@@ -299,4 +299,4 @@ class Creases:
             return (1 - joined) * within + springs
 
         more = (self.marks, self.stiffness, self.angle, self.given, factor)
-        return replace(density, of=of, parameters=(*density.parameters, *more))
+        return replace(density, function=of, parameters=(*density.parameters, *more))

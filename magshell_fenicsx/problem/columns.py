@@ -12,7 +12,7 @@ import numpy as np
 from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import DISTANCE, TURN, Unit
@@ -45,7 +45,7 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
     return (
         of_parts
         | {term.name: term.value for term in terms}
-        | {p.name: p.value for term in terms for p in term.free}
+        | {p.name: p.value for term in terms for p in term.free_parameters}
     )
 
 

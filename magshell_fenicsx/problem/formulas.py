@@ -217,7 +217,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
             on_disc = x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x
             return outline.perfect(on_disc)
 
-    lattice = Lattice.of(basix.CellType.triangle, CELL_SAMPLES)
+    lattice = Lattice.make(basix.CellType.triangle, CELL_SAMPLES)
 
     def places_and_areas(parts: SubCells) -> tuple[Array, Array]:
         X = parts.rule(lattice.places, np.ones(len(lattice.places)))[0]
@@ -440,7 +440,7 @@ def _unresolved_formula(
     def values(x: Array, n: Array) -> Array:
         return key_formulas.values_at(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
 
-    x, normals, _ = cells.at(element.points)
+    x, normals, _ = cells.evaluate(element.points)
     is_thickness = spec.key == THICKNESS
     fit = project_formula(
         values,
@@ -497,7 +497,7 @@ def _stiffness_error(values: Callable[[Array, Array], Array], cells: CellGeometr
         (cells, nodes, 1) thickness factors of the cells.
     """
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
-    x, normals, area = cells.at(X)
+    x, normals, area = cells.evaluate(X)
     kind, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
     curvatures = basix.create_element(
         basix.ElementFamily.P, kind, degree, basix.LagrangeVariant.legendre, discontinuous=True
@@ -518,7 +518,7 @@ def _stiffness_error(values: Callable[[Array, Array], Array], cells: CellGeometr
     moments = [np.ones((len(x), 1)), (1 + position) ** 2, (1 - position) ** 2]
     squared_moments = np.concatenate(moments, axis=1)
     error_integral, exact_integral = (
-        cells.sum(v[..., None] * squared_moments[:, None]) for v in (error, exact)
+        cells.sum_over_ranks(v[..., None] * squared_moments[:, None]) for v in (error, exact)
     )
     return float((error_integral / exact_integral).max())
 

@@ -26,7 +26,7 @@ from magshell_fenicsx.mesh.unfolding import double_sector
 from magshell_fenicsx.mesh.vertex_spacing import flat_triangle, refuse_flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
-from magshell_fenicsx.models.shell.spatial_fields import Inside
+from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
@@ -73,7 +73,7 @@ def solid_body_of(context: Context) -> SolidBody | None:
     shell, ratio = context.shell, _solid_section(context).bulk_to_shear
     share = shell.rubber or 0.0
     assert isinstance(share, float)  # Ogden's law needs a mid-surface
-    return SolidBody(MooneyRivlin.of(shell.poisson_ratio, ratio, share), layer_bounds(context))
+    return SolidBody(MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, ratio, share), layer_bounds(context))
 
 
 def layer_bounds(context: Context) -> list[float]:
@@ -227,7 +227,7 @@ class Problem:
     supports: tuple[str, ...] = ()
     reactions: bool = False
     warnings: tuple[str, ...] = ()
-    within: Mapping[str, Inside] = field(default_factory=dict)
+    within: Mapping[str, InsideRim] = field(default_factory=dict)
     lambda_m: float = 0.0
     unknowns: float = 0.0
     patched: bool = False

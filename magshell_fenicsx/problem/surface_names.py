@@ -55,7 +55,7 @@ def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
     names = list[str]()
     for term in terms:
         names += [term.name, *term.observed] if term.density else [*term.observed]
-    names += {p.name for term in terms for p in term.free}
+    names += {p.name for term in terms for p in term.free_parameters}
     for name in names:
         if name in RESERVED_NAMES or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
@@ -68,7 +68,7 @@ def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:
             raise CaseError(
                 f"model: solid: {term.name} is an energy of an edge, which only a shell has"
             )
-        second_derivatives = [f"r0.{name}" for name in term.placed_parts if name in SECOND_DERIVATIVES]
+        second_derivatives = [f"r0.{name}" for name in term.placement_parts if name in SECOND_DERIVATIVES]
         if second_derivatives:
             raise CaseError(
                 f"model: solid: {term.name} depends on {', '.join(second_derivatives)}, "

@@ -1,4 +1,4 @@
-"""The energies of a shell on its carrier: each a density, made only when a scene calls for it."""
+"""The energies of a shell on its domain: each a density, made only when a scene calls for it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -73,47 +73,47 @@ class EnergyFactory:
         What multiplies h, (1,); None for 1.
     natural
         The natural shape; None if it is the drawn one.
-    free
+    free_constants
         Constants of the parameters that enter freely.
-    folded
+    has_folds
         Whether cells meet at angles that are not small.
     fields
         The applied fields known by values that were made.
-    held
+    held_edges
         The edges that hold the normal, and those on mirror planes, whose energies were made.
     pressed
         Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for
         1.
     creases
         Joints with springs or hinges.
-    made_of
+    cell_materials
         Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
     saturated
         What is known of a soft material that saturates, when it was made.
     """
 
-    carrier: IntegrationDomain
+    domain: IntegrationDomain
     u: fem.Function
     material: Material
     sigma: float
     log: KernelLog
     thickness: fem.Function | None = None
     natural: Shape | None = None
-    free: Constants = field(default_factory=dict)
-    folded: bool = False
+    free_constants: Constants = field(default_factory=dict)
+    has_folds: bool = False
     fields: list[AppliedField] = field(default_factory=list)
-    held: list[HeldEdge] = field(default_factory=list)
+    held_edges: list[HeldEdge] = field(default_factory=list)
     pressed: fem.Function | None = None
     creases: Creases | None = None
-    made_of: fem.Function | None = None
+    cell_materials: fem.Function | None = None
     saturated: list[PointField] = field(default_factory=list)
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
-        whole, u = self.carrier.whole, self.carrier.jet(self.u)
-        form, work = whole * energy.of(u), None
+        whole, u = self.domain.revolution_factor, self.domain.jet(self.u)
+        form, work = whole * energy.form_of(u), None
         if energy.work:
-            work = whole * energy.work(u, self.carrier.jet(ufl.TestFunction(self.u.function_space)))
+            work = whole * energy.work(u, self.domain.jet(ufl.TestFunction(self.u.function_space)))
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
             given = energy.name, *density, form, self.u, self.log, energy.amplitude
@@ -123,66 +123,66 @@ class EnergyFactory:
 
         if energy.density is None:
             return make(FormTerm)
-        if energy.counted is None:
+        if energy.reference_turn is None:
             return make(ShellTerm, energy.density)
         moment = make(MomentTerm, energy.density)
-        moment.set_reference_turn(*energy.counted)
+        moment.set_reference_turn(*energy.reference_turn)
         return moment
 
     def membrane(self) -> Energy:
-        density = self._elastic(Density(per_area(densities.membrane), ()))
-        return self.carrier.energy("membrane", density, column="stretching")
+        density = self._elastic_density(Density(per_area(densities.membrane), ()))
+        return self.domain.energy("membrane", density, column="stretching")
 
     def prestress(self) -> Density:
         """The part of the tangent that membrane stress makes; its first parameter is the strain."""
-        strain = fem.Function(fem.functionspace(self.carrier.mesh, ("DG", 0, (3,))))
-        return self._elastic(Density(per_area(densities.prestress), (strain,)))
+        strain = fem.Function(fem.functionspace(self.domain.mesh, ("DG", 0, (3,))))
+        return self._elastic_density(Density(per_area(densities.prestress), (strain,)))
 
     def bending(self) -> Energy:
-        density = self._elastic(Density(per_area(densities.bending), (), parts=ALL_DERIVATIVES))
-        return self.carrier.energy("bending", density, column="bending")
+        density = self._elastic_density(
+            Density(per_area(densities.bending), (), parts=ALL_DERIVATIVES)
+        )
+        return self.domain.energy("bending", density, column="bending")
 
     def interior_edges(self) -> Energy:
-        of = edges.fold if self.folded else edges.interior
-        density = self._elastic(
+        of = edges.fold if self.has_folds else edges.interior
+        density = self._elastic_density(
             Density(of, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
         )
         if self.creases:
             zero = self._constant(0.0)
             density = self.creases.added(
-                density, self.free.setdefault(FOLD, zero) if self.creases.grow else zero
+                density, self.free_constants.setdefault(FOLD, zero) if self.creases.grow else zero
             )
-        return self.carrier.energy(INTERIOR, density, column="bending")
+        return self.domain.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
         """`turn` is the rotation of an edge that moves."""
         parameters = (self._penalty,) if turn is None else (self._penalty, turn)
-        density = self._elastic(
+        density = self._elastic_density(
             Density(edges.clamped, parameters, ALL_DERIVATIVES, SECOND_DERIVATIVES, facets)
         )
-        self.held.append(HeldEdge(facets, turn=turn))
-        return self.carrier.energy(name, density, column="bending")
+        self.held_edges.append(HeldEdge(facets, turn=turn))
+        return self.domain.energy(name, density, column="bending")
 
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
         """Edges on a mirror plane with that normal."""
         plane = self._constant(normal)
-        density = self._elastic(
+        density = self._elastic_density(
             Density(
                 edges.symmetric, (self._penalty, plane), ALL_DERIVATIVES, SECOND_DERIVATIVES, facets
             )
         )
-        self.held.append(HeldEdge(facets, plane=plane))
-        return self.carrier.energy(name, density, column="bending")
+        self.held_edges.append(HeldEdge(facets, plane=plane))
+        return self.domain.energy(name, density, column="bending")
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
         """A moment per length about the edge's first tangent; in E h R."""
         past = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
-        length = fem.assemble_scalar(
-            self.log.compile(f"{name} length", self.carrier.length(facets))
-        )
-        total = self.carrier.whole * self._over_ranks(length)
-        return self.carrier.energy(name, density, amplitude, counted=(past, intensity * total))
+        length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
+        total = self.domain.revolution_factor * self._over_ranks(length)
+        return self.domain.energy(name, density, amplitude, counted=(past, intensity * total))
 
     def dead_energies(
         self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
@@ -194,19 +194,19 @@ class EnergyFactory:
             )
             for i, load in enumerate(moments(loads))
         ]
-        return turning + [self.own(term, amplitude=name) for term in potentials(loads)]
+        return turning + [self.user_energy(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
-        carrier, parameters = self.carrier, (self._penalty, self._constant(normal))
-        density = self._elastic(
+        domain, parameters = self.domain, (self._penalty, self._constant(normal))
+        density = self._elastic_density(
             Density(antisymmetric_edge, parameters, ALL_DERIVATIVES, facets=facets)
         )
         v = fem.Function(self.u.function_space)
-        jets = carrier.j0, carrier.jet(self.u), carrier.jet(v)
-        energy = density.of(
-            *jets, carrier.covector, carrier.widths[1], *density.parameters
-        ) * carrier.ds(facets)
+        jets = domain.j0, domain.jet(self.u), domain.jet(v)
+        energy = density.function(
+            *jets, domain.covector, domain.widths[1], *density.parameters
+        ) * domain.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
@@ -218,23 +218,27 @@ class EnergyFactory:
         applied = None
         if field.in_space:
             applied = AppliedField(
-                field.in_space, self.carrier.r0, self.u, self.carrier.rule, field.driven
+                field.in_space, self.domain.r0, self.u, self.domain.rule, field.driven
             )
             self.fields.append(applied)
         if field.soft is None:
             return self.remanent(field, applied)
         return [
             *([] if field.soft.alone else self.remanent(field, applied)),
-            self.soft(field, field.soft, applied),
+            self.soft_magnetic(field, field.soft, applied),
         ]
 
-    def soft(self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None) -> Energy:
+    def soft_magnetic(
+        self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None
+    ) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
         sheet, scale = Sheet(field), self._constant(soft.scale)
         law, *given = self._of_sheet(sheet, soft, applied)
         parts = FIRST_DERIVATIVES if field.uniform else VALUE_AND_FIRST
         density = Density(per_area(sheet.energy_per_area), (law, scale, *given), parts=parts)
-        return self.carrier.energy(TERM, self._thick(density), group="magnetic", column="magnetic")
+        return self.domain.energy(
+            TERM, self._with_thickness(density), group="magnetic", column="magnetic"
+        )
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
         """The integrals of the polarisation over the undeformed volume of what is modelled, over h;
@@ -248,7 +252,7 @@ class EnergyFactory:
         for axis, e in zip("xyz", np.eye(3), strict=True):
             by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *given))
         return {
-            f"induced {name}": self._over_area(self._thick(density))
+            f"induced {name}": self._over_area(self._with_thickness(density))
             for name, density in by_name.items()
         }
 
@@ -261,12 +265,14 @@ class EnergyFactory:
         chi = soft.susceptibility
         law = (
             pattern_field(
-                chi, self.carrier.r0, name="susceptibility", key="magnetic.susceptibility", size=1
+                chi, self.domain.r0, name="susceptibility", key="magnetic.susceptibility", size=1
             )[0]
             if callable(chi)
             else self._constant(chi)
         )
-        amplitudes = [self.free.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes]
+        amplitudes = [
+            self.free_constants.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes
+        ]
         if soft.saturation is not None:
             if not self.saturated:  # energy and observed forms share it
                 self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
@@ -286,9 +292,9 @@ class EnergyFactory:
         applied: AppliedField | None,
     ) -> PointField:
         """What is known of a material that saturates, at the points of cells."""
-        carrier, followed = self.carrier, (self.carrier.r0, self.u)
-        known = PointField(carrier.mesh, carrier.rule, 2 * SIZE)
-        jets = carrier.tables(carrier.r0.function_space, known.points)
+        domain, followed = self.domain, (self.domain.r0, self.u)
+        known = PointField(domain.mesh, domain.rule, 2 * SIZE)
+        jets = domain.tables(domain.r0.function_space, known.points)
 
         def placed() -> list[Array]:
             r0, u = (jets(f.x.array)[:3] for f in followed)
@@ -299,21 +305,21 @@ class EnergyFactory:
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
-        pattern, carrier, thins = field.remanent, self.carrier, self.material.law.some_thin
+        pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
         full = full_density(field.law, thins=thins)
-        Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
+        Br = pattern_field(pattern, domain.r0)[0] if callable(pattern) else self._constant(pattern)
         if applied:
             density = self._magnetised(
                 field, densities.in_space(full), Br, applied.polynomial, parts=VALUE_AND_FIRST
             )
-            return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
+            return [domain.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
         directions += [
             (name, name.replace("lambda_", " "), Ba)
             for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False)
         ]
         terms = [
-            carrier.energy(
+            domain.energy(
                 name + suffix,
                 self._magnetised(field, of, Br, self._constant(Ba)),
                 amplitude,
@@ -332,9 +338,7 @@ class EnergyFactory:
                 self._constant(field.gradient),
                 parts=VALUE_AND_FIRST,
             )
-            terms.append(
-                carrier.energy("magnetic gradient", density, "lambda_m", column="magnetic")
-            )
+            terms.append(domain.energy("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
 
     def _magnetised(
@@ -348,8 +352,8 @@ class EnergyFactory:
         shape.
         """
         density = Density(per_area(of), parameters, parts=parts)
-        thins = self.material.law.some_thin and field.law == "deformation"
-        return self._thick(self._thinning(density) if thins else density)
+        thins = self.material.law.thins_somewhere and field.law == "deformation"
+        return self._with_thickness(self._thinning(density) if thins else density)
 
     def pressure(self, *, potential: bool) -> Energy:
         """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it
@@ -363,7 +367,7 @@ class EnergyFactory:
         density = Density(
             of, parameters, parts=VALUE_AND_FIRST, work=None if potential else following
         )
-        return self.carrier.energy("pressure", density, "pressure", drawn=True)
+        return self.domain.energy("pressure", density, "pressure", drawn=True)
 
     def _on_pressed(self, of: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density of a pressure where that acts, whose last parameter is then `pressed`."""
@@ -373,20 +377,22 @@ class EnergyFactory:
         """Delta V/R^3 of the modelled part when its points move straight to their places, where it
         is pressed.
         """
-        return self._volume(
+        return self._volume_integral(
             self._on_pressed(densities.swept_volume),
             *([] if self.pressed is None else [self.pressed]),
         )
 
     def volume_change(self, origin: Array) -> ufl.Form:
         """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
-        return self._volume(densities.volume, *([self._constant(origin)] if origin.any() else []))
+        return self._volume_integral(
+            densities.volume, *([self._constant(origin)] if origin.any() else [])
+        )
 
-    def _volume(self, of: Callable[..., Expr], *parameters: Expr) -> ufl.Form:
-        jets = self.carrier.from_drawn(self.carrier.jet(self.u))
-        return self.carrier.whole * of(*jets, *parameters) * self.carrier.dx()
+    def _volume_integral(self, of: Callable[..., Expr], *parameters: Expr) -> ufl.Form:
+        jets = self.domain.jets_from_initial(self.domain.jet(self.u))
+        return self.domain.revolution_factor * of(*jets, *parameters) * self.domain.dx()
 
-    def own(
+    def user_energy(
         self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
     ) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; `facets` of
@@ -394,12 +400,12 @@ class EnergyFactory:
         """
         assert term.density
         still = tuple(
-            part for part in term.placed_parts if part not in term.parts
+            part for part in term.placement_parts if part not in term.parts
         )  # asked for of r0 alone
         of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
         density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)
-        density = self._weighty(density) if term.of_volume else density
-        return self.carrier.energy(term.name, density, amplitude or term.name, linear=term.linear)
+        density = self._mass_weighted(density) if term.of_volume else density
+        return self.domain.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, facets: Facets | None = None) -> dict[str, ufl.Form]:
         """What it observes of the modelled part."""
@@ -409,25 +415,27 @@ class EnergyFactory:
             for column, of in term.observed.items()
         }
         if term.of_volume:
-            by_column = {column: self._weighty(density) for column, density in by_column.items()}
+            by_column = {
+                column: self._mass_weighted(density) for column, density in by_column.items()
+            }
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that
         times its radius.
         """
-        carrier, approach = (
-            self.carrier,
-            self.free.setdefault(contact.amplitude, self._constant(0.0)),
+        domain, approach = (
+            self.domain,
+            self.free_constants.setdefault(contact.amplitude, self._constant(0.0)),
         )
-        rule, thins = carrier.contact_rule, self.material.law.some_thin
+        rule, thins = domain.contact_rule, self.material.law.thins_somewhere
         thins_at = (
-            thickness_ratio_at_points(carrier, self.u, self.natural, self.law_of_cells.thins)
+            thickness_ratio_at_points(domain, self.u, self.natural, self.law_of_cells.thins)
             if thins
             else None
         )
         pressing = Pressing(
-            contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness, thins_at
+            contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
         of, parts = (thinned_energy, VALUE_AND_FIRST) if thins else (contact_energy, ("r",))
         density = Density(per_area(of), pressing.parameters, parts, quadrature=rule)
@@ -439,61 +447,71 @@ class EnergyFactory:
             for name, of in seen.items()
         }
         integrals = {name: self._over_area(density) for name, density in by_name.items()}
-        return carrier.energy(f"contact {contact.body}", density), pressing, integrals
+        return domain.energy(f"contact {contact.body}", density), pressing, integrals
 
     def _over_area(self, density: Density) -> ufl.Form:
-        return self.carrier.whole * self.carrier.integral(density, self.carrier.jet(self.u))
+        return self.domain.revolution_factor * self.domain.integral(
+            density, self.domain.jet(self.u)
+        )
 
     def _parameters(self, term: OwnTerm) -> tuple[Parameter, ...]:
-        return constants_of(term, self.carrier.mesh, self.free)
+        return constants_of(term, self.domain.mesh, self.free_constants)
 
     def _constant(self, value: float | Array) -> fem.Constant:
-        return self.carrier.constant(value)
+        return self.domain.constant(value)
 
     def _over_ranks(self, value: float) -> float:
-        return float(self.carrier.mesh.comm.allreduce(value))
+        return float(self.domain.mesh.comm.allreduce(value))
 
-    def _thick(self, density: Density) -> Density:
+    def _with_thickness(self, density: Density) -> Density:
         """The density over E h with the thickness as it varies, if it does."""
         return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
         """A density of what thins, on the natural shape, and where the law of the shell says so."""
-        law, own = self.material.law, self.made_of
+        law, own = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
         if own is None or not isinstance(law, LawByShell):
             return density
 
         def of(*arguments: Expr, **keywords: Any) -> Expr:
             *given, numbers = arguments
-            return density.of(
-                *given, thins=law.made_of(numbers[0], numbers[1], numbers[3]).thins, **keywords
+            return density.function(
+                *given,
+                thins=law.with_material(numbers[0], numbers[1], numbers[3]).thins,
+                **keywords,
             )
 
-        return replace(density, of=of, parameters=(*density.parameters, own))
+        return replace(density, function=of, parameters=(*density.parameters, own))
 
     @property
     def law_of_cells(self) -> Law:
         """That of each cell of this rank, for arrays (cells, n) of places in them."""
-        own = self.made_of
+        own = self.cell_materials
         return self.material.law_in(
             own and own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[:, 0]]
         )
 
-    def _weighty(self, density: Density) -> Density:
+    def _mass_weighted(self, density: Density) -> Density:
         """One of what has mass, with thickness and density of the material as they vary, if they
         do.
         """
-        density = self._thick(density)
-        return density if self.made_of is None else thickness_weighted(density, self.made_of, 2)
+        density = self._with_thickness(density)
+        return (
+            density
+            if self.cell_materials is None
+            else thickness_weighted(density, self.cell_materials, 2)
+        )
 
-    def _elastic(self, density: Density) -> Density:
+    def _elastic_density(self, density: Density) -> Density:
         """The density of the material with the thickness as it varies, and of the natural shape, if
         there is one.
         """
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
-        density = elastic_density(density, law.with_numbers(*numbers), self.thickness, self.made_of)
+        density = elastic_density(
+            density, law.with_numbers(*numbers), self.thickness, self.cell_materials
+        )
         return grown(density, self.natural) if self.natural else density
 
     @property
@@ -503,7 +521,7 @@ class EnergyFactory:
 
 def _along(term: OwnTerm, of: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density of a term per area of the coordinates or, on an edge, per length of its parameter;
-    see `Density.of`.
+    see `Density.function`.
     """
     if term.on is None:
         return per_area(of)

@@ -58,15 +58,15 @@ def mass_factor(model: Model) -> Expr | None:
     thickness in its shape.
     """
     factors = [] if model.thickness is None else [model.thickness[0]]
-    if model.made_of is not None:
-        factors.append(model.made_of[2])
+    if model.cell_materials is not None:
+        factors.append(model.cell_materials[2])
     return reduce(mul, factors) if factors else None
 
 
 def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
     """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
     product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
-    return _integral(model, model.carrier.whole * product if model.thin else product)
+    return _integral(model, model.domain.revolution_factor * product if model.thin else product)
 
 
 def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
@@ -100,7 +100,7 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
     if not model.thin:
         return f / model.material.h * dx
-    return f * kin.area_ratio(model.carrier.j0) * dx
+    return f * kin.area_ratio(model.domain.j0) * dx
 
 
 def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:

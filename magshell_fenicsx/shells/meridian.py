@@ -82,7 +82,7 @@ class Probe:
     normal: Array
 
     @staticmethod
-    def at(s: float, azimuth: float, r0: fem.Function) -> "Probe":
+    def at_parameter(s: float, azimuth: float, r0: fem.Function) -> "Probe":
         """For a parameter of the meridian with the placement `r0`."""
         V = r0.function_space
         ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
@@ -138,9 +138,9 @@ class MeridianModel(ThinModel):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
-    made_of
+    cell_materials
         Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
-    touchings, tees
+    touchings, t_junction_terms
         The contacts of shells with each other, and their T-junctions.
     """
 
@@ -182,28 +182,28 @@ class MeridianModel(ThinModel):
         }
         self.growing = PlacementAmplitudes(self.r0, shapes, material.h) if shapes else None
         self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
-        self.made_of: fem.Function | None = None
+        self.cell_materials: fem.Function | None = None
         if material.shells:
-            self.made_of = material_field(material.shells, meridian.mesh, patches)
+            self.cell_materials = material_field(material.shells, meridian.mesh, patches)
         pressed = on_cells(loads.pressed, meridian) if loads.pressed else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
             shape = Shape.of(natural_field(grown, cell_geometry(self.r0), V), grown, free)
-        carrier = meridian_domain(self.r0, self.growing and self.growing.initial_placement)
+        domain = meridian_domain(self.r0, self.growing and self.growing.initial_placement)
         of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
         folded = meridian.largest_fold(self.r0) > FOLD_ANGLE
         creases = Creases.of(loads.joints, meridian) if loads.joints else None
         self.factory = factory = EnergyFactory(
-            carrier,
+            domain,
             self.u,
             *of_shell,
             folded,
             pressed=pressed,
             creases=creases,
-            made_of=self.made_of,
+            cell_materials=self.cell_materials,
         )
-        around = Around(meridian, carrier)
+        around = Around(meridian, domain)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         self.supports = {}
@@ -225,7 +225,7 @@ class MeridianModel(ThinModel):
         closed = enclosed(loads, free_ends, self.without_potential)
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
-        self.energies += self.own_and_contacts(meridian.ends)
+        self.energies += self.user_and_body_energies(meridian.ends)
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force, self.force_unit, around, self.kernels))
         self.load_size, self.load_sizes = {}, {}
@@ -247,15 +247,15 @@ class MeridianModel(ThinModel):
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters: dict[str, FreeParameter] = {
-            **make_parameters(factory.free, terms, self.u, self.kernels)
+            **make_parameters(factory.free_constants, terms, self.u, self.kernels)
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
-        moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
+        moves = moving(self.r0, self.supports, loads, self._edge_pressure() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        rule = factory.carrier.contact_rule
+        rule = factory.domain.contact_rule
         self.shell_contacts = []
         if loads.pairs:
             from magshell_fenicsx.parts.contact.meridian_contact import shell_contacts
@@ -266,23 +266,25 @@ class MeridianModel(ThinModel):
         for each in self.shell_contacts:
             stiffnesses |= each.history
             parameters |= each.entered(parameters)
-        self.tees: list[MeridianTJunction] = []
+        self.t_junction_terms: list[MeridianTJunction] = []
         if any(of is None for of in meridian.joints):
             from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
 
-            self.tees = meridian_t_junction_terms(self)
+            self.t_junction_terms = meridian_t_junction_terms(self)
         begun = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
-            [*terms, *self.shell_contacts, *self.tees],
+            [*terms, *self.shell_contacts, *self.t_junction_terms],
             held,
             pattern,
             self.material.h,
             variables=SystemVariables(parameters, moves, stiffnesses),
         )
         self._volume = begun()
-        self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
-        self.normals = {name: probe.normal for name, probe in self._seen.items()}
+        self._probe_by_point = {
+            name: Probe.at_parameter(*place, self.r0) for name, place in meridian.points.items()
+        }
+        self.normals = {name: probe.normal for name, probe in self._probe_by_point.items()}
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """All values that its terms take from the problem, by term, as views; None if a term takes
@@ -292,9 +294,9 @@ class MeridianModel(ThinModel):
         follows = (
             self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
         )
-        if follows or any(e.density is None or e.counted for e in self.energies):
+        if follows or any(e.density is None or e.reference_turn for e in self.energies):
             return None
-        free = {id(constant) for constant in self.factory.free.values()}  # amplitudes
+        free = {id(constant) for constant in self.factory.free_constants.values()}  # amplitudes
         values = {"placement": [self.r0.x.array]}
         for e in self.energies:
             assert e.density
@@ -313,21 +315,21 @@ class MeridianModel(ThinModel):
         other = copy(self)
         other.system = self.system.with_number("numbers of the case", numbers, value)
         other.meridian, other.material = of.meridian, of.material
-        other.excluded_modes = SymmetryBreakingWaves(
-            self.waves.of(other.system, largest_wave_number(of.meridian, of.material.h))
+        other.symmetry_breaking_modes = SymmetryBreakingWaves(
+            self.waves.for_system(other.system, largest_wave_number(of.meridian, of.material.h))
         )
         return other
 
     @cached_property
-    def excluded_modes(self) -> SymmetryBreakingWaves:
+    def symmetry_breaking_modes(self) -> SymmetryBreakingWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        of = self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels
-        return SymmetryBreakingWaves(Waves(*of, [*self.shell_contacts, *self.tees]))
+        of = self.system, self.energies, self.meridian, self.domain, self.held, self.kernels
+        return SymmetryBreakingWaves(Waves(*of, [*self.shell_contacts, *self.t_junction_terms]))
 
     @property
     def waves(self) -> Waves:
         """Around the axis."""
-        return self.excluded_modes.waves
+        return self.symmetry_breaking_modes.waves
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
         """What further deviations add to the placement."""
@@ -375,13 +377,13 @@ class MeridianModel(ThinModel):
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""
-        return self._seen[point](u)
+        return self._probe_by_point[point](u)
 
     def probe(self, point: str) -> Array:
         """See `ModelBase`."""
-        return self._seen[point].rows(self.system.size)
+        return self._probe_by_point[point].rows(self.system.size)
 
-    def _pressed(self) -> EdgePressure:
+    def _edge_pressure(self) -> EdgePressure:
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [

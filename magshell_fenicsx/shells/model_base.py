@@ -104,7 +104,7 @@ class ModelBase:
     midsurface: Midsurface | None = None
 
     @cached_property
-    def kept(self) -> dict[type, Any]:
+    def part_caches(self) -> dict[type, Any]:
         """What rooms of parts keep with the model, by its class."""
         return {}
 
@@ -137,7 +137,7 @@ class ModelBase:
             for name, x in points.items()
         }
 
-    def load_with(self, name: str, dead: DeadLoads) -> LinearTerm:
+    def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads of an amplitude, except the moments."""
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
         one, u = fem.Constant(self.V.mesh, 1.0), self.u
@@ -282,13 +282,13 @@ class ThinModel(ModelBase):
     factory: EnergyFactory
     kernels: KernelLog
 
-    def own_and_contacts(self, edges: Mapping[str, Facets]) -> list[Energy]:
+    def user_and_body_energies(self, edges: Mapping[str, Facets]) -> list[Energy]:
         """The energies of one's own terms and of bodies; sets what is observed of them."""
         factory, own = (
             self.factory,
             [(term, edges[term.on] if term.on else None) for term in self.loads.own],
         )
-        energies = [factory.own(term, facets) for term, facets in own if term.density]
+        energies = [factory.user_energy(term, facets) for term, facets in own if term.density]
         self.observed = self.kernels.compile_all(
             factory.observed(term, facets) for term, facets in own
         )
@@ -302,9 +302,9 @@ class ThinModel(ModelBase):
         return energies
 
     @property
-    def carrier(self) -> IntegrationDomain:
+    def domain(self) -> IntegrationDomain:
         """Where its densities are integrated."""
-        return self.factory.carrier
+        return self.factory.domain
 
     @property
     def law_of_cells(self) -> Law:
@@ -312,8 +312,8 @@ class ThinModel(ModelBase):
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """The integral over the undeformed area of what is modelled."""
-        over = self.carrier.over_area()
-        return lambda f: self.carrier.whole * over(f)
+        over = self.domain.over_area()
+        return lambda f: self.domain.revolution_factor * over(f)
 
     def cells_of_fields(self) -> CellGeometry:
         """Where fields are given by formulas."""

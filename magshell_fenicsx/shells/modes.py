@@ -47,25 +47,25 @@ class ModeSpace:
 
     Attributes
     ----------
-    of
+    displacement
         A displacement of the given model in this one; collective.
     """
 
     model: Model
-    of: Callable[[Vector], Vector] = lambda u: u
+    displacement: Callable[[Vector], Vector] = lambda u: u
 
     def state(self, state: State) -> State:
         """A state of the given model in this one; collective."""
-        return State(self.of(state.u), dict(state.mu))
+        return State(self.displacement(state.u), dict(state.mu))
 
 
 def mode_space(model: Model) -> ModeSpace:
     """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked;
     collective.
     """
-    modes = None if isinstance(model, MeridianModel) else model.excluded_modes
+    modes = None if isinstance(model, MeridianModel) else model.symmetry_breaking_modes
     return (
-        ModeSpace(modes.half, modes.unfolded)
+        ModeSpace(modes.half_model, modes.unfold)
         if isinstance(modes, SectorModes)
         else ModeSpace(model)
     )
@@ -224,13 +224,13 @@ def _families(
         along, across = (len(free.along), len(free.across)) if free else (0, 0)
         around: list[Vector] = [*free.around] if free else []
         yield of("", model.system, along)
-        waves = model.excluded_modes.waves
+        waves = model.symmetry_breaking_modes.waves
         wave_mass = f"{name}wave mass", wave_product(model, factor)
         if vibrating:
             yield _Family(
                 TORSION,
                 partial(waves.tangent, m=0),
-                waves.held(0),
+                waves.constraints(0),
                 wave_mass,
                 contains=_turns,
                 rigid=len(around) + along,  # its space has the motion along e3 too
@@ -239,7 +239,11 @@ def _families(
         for m in range(1, waves.largest + 1):
             rigid = across if m == 1 else 0
             yield _Family(
-                f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass, rigid=rigid
+                f"m = {m}",
+                partial(waves.tangent, m=m),
+                waves.constraints(m),
+                wave_mass,
+                rigid=rigid,
             )
         return
 
@@ -247,8 +251,8 @@ def _families(
         return rigid_motions(system, model.r0, rest.mu) if rest else 0
 
     yield of("", model.system, free_of(model.system))
-    if isinstance(model.excluded_modes, AntisymmetricModes):
-        other = model.excluded_modes.system
+    if isinstance(model.symmetry_breaking_modes, AntisymmetricModes):
+        other = model.symmetry_breaking_modes.system
         yield of("antisymmetric", other, free_of(other))
 
 

@@ -59,14 +59,14 @@ class Revolution:
         self._basis = np.moveaxis(basis, -1, 0)
         normals = nodal_normals(model.r0)
         self.r0, self.n0 = (
-            self._turned(model.r0.x.array.reshape(-1, 2)),
-            self._turned(normals[:, [0, 2]]),
+            self._swept(model.r0.x.array.reshape(-1, 2)),
+            self._swept(normals[:, [0, 2]]),
         )
         self.cells = self._triangles(sectors)
 
     def displacement(self, u: Vector) -> Array:
         """The displacement of the nodes, (n, 3) over R."""
-        return self._turned(u.reshape(-1, 2))
+        return self._swept(u.reshape(-1, 2))
 
     def jets(self, f: fem.Function) -> Array:
         """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2,
@@ -74,19 +74,19 @@ class Revolution:
 
         At the pole, where the surface has no second direction, a little off it.
         """
-        values = self._at(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
+        values = self._derivatives(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
         at_pole = self._poles[self.ends][..., None]
         return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
         """The same at reference points (q, 1) inside all cells: (6, cells, q, 3)."""
-        return _revolved(self._at(f, points))
+        return _revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
         """The values of a field (1,) at the ends of all cells, or other reference points (q, 1):
         (cells, q).
         """
-        return self._at(f, points)[0, :, :, 0]
+        return self._derivatives(f, points)[0, :, :, 0]
 
     def vertices(self, V: fem.FunctionSpace) -> NDArray[np.int64]:
         """The nodes of a space on the meridian at all circles."""
@@ -99,7 +99,7 @@ class Revolution:
         kept[self._poles, 1:] = False
         return np.asarray(circles[kept])
 
-    def _at(self, f: fem.Function, points: Array) -> Array:
+    def _derivatives(self, f: fem.Function, points: Array) -> Array:
         """(3, cells, q, components) values, first and second derivatives at reference points (q,
         1).
         """
@@ -110,7 +110,7 @@ class Revolution:
             np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[self.order]])
         )
 
-    def around(self, ends: Array, weight: Array) -> Array:
+    def on_parallels(self, ends: Array, weight: Array) -> Array:
         """Values at the nodes, of those at the ends of all cells.
 
         Parameters
@@ -143,7 +143,7 @@ class Revolution:
 
         return np.asarray(sums(weight * ends) / sums(weight))
 
-    def _turned(self, nodal: Array) -> Array:
+    def _swept(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the poles and on the circles."""
         along = nodal[self.vertices(self._model.V)]
         along = np.where(self._poles[:, None], along * [0.0, 1.0], along)[:, None]

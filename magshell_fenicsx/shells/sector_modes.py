@@ -52,7 +52,7 @@ class SectorModes:
         self._own, self._others = Factorisation(model.system.comm), Factorisation(model.system.comm)
 
     @cached_property
-    def half(self) -> "ShellModel":
+    def half_model(self) -> "ShellModel":
         """The model whose tangents are counted."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
@@ -71,9 +71,9 @@ class SectorModes:
         ]
         return half
 
-    def unfolded(self, u: Vector) -> Vector:
+    def unfold(self, u: Vector) -> Vector:
         """A displacement of the sector as that of the half; collective."""
-        half, system = self.half, self._model.system
+        half, system = self.half_model, self._model.system
         whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
             half.system.zero_at_supports(
@@ -85,12 +85,12 @@ class SectorModes:
         """Unstable modes of the half that the sector excludes, and those that are antisymmetric to
         the half.
         """
-        half, state_of_half = self.half, State(self.unfolded(state.u), dict(state.mu))
+        half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))
         own = self._own.negative_pivots
         self._others.factor(half.system.tangent(state_of_half.u, state_of_half.mu))
         symmetric = self._others.negative_pivots - own
-        modes = half.excluded_modes
+        modes = half.symmetry_breaking_modes
         assert isinstance(modes, AntisymmetricModes)
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
@@ -109,7 +109,11 @@ class SectorModes:
         """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None
         without any.
         """
-        half, system, modes = self.half, self.half.system, self.half.excluded_modes
+        half, system, modes = (
+            self.half_model,
+            self.half_model.system,
+            self.half_model.symmetry_breaking_modes,
+        )
         if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
             return None
         V = half.V

@@ -115,7 +115,7 @@ class ShellModel(ThinModel):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
-    made_of
+    cell_materials
         Of each cell the `parameters.OwnMaterial` of its shell; None where all shells have one.
     mirror
         Of a half model or a sector.
@@ -162,9 +162,11 @@ class ShellModel(ThinModel):
         self._put_edges_in_planes()
         self.growing = self._growing_placement()
         self.thickness = self._thickness_field(thickness, cells)
-        self.made_of = None
+        self.cell_materials = None
         if material.shells:
-            self.made_of = material_field(material.shells, midsurface.mesh, midsurface.patches)
+            self.cell_materials = material_field(
+                material.shells, midsurface.mesh, midsurface.patches
+            )
         self.factory = self._make_factory(cells)
         self._pattern_term = self.factory.term(self.factory.interior_edges())
         terms: list[Term] = [
@@ -177,7 +179,7 @@ class ShellModel(ThinModel):
             midsurface,
             conditions,
             self._mirror_planes,
-            material.every_laminate,
+            material.laminate_by_shell,
             self.loads,
             self.factory,
         )
@@ -191,7 +193,9 @@ class ShellModel(ThinModel):
         interaction = self._interaction_term()
         if interaction is not None:
             terms.append(interaction)
-        terms += [self.factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
+        terms += [
+            self.factory.term(energy) for energy in self.user_and_body_energies(midsurface.edges)
+        ]
         self.normals = {
             name: vertex_normal(self.r0, x, midsurface.cells_of_point(name))
             for name, x in midsurface.points.items()
@@ -219,7 +223,7 @@ class ShellModel(ThinModel):
 
     def _refuse_normal_plies(self) -> None:
         """Refuse plies whose direction is normal to the surface of their shell."""
-        for shell, laminate in self.material.every_laminate.items():
+        for shell, laminate in self.material.laminate_by_shell.items():
             cells = self.midsurface.patches[shell] if shell else slice(None)
             normals = positions_and_normals(self.r0)[1][cells]
             laminate.refuse_normal(normals, self.midsurface.mesh.comm)
@@ -288,7 +292,7 @@ class ShellModel(ThinModel):
             is_folded,
             pressed=on_cells(loads.pressed, midsurface) if loads.pressed else None,
             creases=creases,
-            made_of=self.made_of,
+            cell_materials=self.cell_materials,
         )
 
     def _natural_shape(
@@ -350,7 +354,7 @@ class ShellModel(ThinModel):
         measures = SurfaceMeasures(self.r0, self.midsurface, self.degree)
         for name, dead in loads.dead.items():
             vectors = assemble_dead_loads(dead, self.V, measures, self.kernels)
-            terms.append(self.load_with(name, vectors))
+            terms.append(self.dead_load_term(name, vectors))
             energies = self.factory.dead_energies(name, dead, self.midsurface.edges)
             terms += [self.factory.term(energy) for energy in energies]
         return terms
@@ -367,7 +371,7 @@ class ShellModel(ThinModel):
             self.u,
             self.midsurface.patches,
             self.material.h,
-            factory.carrier.contact_rule,
+            factory.domain.contact_rule,
             self.thickness,
             factory.law_of_cells.thins,
             self.mirror.images if self._mirror_planes else (),
@@ -451,7 +455,7 @@ class ShellModel(ThinModel):
         factory = self.factory
         one_by_one = partial(self._point_residual, apart=True)
         parameters: dict[str, FreeParameter] = {
-            **point_parameters(factory.free, density_terms, one_by_one)
+            **point_parameters(factory.free_constants, density_terms, one_by_one)
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         for contact in self.shell_contacts:
@@ -473,7 +477,7 @@ class ShellModel(ThinModel):
         return np.unique(np.concatenate(facets)).astype(np.int32)
 
     @cached_property
-    def excluded_modes(self) -> AntisymmetricModes | SectorModes | None:
+    def symmetry_breaking_modes(self) -> AntisymmetricModes | SectorModes | None:
         """The modes that a half model or a sector does not see; None for a whole one.
 
         Compiles kernels.

@@ -90,7 +90,7 @@ class SolidModel(ModelBase):
 
     thin: Literal[False] = False
     axisymmetric: Literal[False] = False
-    made_of: None = None  # of one material
+    cell_materials: None = None  # of one material
     degree = 2
     sigma = None
 
@@ -142,7 +142,7 @@ class SolidModel(ModelBase):
             material.h,
             self.kernels,
             hinged,
-            free=free,
+            free_constants=free,
             fields=[],
             saturated=[],
             **growing,
@@ -160,7 +160,7 @@ class SolidModel(ModelBase):
         if loads.pressure:
             potential = not self.without_potential
             self._terms += factory.pressure(material.classical_pressure, potential=potential)
-        self._terms += [factory.own(term) for term in loads.own if term.density]
+        self._terms += [factory.user_energy(term) for term in loads.own if term.density]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])
@@ -171,12 +171,14 @@ class SolidModel(ModelBase):
         on = BodyMeasures(body, V, self.kernels) if loads.dead else None
         for name, dead in loads.dead.items():
             assert on
-            self._terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
+            self._terms.append(
+                self.dead_load_term(name, assemble_dead_loads(dead, V, on, self.kernels))
+            )
             self._terms += [
                 factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
                 for i, m in enumerate(moments(dead))
             ]
-            self._terms += [factory.own(term, name) for term in potentials(dead)]
+            self._terms += [factory.user_energy(term, name) for term in potentials(dead)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = body_hessian_integrals(body, self.r0, self._terms, self.kernels)
@@ -196,7 +198,7 @@ class SolidModel(ModelBase):
         self.observe(self.kernels.compile("volume energy", volume), body.points)
 
     @cached_property
-    def excluded_modes(self) -> AntisymmetricModes | None:
+    def symmetry_breaking_modes(self) -> AntisymmetricModes | None:
         """The modes that a half model does not see: moved freely across the mirror plane and not in
         it.
         """
@@ -257,7 +259,7 @@ class SolidModel(ModelBase):
             )
         fast = FastTangent(self.u, self._sites, held, near)
         parameters: dict[str, FreeParameter] = {
-            **make_parameters(factory.free, self._terms, self.u, self.kernels)
+            **make_parameters(factory.free_constants, self._terms, self.u, self.kernels)
         }
         parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
         self.fields = factory.fields
@@ -302,6 +304,8 @@ def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
 
     def of(*arguments: Expr) -> Expr:
         count = len(arguments) - len(shape.parameters)
-        return density.of(*arguments[:count], growth=growth_in_body(shape, *arguments[count:]))
+        return density.function(
+            *arguments[:count], growth=growth_in_body(shape, *arguments[count:])
+        )
 
-    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
+    return replace(density, function=of, parameters=(*density.parameters, *shape.parameters))

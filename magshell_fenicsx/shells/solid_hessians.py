@@ -127,7 +127,7 @@ class BodyHessianIntegral:
         """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
-        of = density.work or density.of
+        of = density.work or density.function
         self._varying[term.name] = [
             (target, on_batches(field, self._batches)) for target, field in varying
         ]

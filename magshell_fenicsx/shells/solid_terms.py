@@ -50,7 +50,7 @@ class SolidDensity:
 
     Attributes
     ----------
-    of
+    function
         In the body of (X, u, H, *parameters) per volume, see `densities`; on its outer face of (X,
         X1, X2, u, u1, u2, *parameters) per area of the reference cell; on ends, the faces above
         edges, of (X, u, H, n, t, *parameters) per area.
@@ -68,7 +68,7 @@ class SolidDensity:
         On faces: the virtual work of a load without potential; it takes v before the parameters.
     """
 
-    of: Callable[..., Expr]
+    function: Callable[..., Expr]
     parameters: tuple[fem.Constant | fem.Function, ...]
     parts: tuple[int, ...] = GRADIENT
     degree: int = QUADRATURE_DEGREE
@@ -107,7 +107,7 @@ class TermFactory:
     grown: Callable[[SolidDensity], SolidDensity] = lambda density: (
         density
     )  # takes the body's natural shape
-    free: Constants = field(default_factory=dict)  # of parameters that enter freely
+    free_constants: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
     saturated: list[PointField] = field(
         default_factory=list
@@ -160,13 +160,13 @@ class TermFactory:
             return self.remanent(of, applied)
         return [
             *([] if of.soft.alone else self.remanent(of, applied)),
-            self.soft(of, of.soft, applied),
+            self.soft_magnetic(of, of.soft, applied),
         ]
 
-    def soft(
+    def soft_magnetic(
         self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None
     ) -> SolidTerm:
-        """What the field makes of a soft body, see `EnergyFactory.soft`."""
+        """What the field makes of a soft body, see `EnergyFactory.soft_magnetic`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
         law, n0, *given = self._of_sheet(sheet, soft, applied)
         density = SolidDensity(sheet.energy_in_solid, (law, scale, n0, h, *given), VALUE + GRADIENT)
@@ -201,7 +201,8 @@ class TermFactory:
         )
         n0 = field_in_body(radial, V, name="n0")
         amplitudes = [
-            self.free.setdefault(name, self._constants(0.0)[0]) for name in sheet.amplitudes
+            self.free_constants.setdefault(name, self._constants(0.0)[0])
+            for name in sheet.amplitudes
         ]
         polynomials = [applied.polynomial] if applied else []
         if soft.saturation is not None:
@@ -293,12 +294,12 @@ class TermFactory:
                 "pressure",
                 work=None if v is None else self._on_faces([density], v),
             )
-            for name, density in self._enclosing(
+            for name, density in self._volume_densities(
                 classical / self.h, None, potential=potential
             ).items()
         ]
 
-    def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
+    def user_term(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
         """The energy of a part or one's own on the outer face or of the body, with its own
         amplitude or another.
         """
@@ -306,11 +307,11 @@ class TermFactory:
         if term.of_volume:
             return self._bulk(
                 term.name,
-                self._inside(term, term.density),
+                self._volume_density(term, term.density),
                 amplitude or term.name,
                 linear=term.linear,
             )
-        density = self._surface(term, term.density)
+        density = self._face_density(term, term.density)
         energy = self._on_faces([density])
         return SolidTerm(
             term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear
@@ -319,14 +320,16 @@ class TermFactory:
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face, or of the body."""
         if term.of_volume:
-            inside = {column: self._inside(term, of) for column, of in term.observed.items()}
+            inside = {
+                column: self._volume_density(term, of) for column, of in term.observed.items()
+            }
             return {column: self._over_body(density) for column, density in inside.items()}
         return {
-            column: self._on_faces([self._surface(term, of)])
+            column: self._on_faces([self._face_density(term, of)])
             for column, of in term.observed.items()
         }
 
-    def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
+    def _volume_density(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
         """A density of the volume, which depends on places alone."""
         flat, count, at_point = (
             [ufl.zero(3)] * len(ALL_DERIVATIVES),
@@ -337,7 +340,7 @@ class TermFactory:
         def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
             return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
 
-        constants = constants_of(term, self.u.function_space.mesh, self.free)
+        constants = constants_of(term, self.u.function_space.mesh, self.free_constants)
         return SolidDensity(at, (*constants, *self._constants(self.h)), VALUE)
 
     def _over_body(self, density: SolidDensity) -> ufl.Form:
@@ -345,9 +348,9 @@ class TermFactory:
             "dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree}
         )
         X, H = ufl.SpatialCoordinate(self.body.mesh), ufl.grad(self.u)
-        return density.of(X, self.u, H, *density.parameters) * dx
+        return density.function(X, self.u, H, *density.parameters) * dx
 
-    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
+    def _face_density(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
         flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
@@ -358,7 +361,7 @@ class TermFactory:
                 Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters
             )
 
-        parameters = constants_of(term, self.u.function_space.mesh, self.free)
+        parameters = constants_of(term, self.u.function_space.mesh, self.free_constants)
         return SolidDensity(
             on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER_FACE]
         )
@@ -367,7 +370,7 @@ class TermFactory:
         """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points
         move straight.
         """
-        return self._on_faces(list(self._enclosing(1.0, origin).values()))
+        return self._on_faces(list(self._volume_densities(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
         """A moment per length in E h R about the first tangent of an edge."""
@@ -388,7 +391,7 @@ class TermFactory:
         )
         return term
 
-    def _enclosing(
+    def _volume_densities(
         self, unit: float, origin: Array | None, *, potential: bool = True
     ) -> dict[str, SolidDensity]:
         """p times the change of the volume under the outer face, down to the middle line where an
@@ -461,7 +464,7 @@ class TermFactory:
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []
         for tag, density in enumerate(densities, 1):
-            of = density.of if v is None else density.work
+            of = density.function if v is None else density.work
             assert of
             parameters = density.parameters if v is None else (v, *density.parameters)
             if density.where == "outer":

@@ -121,10 +121,10 @@ class TieTerm:
             "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
             "hessian": full_hessian("T-junction Hessian", W, self._moved, log),
         }
-        self._placed = self._times(tangents, global_values(r0))
+        self._placed = self._apply(tangents, global_values(r0))
         values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]
         values[:, :2], values[:, 4] = along, stiffness[:, 1]
-        values[:, 2:4] = self._at("angle", 0 * global_values(r0))
+        values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
     # as a term
 
@@ -136,17 +136,17 @@ class TieTerm:
 
     def energy(self) -> float:
         u = global_values(self._u)
-        tied = float(self._tie @ np.sum(self._times(self._gaps, u) ** 2, axis=1)) / 2
-        return tied + (float(self._at("energy", u).sum()) if self._turns else 0.0)
+        tied = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
+        return tied + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
 
     def add_residual(self, b: Array, factor: float) -> None:
         u = global_values(self._u)
         residual = np.zeros(u.size)
         forces = np.einsum(
-            "nc,nck->nk", self._tie[:, None] * self._times(self._gaps, u), self._gaps
+            "nc,nck->nk", self._tie[:, None] * self._apply(self._gaps, u), self._gaps
         )
         if self._turns:
-            forces += np.einsum("nc,nck->nk", self._at("gradient", u), self._tangents)
+            forces += np.einsum("nc,nck->nk", self._evaluate("gradient", u), self._tangents)
         np.add.at(residual, self._unknowns, factor * forces)
         add_to_owners(b, residual, self._own, self._comm)
 
@@ -154,7 +154,7 @@ class TieTerm:
         """None here: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
-        return _entries(self._unknowns, self._second(self._gaps, self._tangents))
+        return _entries(self._unknowns, self._second_variation(self._gaps, self._tangents))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
         """See `NonlocalTerm`: those that act on each other always do."""
@@ -165,7 +165,7 @@ class TieTerm:
         """See `NonlocalTerm`."""
         return 0.0
 
-    def _second(self, gap: Array, tangents: Array) -> Array:
+    def _second_variation(self, gap: Array, tangents: Array) -> Array:
         """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
         collective.
         """
@@ -176,23 +176,23 @@ class TieTerm:
         if self._turns and len(H):
             of_parts = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
             upper = np.triu_indices(TANGENT_COMPONENTS)
-            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._at(
+            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._evaluate(
                 "hessian", u
             )
             H += np.einsum("nik,nij,njl->nkl", tangents, of_parts, tangents, optimize=True)
         return np.asarray(H)
 
-    def _times(self, maps: Array, u: Array) -> Array:
+    def _apply(self, maps: Array, u: Array) -> Array:
         """(n, c) what maps (n, c, k) make of the values (nodes, components) of all nodes."""
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
-    def _at(self, kernel: str, u: Array) -> Array:
+    def _evaluate(self, kernel: str, u: Array) -> Array:
         """(n, ..) what a kernel gives at the points, with this displacement (nodes, components) of
         all nodes.
         """
         count = len(self._unknowns)
         self._present.x.array[: count * TANGENT_COMPONENTS] = (
-            self._placed + self._times(self._tangents, u)
+            self._placed + self._apply(self._tangents, u)
         ).ravel()
         return np.array(self._points.evaluate(self._kernels[kernel], count))
 
@@ -227,8 +227,8 @@ class SurfaceTJunction(TieTerm):
         material: Material,
         log: KernelLog,
     ) -> None:
-        surfaces = MidSurfaces.of(r0)
-        at = surfaces.foot_of(foot, on)
+        surfaces = MidSurfaces.gather(r0)
+        at = surfaces.edge_on_shell(foot, on)
         at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
         nodes = surfaces.cells.nodes
         both = np.concatenate([nodes[at.cell], nodes[at.other_cell]], axis=1)
@@ -327,7 +327,7 @@ class MidSurfaces:
     r0: Array
 
     @classmethod
-    def of(cls, r0: fem.Function) -> Self:
+    def gather(cls, r0: fem.Function) -> Self:
         """Those of a placement; collective."""
         return cls(r0.function_space, GlobalCells.gather(r0.function_space), global_values(r0))
 
@@ -339,7 +339,7 @@ class MidSurfaces:
         """Return (3, n, functions): shape functions at places and their derivatives."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
-    def foot_of(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> EdgeOnShell:
+    def edge_on_shell(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> EdgeOnShell:
         """Return the foot of an edge on another shell; collective.
 
         Parameters
@@ -627,10 +627,10 @@ def refuse_misplaced_edges(
         On every rank, with the edge.
     """
     tied = _t_junction_joints(joints, surface)
-    surfaces = MidSurfaces.of(r0) if tied else None
+    surfaces = MidSurfaces.gather(r0) if tied else None
     for joint, key, on in tied:
         assert surfaces
-        surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(
+        surfaces.edge_on_shell(surface.edges[joint.edges[0]], on).refuse_misplaced(
             r0.function_space.mesh.comm, h, key, joint
         )
 
@@ -670,8 +670,8 @@ def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
     if model.thickness is not None:
         t = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
         factors *= np.column_stack([t, t**3])
-    if model.made_of is not None:
-        factors *= model.made_of.x.array.reshape(-1, 4)[
-            model.made_of.function_space.dofmap.list[:, 0], :1
+    if model.cell_materials is not None:
+        factors *= model.cell_materials.x.array.reshape(-1, 4)[
+            model.cell_materials.function_space.dofmap.list[:, 0], :1
         ]
     return factors

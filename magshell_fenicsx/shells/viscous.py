@@ -96,39 +96,40 @@ class Viscosity:
         branches: Sequence[Branch],
     ) -> None:
         self._model, self._mu, self._branches, self.creep_time = model, dict(mu), branches, kelvin
-        V, carrier = model.V, model.factory.carrier
-        Q = carrier.discontinuous(STRAIN_SIZE)
-        self._jets = carrier.tables(V, Q.element.basix_element.points)
-        self._frame = TangentFrame.of(self._jets(model.r0.x.array))
+        V, domain = model.V, model.factory.domain
+        Q = domain.discontinuous(STRAIN_SIZE)
+        self._jets = domain.tables(V, Q.element.basix_element.points)
+        self._frame = TangentFrame.from_jet(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
-        self._given = _PrescribedStress(
+        self._prescribed = _PrescribedStress(
             self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0)
         )
-        works = _works(model, self._given)
+        works = _works(model, self._prescribed)
         gradients = [
-            ufl.derivative(carrier.whole * work, model.u, ufl.TestFunction(V)) for work in works
+            ufl.derivative(domain.revolution_factor * work, model.u, ufl.TestFunction(V))
+            for work in works
         ]
         self._forms = [
             model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)
         ]
-        self._strained = [
+        self._elastic_terms = [
             term.name for term in model.system.terms if term.column in ("stretching", "bending")
         ]
         law = model.material.law
-        self._slowing = _AddedViscousTangent(model) if law.linear != law else None
+        self._viscous_tangent = _AddedViscousTangent(model) if law.linear != law else None
         self.memory = Memory([np.zeros((*self._places.shape, STRAIN_SIZE)) for _ in branches])
-        self._first: tuple[Vector, Array] = (
+        self._first_strain: tuple[Vector, Array] = (
             np.empty(0),
             np.empty(0),
         )  # displacements and their strains
-        self._last: tuple[Vector, Array] = self._first
+        self._last_strain: tuple[Vector, Array] = self._first_strain
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         at = u0 + part * (u1 - u0)
         stress = (
-            self.creep_time * self._rate(at, v)
+            self.creep_time * self._strain_rate(at, v)
             if self.creep_time
             else np.zeros((*self._places.shape, STRAIN_SIZE))
         )
@@ -145,17 +146,18 @@ class Viscosity:
         it touches.
         """
         stiffness = self.stiffness(dt, rate)
-        if self._slowing is None:
+        if self._viscous_tangent is None:
             return self._model.system.tangent(
-                u, mu, times=dict.fromkeys(self._strained, 1 + stiffness)
+                u, mu, times=dict.fromkeys(self._elastic_terms, 1 + stiffness)
             )
-        with self._slowing.by(stiffness):
+        with self._viscous_tangent.scaled_by(stiffness):
             return self._model.system.tangent(u, mu)
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
         return self.creep_time * rate + sum(
-            b.modulus * (_retained_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches
+            b.modulus * (_retained_share(b, dt) + self._bending_share(b, dt) / dt)
+            for b in self._branches
         )
 
     def begin(self) -> None:
@@ -168,7 +170,7 @@ class Viscosity:
         """Go on from u1; the force that the step was solved with."""
         if self._branches:
             self.memory = Memory(
-                self._evolved(u0, u1, dt), np.asarray(self._change(u0, u1) / dt), dt
+                self._evolved(u0, u1, dt), np.asarray(self._strain_change(u0, u1) / dt), dt
             )
         return self._force
 
@@ -179,14 +181,14 @@ class Viscosity:
         rate = self.memory.rate
         if rate is None:
             return None
-        bend = self._change(u0, u1) / dt - rate
+        bend = self._strain_change(u0, u1) / dt - rate
         return self._forces(
-            sum(b.modulus * self._bend(b, dt) for b in self._branches) * bend, u1, u1, 0.0
+            sum(b.modulus * self._bending_share(b, dt) for b in self._branches) * bend, u1, u1, 0.0
         )
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Of a stress at nodes, and of edges that open from u0 to u1."""
-        given, system = self._given, self._model.system
+        given, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         given.stiffness.value = stiffness
         for field, displacement in ((given.before, u0), (given.after, u1)):
@@ -197,18 +199,18 @@ class Viscosity:
         """q at the end of a step; the strain is quadratic in time through its ends and the begin of
         the step before.
         """
-        change, rate = self._change(u0, u1), self.memory.rate
+        change, rate = self._strain_change(u0, u1), self.memory.rate
         bend = 0.0 if rate is None else change / dt - rate
         return [
             np.asarray(
                 np.exp(-dt / b.time) * q
                 + _retained_share(b, dt) * change
-                + self._bend(b, dt) * bend
+                + self._bending_share(b, dt) * bend
             )
             for b, q in zip(self._branches, self.memory.strains, strict=True)
         ]
 
-    def _bend(self, branch: Branch, dt: float) -> float:
+    def _bending_share(self, branch: Branch, dt: float) -> float:
         """What a change of the mean rate from the step before to this one leaves in the spring."""
         return (
             0.0
@@ -216,14 +218,16 @@ class Viscosity:
             else _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
         )
 
-    def _change(self, u0: Vector, u1: Vector) -> Array:
-        if self._first[0] is not u0:
-            self._first = self._last if self._last[0] is u0 else (u0, self._strain(u0))
-        if self._last[0] is not u1:
-            self._last = u1, self._strain(u1)
-        return self._last[1] - self._first[1]
+    def _strain_change(self, u0: Vector, u1: Vector) -> Array:
+        if self._first_strain[0] is not u0:
+            self._first_strain = (
+                self._last_strain if self._last_strain[0] is u0 else (u0, self._strain(u0))
+            )
+        if self._last_strain[0] is not u1:
+            self._last_strain = u1, self._strain(u1)
+        return self._last_strain[1] - self._first_strain[1]
 
-    def _rate(self, u: Vector, v: Vector) -> Array:
+    def _strain_rate(self, u: Vector, v: Vector) -> Array:
         size = max_abs(self._model.system.comm, v)
         if size == 0:
             return np.zeros((*self._places.shape, STRAIN_SIZE))
@@ -253,7 +257,7 @@ class _AddedViscousTangent:
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _StrainRates(model), ufl.TestFunction(model.V)
-        self._since, whole = rates.since, model.factory.carrier.whole
+        self._since, whole = rates.since, model.factory.domain.revolution_factor
         self._forms = [
             model.kernels.compile(
                 f"viscous tangent {i}", whole * self._stiffness * ufl.derivative(work, model.u, v)
@@ -264,7 +268,7 @@ class _AddedViscousTangent:
         self._system.added_tangents.append(self)
 
     @contextmanager
-    def by(self, stiffness: float) -> Iterator[None]:
+    def scaled_by(self, stiffness: float) -> Iterator[None]:
         """Tangents are those with so many times this one."""
         self._stiffness.value = stiffness
         try:
@@ -320,11 +324,9 @@ class _PrescribedStress:
         at = self.field(side) if side else self.field
         return covariant(j, at, 0), covariant(j, at, 6)
 
-    def opened(self, carrier: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
+    def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
-        after, before = (
-            jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before)
-        )
+        after, before = (jump(domain.j0 + domain.jet(field)) for field in (self.after, self.before))
         return self.stiffness * (after - before)
 
 
@@ -335,7 +337,7 @@ class _StrainRates:
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self.since, self._change = fem.Function(model.V), ufl.TrialFunction(model.V)
-        self._jet = model.factory.carrier.jet(self.since)
+        self._jet = model.factory.domain.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
         """See `_PrescribedStress`."""
@@ -344,9 +346,9 @@ class _StrainRates:
             K, self.since, self._change
         )
 
-    def opened(self, carrier: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
+    def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
         """See `_PrescribedStress`."""
-        return ufl.derivative(jump(carrier.j0 + self._jet), self.since, self._change)
+        return ufl.derivative(jump(domain.j0 + self._jet), self.since, self._change)
 
 
 def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
@@ -382,17 +384,17 @@ def _works(
     Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it
     opens.
     """
-    factory, carrier = model.factory, model.factory.carrier
-    r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
+    factory, domain = model.factory, model.factory.domain
+    r0, u, t, m = domain.j0, domain.jet(model.u), factory.thickness, domain.covector
 
     def law(j: Jet, side: str = "") -> Law:
         """That of the shell at small strains, which a viscous stress follows too."""
-        of_shell, own = densities.law_at(model.material.law.linear, j), factory.made_of
+        of_shell, own = densities.law_at(model.material.law.linear, j), factory.cell_materials
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
         return (
             of_shell
             if own is None
-            else of_shell.made_of(*((own(side) if side else own)[i] for i in (0, 1, 3)))
+            else of_shell.with_material(*((own(side) if side else own)[i] for i in (0, 1, 3)))
         )
 
     E, K = _strains(r0, u)
@@ -401,7 +403,7 @@ def _works(
     own = law(r0)
     stretching, bending = work(own.stress(strain, up), E), work(own.moment(strain, bend, up), K)
     coupled = work(own.moment(E, 0 * K, up), bend)  # of plies: a viscous bend makes membrane stress
-    works = [(stretching + bending + coupled) * kin.area_ratio(r0) * carrier.dx()]
+    works = [(stretching + bending + coupled) * kin.area_ratio(r0) * domain.dx()]
 
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
@@ -409,7 +411,7 @@ def _works(
 
     def across(r: Jet) -> Expr:
         plus, minus = (r.side(s) for s in sides)
-        if factory.folded:
+        if factory.has_folds:
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
@@ -422,22 +424,22 @@ def _works(
             law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge)
             / 2
             * model.sigma
-            / carrier.widths[0]
+            / domain.widths[0]
         )
-    S_J, J = given.opened(carrier, across), across(r0 + u)
+    S_J, J = given.stiff_opening(domain, across), across(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
-    works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * carrier.dS()
+    works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * domain.dS()
 
     nu1, nu2, stretch = kin.conormal(r0, m)
     edge = up, (nu1, nu2), 1
     M, bent = (own.edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
-    stiff = own.edge_stiffness(E, *edge) * model.sigma / carrier.widths[1]
-    for held_edge in factory.held:
+    stiff = own.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
+    for held_edge in factory.held_edges:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
-        S_J, J = given.opened(carrier, jump), jump(r0 + u)
+        S_J, J = given.stiff_opening(domain, jump), jump(r0 + u)
         works.append(
             (M * J + S_J * (bent + modelled_sides * stiff * J))
             * stretch
-            * carrier.ds(held_edge.facets)
+            * domain.ds(held_edge.facets)
         )
     return works

@@ -54,7 +54,7 @@ class Waves:
         Its terms as functions of a jet.
     supports
         What is held.
-    touching
+    nonlocal_terms
         Contacts and T-junctions, whose entries are not in the pattern of the others.
 
     Attributes
@@ -73,65 +73,65 @@ class Waves:
         system: FiniteElementSystem,
         energies: Sequence[Energy],
         meridian: Meridian,
-        carrier: IntegrationDomain,
+        domain: IntegrationDomain,
         supports: Supports,
         log: KernelLog,
         touching: "Sequence[MeridianContact | MeridianTJunction]" = (),
     ) -> None:
-        self.touching = touching
+        self.nonlocal_terms = touching
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
         self._m = fem.Constant(V.mesh, 1.0)
-        self._kept = [e for e in energies if not e.linear]
-        self._points = WaveHessians(carrier, system.u, self._kept, log)
+        self._nonlinear_energies = [e for e in energies if not e.linear]
+        self._points = WaveHessians(domain, system.u, self._nonlinear_energies, log)
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
-        self._look_at(largest_wave_number(meridian, system.length))
-        self._solve_for(system)
+        self._set_largest(largest_wave_number(meridian, system.length))
+        self._set_system(system)
 
-    def _look_at(self, largest: int) -> None:
+    def _set_largest(self, largest: int) -> None:
         self.largest = largest
         self._nodes = largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
         self._weights = _lagrange_weights(self._nodes, np.arange(largest + 1))
         self._pieces = [_WaveRange(2, largest, self._nodes)]
 
-    def _solve_for(self, system: FiniteElementSystem) -> None:
+    def _set_system(self, system: FiniteElementSystem) -> None:
         self._system, self._matrices = system, dict[str, PETSc.Mat]()
         self._factorisation, self._counting = (Factorisation(self.V.mesh.comm) for _ in range(2))
 
-    def of(self, system: FiniteElementSystem, largest: int) -> "Waves":
+    def for_system(self, system: FiniteElementSystem, largest: int) -> "Waves":
         """Those of another system with the same terms."""
         _ = self._bands, self._rows_of_matrix  # both have these
         other = copy(self)
-        other._solve_for(system)
+        other._set_system(system)
         if largest != self.largest:
-            other._look_at(largest)
+            other._set_largest(largest)
         return other
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
-        return self._touched(state, self._filled("tangent", entries.ravel(), m), m)
+        return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
 
-    def _touched(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
+    def _with_nonlocal_entries(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
         """With the entries of contacts at a state."""
-        if not self.touching:
+        if not self.nonlocal_terms:
             return K
         entries = self._system.at_state(state).evaluate(
-            lambda: [each.entries_of_waves(m) for each in self.touching]
+            lambda: [each.entries_of_waves(m) for each in self.nonlocal_terms]
         )
         rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
         fixed = np.zeros(K.getSize()[0], dtype=bool)
         fixed[self._rows(m)] = True
         return with_entries(K, (rows, columns, values), fixed)
 
-    def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
+    def energies_along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
         """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi
         and m at a time.
         """
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
-            for e in self._kept:
+            for e in self._nonlinear_energies:
                 energy, v = self._of_wave(e)
                 twice = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
                 form = ufl.replace(twice, {v: ufl.zero(3)})
@@ -140,7 +140,7 @@ class Waves:
                 )
         return self._energies
 
-    def held(self, m: int) -> list[fem.DirichletBC]:
+    def constraints(self, m: int) -> list[fem.DirichletBC]:
         """What is held at the axis and at the ends: a wave m = 1 may move the axis across itself."""
         return self._held_once if m == 1 else self._held
 
@@ -157,32 +157,32 @@ class Waves:
         W), and so three are assembled. Only those that are not positive definite are factored for
         their inertia.
         """
-        values = self.numbers(state)
-        if not self.touching:
-            return self.counts_of(values)
+        values = self.sampled_matrices(state)
+        if not self.nonlocal_terms:
+            return self.counts_from(values)
         unstable = list[int]()
         for m in range(1, self.largest + 1):
             K = self._filled("interpolated", self._weights[m] @ values, m)
-            self._counting.factor(self._touched(state, K, m))
+            self._counting.factor(self._with_nonlocal_entries(state, K, m))
             unstable.append(self._counting.negative_pivots)
         return unstable
 
-    def numbers(self, state: State) -> NDArray[np.float64]:
+    def sampled_matrices(self, state: State) -> NDArray[np.float64]:
         """(5, entries) of the matrices at the five m."""
         of_nodes = self._system.at_state(state).evaluate_forms(
             lambda: self._entries(state, self._nodes[:3])
         )
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
-    def counts_of(self, values: NDArray[np.float64]) -> list[int]:
-        """See `counts`, from `numbers`."""
+    def counts_from(self, values: NDArray[np.float64]) -> list[int]:
+        """See `counts`, from `sampled_matrices`."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
-        """m - 1 of the waves whose matrices, as `numbers` gives them, are not positive definite."""
+        """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive definite."""
         pieces = self._pieces
         try:
             return {m - 1 for m in self._indefinite(values)}
@@ -195,7 +195,7 @@ class Waves:
         """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the
         system's displacement.
         """
-        factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._kept}
+        factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._nonlinear_energies}
         return self._points.entries(factors, [float(m) for m in waves])
 
     @cached_property
@@ -236,15 +236,17 @@ class Waves:
         """
         once, twice = self._bands
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
-        definite = cache(lambda m: twice.positive(rest, self._weights[m]))
-        indefinite = set[int]() if once.positive(first, np.ones(1)) else {1}
+        definite = cache(lambda m: twice.is_positive_definite(rest, self._weights[m]))
+        indefinite = set[int]() if once.is_positive_definite(first, np.ones(1)) else {1}
         halved, self._pieces = [*self._pieces], []  # of others of the same terms too
         while halved:
             piece = halved.pop()
             ends = definite(piece.first) and definite(piece.last)
             if piece.short:
                 indefinite |= {m for m in range(piece.first, piece.last + 1) if not definite(m)}
-            elif not (ends and all(twice.positive(rest, weights) for weights in piece.inner)):
+            elif not (
+                ends and all(twice.is_positive_definite(rest, weights) for weights in piece.inner)
+            ):
                 halved += piece.halves(self._nodes)
                 continue
             self._pieces.append(piece)
@@ -274,7 +276,7 @@ class Waves:
         return filled
 
     def _rows(self, m: int) -> NDArray[np.int32]:
-        return np.concatenate([bc.dof_indices()[0] for bc in self.held(m)])
+        return np.concatenate([bc.dof_indices()[0] for bc in self.constraints(m)])
 
     def negative_pivots(self, state: State, m: int) -> int:
         """Number of unstable directions among the waves m."""
@@ -290,7 +292,7 @@ class Waves:
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
         v, u = fem.Function(self.V), domains.revolved_jet(self._system.u)
         cosine, sine = domains.wave_jets(v, self._m)
-        return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
+        return np.pi * (e.perturbed_form(u, cosine) + e.perturbed_form(u, sine)), v
 
 
 def largest_wave_number(meridian: Meridian, length: float) -> int:
@@ -375,7 +377,7 @@ class SymmetryBreakingWaves:
     @property
     def tangents(self) -> Waves | None:
         """For a `StabilityMonitor`; those of contacts have no pattern in common."""
-        return None if self.waves.touching else self.waves
+        return None if self.waves.nonlocal_terms else self.waves
 
     def counts(self, state: State) -> Sequence[int]:
         """Numbers of unstable directions of all families at a state."""
@@ -411,12 +413,14 @@ class BandedMatrices:
         place[order] = np.arange(n)
         free = np.ones(n, dtype=bool)
         free[held] = False
-        self._kept = np.flatnonzero(free[rows] & free[columns])
-        rows, columns = rows[self._kept], columns[self._kept]
+        self._free_entries = np.flatnonzero(free[rows] & free[columns])
+        rows, columns = rows[self._free_entries], columns[self._free_entries]
         i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
         self._shape = (int((i - j).max(initial=0)) + 1, n)
-        self._at = (i - j) + j * self._shape[0]  # in LAPACK's lower band, column by column
-        self._ones = place[held]
+        self._band_positions = (i - j) + j * self._shape[
+            0
+        ]  # in LAPACK's lower band, column by column
+        self._held_places = place[held]
 
     def bands(self, values: Iterable[Array]) -> Array:
         """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what
@@ -425,11 +429,11 @@ class BandedMatrices:
         values = list(values)
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
         for band, v in zip(stacked, values, strict=True):
-            band[self._at] = v.ravel()[self._kept]
-        stacked[:, self._ones * self._shape[0]] = 1.0
+            band[self._band_positions] = v.ravel()[self._free_entries]
+        stacked[:, self._held_places * self._shape[0]] = 1.0
         return stacked
 
-    def positive(self, bands: Array, weights: Array) -> bool:
+    def is_positive_definite(self, bands: Array, weights: Array) -> bool:
         """Whether the weighted sum of some matrices is positive definite; the weights' sum is one."""
         band = (weights @ bands).reshape(self._shape, order="F")
         return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)

@@ -88,7 +88,7 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
     from magshell_fenicsx.parts.magnetism.stacked_faces import OVERLAP_DISTANCE
 
-    surfaces, V = MidSurfaces.of(r0), r0.function_space
+    surfaces, V = MidSurfaces.gather(r0), r0.function_space
     nodes = surfaces.cells.nodes
     part = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
     for number in np.unique(part)[1:]:

@@ -27,11 +27,11 @@ from magshell_fenicsx.mesh.mirror import Y0_PLANE, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.observables import Sight
 from magshell_fenicsx.parts.registered import SEEN
-from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.motion import UNHELD_CONDITIONS
 from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import on_first_rank
@@ -187,8 +187,12 @@ class Scene:
             surface is not None and surface.from_mesh_file
         )  # a file may have pieces, of which each must be held
         unsure = self.model.axisymmetric or several or not self.problem.fixed
-        self.loose = unsure and self.problem.at_rest
-        motion = self.model.free_motion(self.unloaded().mu) if unsure and not self.loose else ""
+        self.allows_rigid_motion = unsure and self.problem.at_rest
+        motion = (
+            self.model.free_motion(self.unloaded().mu)
+            if unsure and not self.allows_rigid_motion
+            else ""
+        )
         if motion and not self.problem.moves_freely:
             raise MeshError(f"mesh: {flat}" if (flat := self.flat_triangle) else motion)
         self.free_in_time = bool(motion)
@@ -196,7 +200,7 @@ class Scene:
             self.warnings.append(NOT_COUNTED)
         # a body's penetration changes over far less than h: factors of a state near by are no
         # tangent's, and the first matrices only find what touches
-        faces = {each.pair.setting: each.pair.stiffness for each in self.model.touchings}
+        faces = {each.pair.setting: each.pair.stiffness for each in self.model.shell_contacts}
         stiff = self.model.contacts or faces
         options = (
             NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses=faces, allows_kinks=True)
@@ -206,10 +210,10 @@ class Scene:
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: SolverJournal = NoJournal()
         self.progress: Progress = NoProgress()
-        self.meshed: Callable[[Problem], Problem] = lambda problem: problem
+        self.remesh: Callable[[Problem], Problem] = lambda problem: problem
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
-    def retuned(self, context: Context) -> "Scene":
+    def with_field_strength(self, context: Context) -> "Scene":
         """The same model and solver for what differs by the strength of the field alone."""
         return self._with(
             problem=replace(self.problem, context=context, lambda_m=strength(context))
@@ -248,15 +252,15 @@ class Scene:
         return int(topology.index_map(topology.dim).size_global)
 
     @cached_property
-    def watch(self) -> StabilityMonitor:
+    def stability_monitor(self) -> StabilityMonitor:
         """The watch over the modes that the model excludes.
 
         Its first use compiles their kernels.
         """
-        return StabilityMonitor(self.model.excluded_modes)
+        return StabilityMonitor(self.model.symmetry_breaking_modes)
 
     @cached_property
-    def unshown(self) -> list[str]:
+    def unresolved(self) -> list[str]:
         """What the mesh misses of the problem's formulas, in words; collective."""
         model, formulas = self.model, case_formulas(self.problem.context)
         if not formulas:
@@ -265,7 +269,7 @@ class Scene:
             formulas, model.cells_of_fields(), self.problem.azimuth, self.problem.material.h
         )
 
-    def nowhere(self) -> str:
+    def lost_field_text(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message;
         collective.
         """
@@ -429,7 +433,7 @@ class Scene:
         """
         return extra_columns(self.problem)
 
-    def stored(self, state: State, energy: float) -> float:
+    def energy_of_shell(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
         system, of = self.model.system, self.model.multiplicity
         loads = (name for name in state.mu if name not in system.coordinates)

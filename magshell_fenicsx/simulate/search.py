@@ -25,13 +25,13 @@ from magshell_fenicsx.continuation.search import (
     further_solutions,
 )
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.course import SearchSection
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_control import SearchSection
+from magshell_fenicsx.simulate.contact_control import before_passing, passes, with_own_contact
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import Stage, plain, staged
-from magshell_fenicsx.simulate.steps import held_by
-from magshell_fenicsx.simulate.touch import before_passing, of_its_own, passes
+from magshell_fenicsx.simulate.stage import Stage, load_stage, make_stage
+from magshell_fenicsx.simulate.steps import held_conjugates_of_step
 from magshell_fenicsx.simulate.transfer import nodes_of_shells
 
 Array = NDArray[np.float64]
@@ -43,14 +43,14 @@ ROUNDING = 1e-9
 THIN = 1e-6  # a smaller mean square distance from a plane or a line, over the largest, is zero
 
 
-def dented(scene: Scene, state: State) -> Iterator[State]:
+def dented_states(scene: Scene, state: State) -> Iterator[State]:
     """Dented copies of a state, none of flat shells; of several shells each alone, then all.
 
     Collective.
     """
     system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
-    parts = [Curved.of(scene, x, inside) for inside in nodes_of_shells(scene)]
+    parts = [CurvedShell.of(scene, x, inside) for inside in nodes_of_shells(scene)]
     curved = [part for part in parts if part.top > LEAST * scene.problem.material.h]
     for depth in DEPTHS:
         dents = [part.dent(depth, scene.problem.material.h) for part in curved]
@@ -59,7 +59,7 @@ def dented(scene: Scene, state: State) -> Iterator[State]:
 
 
 @dataclass(frozen=True)
-class Curved:
+class CurvedShell:
     """A shell above the plane of its supports.
 
     Attributes
@@ -78,7 +78,7 @@ class Curved:
     top: float
 
     @classmethod
-    def of(cls, scene: Scene, x: Array, inside: NDArray[np.bool_]) -> "Curved":
+    def of(cls, scene: Scene, x: Array, inside: NDArray[np.bool_]) -> "CurvedShell":
         """Of places (n, 2 or 3) of this rank's nodes; collective."""
         comm = scene.model.system.comm
         normal, level = _plane(scene, x, inside)
@@ -138,7 +138,9 @@ def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
     return mean, comm.allreduce((x - mean).T @ (x - mean)) / count
 
 
-def searched(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> Iterator[Record]:
+def search_at_end_of_step(
+    scene: Scene, step: ProgrammeStep, begin: State, end: State
+) -> Iterator[Record]:
     """The solutions that the search of a step finds at its end, if the case requests one.
 
     Parameters
@@ -147,9 +149,9 @@ def searched(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> Ite
         The states at both ends of the step.
     """
     if step.load.search:
-        held = held_by(scene, step, begin)
+        held = held_conjugates_of_step(scene, step, begin)
         name = step.name if step.name in end.mu else "lambda_m"  # of a turning field
-        for record in _solutions(staged(scene, end, held), name, end, step.load.search):
+        for record in _solutions(make_stage(scene, end, held), name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 
 
@@ -190,7 +192,7 @@ def solutions(
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
-    yield from _solutions(plain(scene), name, rest.state, search)
+    yield from _solutions(load_stage(scene), name, rest.state, search)
 
 
 def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> Iterator[Record]:
@@ -204,7 +206,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     made = [partial(dents.settled, number) for number in range(dents.count)]
     limits = SearchLimits(search.solutions, search.guesses, over)
-    excluded = scene.model.excluded_modes
+    excluded = scene.model.symmetry_breaking_modes
     descend = dents.descended if search.stable else None
     found = further_solutions(
         path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage)
@@ -222,11 +224,13 @@ def _rules(stage: Stage) -> AcceptanceRules:
     scene = stage.scene
 
     def own(state: State) -> State | None:
-        changed = of_its_own(scene, stage.leave(state))
+        changed = with_own_contact(scene, stage.leave(state))
         return State(state.u, {**state.mu, **changed.mu}) if changed else None
 
     return (
-        AcceptanceRules(partial(passes, stage), own) if scene.model.touchings else AcceptanceRules()
+        AcceptanceRules(partial(passes, stage), own)
+        if scene.model.shell_contacts
+        else AcceptanceRules()
     )
 
 
@@ -235,17 +239,17 @@ class _Dents:
 
     def __init__(self, stage: Stage, state: State) -> None:
         self._stage, self._state = stage, state
-        self._guesses = list(dented(stage.scene, state))
+        self._guesses = list(dented_states(stage.scene, state))
         self.count = len(self._guesses)
 
     @cached_property
     def _settling(self) -> Settling:
         scene = self._stage.scene
-        return Settling(scene.model.system, scene.unloaded(), partial(passes, plain(scene)))
+        return Settling(scene.model.system, scene.unloaded(), partial(passes, load_stage(scene)))
 
     def settled(self, number: int) -> State:
         """One that has come there without shells that pass through each other."""
-        guess = before_passing(plain(self._stage.scene), self._state, self._guesses[number])
+        guess = before_passing(load_stage(self._stage.scene), self._state, self._guesses[number])
         return self._stage.enter(self._settling.settled(guess))
 
     def descended(self, state: State) -> State:

@@ -1,44 +1,35 @@
-"""A step in time: the records of a motion, with its energies, from any state, to its end or to
-rest.
+"""Step in time: the records of a motion, from any state, to its end or to rest.
 
-It begins along a mode of vibration or with a velocity by formulas; its loads are functions of time
-in the scales of the model.
+A motion begins along a mode of vibration or with a velocity by formulas. Each of its rows has the
+energies since the begin, whose balance shows the error. Times are over R sqrt(rho/E), the unit of
+time of the model. docs/theory.md has the integrator.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.prescribed_motion import vectors_in_space
 from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
-from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator, Surroundings
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.bodies.body_contact import Pressing
-from magshell_fenicsx.parts.contact.time_averaging import TimeAveragedContact, samples_of_step
-from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.parts.motion.motion_step import (
-    EventSection,
-    PushSection,
-    TimeSection,
-    level_in,
-)
+from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection
 from magshell_fenicsx.parts.step_control import SnapSection
-from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.meridian_chart import vector_function
 from magshell_fenicsx.shells.mass import SupportInertia, mass, mass_with_supports
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.viscous import Branch, Viscosity
-from magshell_fenicsx.simulate.contact_control import raised_stiffnesses, stiff_for
+from magshell_fenicsx.simulate.contact_control import raised_stiffnesses
+from magshell_fenicsx.simulate.contacts_in_time import ContactsInTime
+from magshell_fenicsx.simulate.loads_in_time import LoadsInTime, dimensionless_time
 from magshell_fenicsx.simulate.motion_rows import MotionRows, StepRefinement
 from magshell_fenicsx.simulate.path_records import Records
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -46,264 +37,31 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import make_stage
 
 Array = NDArray[np.float64]
-SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
-CLOSE = 1e-5  # of the shortest time of a history: a difference by time
-SAME = 1e-9
-LONGEST, MOST = 2000.0, 500  # of a snap, in radians of that mode, and its rows
-QUIET = 1e-6  # kinetic energy over its largest value below which a shell may be at rest
-IDLE = ""  # an amplitude of no load
-NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
-
-
-def pushed_along_mode(
-    scene: Scene, push: PushSection, state: State, v: Vector
-) -> tuple[Vector, Vector]:
-    """Displacement and velocity with a natural mode of the model itself, inward at the pole."""
-    comm = scene.model.system.comm
-    modes = ShellModes(scene.model)
-    own = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
-    if len(own) < push.mode:  # modes of other symmetries were lower
-        own = [mode for mode in modes.lowest(state, push.mode) if not mode.label]
-    mode = own[push.mode - 1].vector
-    phi = np.asarray(mode / max_abs(comm, mode))
-    inward = scene.model.deflection(phi, "pole")
-    if abs(inward) < SMALL:
-        inward = dot(comm, phi, phi**2)
-    h = np.copysign(scene.problem.material.h, inward)
-    return state.u + push.displacement * h * phi, v + push.velocity * (
-        scene.problem.time_unit or 1.0
-    ) * h * phi
-
-
-def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
-    """The velocity with these components, formulas of the undeformed place, at the nodes; zero at
-    supports.
-    """
-    model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
-    axes = model.axes
-    places = vectors_in_space(model.r0.x.array, len(axes))
-    velocity = (
-        vector_function(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
-    )
-    return np.asarray(
-        model.system.zero_at_supports(
-            np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
-        )
-    )
-
-
-def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
-    """The clock of the state before a step, with the energy of its initial velocity; empty without
-    one.
-    """
-    v = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
-    if load.push and load.push.velocity:
-        v = pushed_along_mode(scene, load.push, state, v)[1]
-    if not max_abs(scene.comm, v):
-        return {}
-    x, Mx = (M := mass(scene.model)).createVecs()
-    x.setArray(v)
-    M.mult(x, Mx)
-    return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}
-
-
-def time_in_case_unit(value: Time) -> float:
-    """A time in the case's own unit."""
-    return float(in_units("second")(value))
-
-
-def dimensionless_time(problem: Problem, value: Time) -> float:
-    """A time over R sqrt(rho/E)."""
-    return time_in_case_unit(value) / (problem.time_unit or 1.0)
-
-
-def amplitude_of_level(problem: Problem, name: str, value: Level) -> float:
-    """A value of a history as an amplitude."""
-    if name != "lambda_m":
-        return level_in(problem.context, name, value)
-    return problem.lambda_m * level_in(problem.context, "field", value)
-
-
-def _scaled(of: Curve, size: float, unit: float, amplitude: Callable[[float], float]) -> Curve:
-    return lambda t, before: amplitude(size * of(t * unit, before))
-
-
-class LoadsInTime:
-    """The amplitudes of a step as functions of its time.
-
-    Parameters
-    ----------
-    motions
-        Amplitudes of supports, which must not jump.
-
-    Raises
-    ------
-    CaseError
-        If one of these does at the begin.
-    """
-
-    def __init__(
-        self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]
-    ) -> None:
-        self._mu, time = dict(state.mu), partial(dimensionless_time, problem)
-        histories = dict(zip(load.drives, load.history.values(), strict=True))
-        unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
-        self._curves, self.marks = dict[str, Curve](), set[float]()
-        for name, history in histories.items():
-            # histories are in the case's own unit of time
-            driven = steps.get(name)
-            value = driven.in_history(state.mu[name]) if driven else state.mu[name]
-            of = curve(
-                history, time_in_case_unit, partial(amplitude_of_level, problem, name), value
-            )
-            size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
-            self._curves[name] = _scaled(of, size, unit, driven.of_history if driven else float)
-            self.marks |= set(marks(history, time, time(load.duration)))
-            first, given = self._curves[name](0.0, False), state.mu[name]
-            if name in motions and abs(first - given) > SAME * max(1.0, abs(given)):
-                raise CaseError(
-                    f"history.{name}: begins at {first:.6g}, but the support is at {given:.6g}"
-                )
-
-        times = [
-            time(load.duration),
-            *(time(t) for history in histories.values() for t in times_of(history)),
-        ]
-        self._close = CLOSE * min(t for t in times if t)
-
-    def rates(
-        self, t: float, before: bool, names: Collection[str]
-    ) -> dict[str, tuple[float, float]]:
-        """First and second derivatives by time of some of them, from values on one side, to second
-        order.
-        """
-        back = before and t >= 3 * self._close
-        slopes, step = {}, -self._close if back else self._close
-        for name in set(self._curves) & set(names):
-            a, b, c, d = (self._curves[name](t + i * step, back) for i in range(4))
-            slopes[name] = (4 * b - 3 * a - c) / (2 * step), (2 * a - 5 * b + 4 * c - d) / step**2
-        return slopes
-
-    def __call__(self, t: float, before: bool) -> dict[str, float]:
-        return self._mu | {name: of(t, before) for name, of in self._curves.items()}
-
-
-@dataclass(frozen=True)
-class _Ends:
-    """Where bodies press, and the displacements of shells that may touch, at one end of a step."""
-
-    of_bodies: list[tuple[Array, float | Array]]
-    nodes_by_shell: list[Array]
-
-
-class ContactsInTime:
-    """All contacts of a system in steps in time, with bodies and between shells; a
-    `continuation.motion.AveragedContact`.
-
-    Attributes
-    ----------
-    names
-        The approaches.
-    settings
-        Names of the stiffnesses between shells.
-    """
-
-    def __init__(
-        self,
-        system: FiniteElementSystem,
-        pressings: Mapping[str, Pressing],
-        between: Sequence[TimeAveragedContact],
-    ) -> None:
-        self._system, self._pressings, self._between = system, list(pressings.values()), between
-        self.names = frozenset(pressings)
-        self.settings = frozenset(contact.pair.setting for contact in between)
-        self._begin: tuple[Vector, _Ends] | None = None
-
-    def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
-        """Settings of pairs of shells that do not touch, and may meet too fast for their penalty."""
-        if not self._between:
-            return {}
-        comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
-        fastest = np.max(comm.allgather(np.max([nodes, -nodes], axis=1, initial=0.0)), axis=0)
-        speed = float(
-            np.linalg.norm(fastest.sum(axis=0))
-        )  # of no two places relative to each other is it larger
-        wanted = {
-            each.pair: stiff_for(each.pair, speed, self._system.length) for each in self._between
-        }
-        at, found = self._system.at_state(begin), dict[str, float]()
-        for each in self._between:
-            k = begin.mu.get(each.pair.setting, each.pair.stiffness)
-            if wanted[each.pair] > k and not each.pair.given and at.evaluate(each.penetration) <= 0:
-                found[each.pair.setting] = wanted[each.pair]
-        return found
-
-    def average_along(self, begin: State, end: State, part: float) -> None:
-        """Take the forces of a step at a part of it."""
-        before, after = self._at_begin(begin), self._places(end)
-        for pressing, low, high in zip(
-            self._pressings, before.of_bodies, after.of_bodies, strict=True
-        ):
-            pressing.average(low, high, part)
-        for contact, u, v in zip(
-            self._between, before.nodes_by_shell, after.nodes_by_shell, strict=True
-        ):
-            contact.samples = ()
-            contact.samples = samples_of_step(contact, u, v, part)
-
-    def use_state_forces(self) -> None:
-        """Take the present forces again."""
-        for pressing in self._pressings:
-            pressing.present()
-        for contact in self._between:
-            contact.samples = ()
-
-    def penetration_message(self, begin: State, end: State) -> str:
-        """Which shells pass through each other in a step."""
-        ends = zip(
-            self._between,
-            self._at_begin(begin).nodes_by_shell,
-            self._places(end).nodes_by_shell,
-            strict=True,
-        )
-        through = [
-            contact.pair.words for contact, before, after in ends if contact.passes(before, after)
-        ]
-        return f"{through[0]} pass through each other" if through else ""
-
-    def stored_energy(self, u: Vector, mu: Amplitudes) -> float:
-        """The energy of the shell itself with that of the contacts."""
-        self.use_state_forces()
-        return self._system.stored_energy(u, mu)
-
-    def _at_begin(self, begin: State) -> _Ends:
-        if self._begin is None or self._begin[0] is not begin.u:
-            self._begin = begin.u, self._places(begin)
-        return self._begin[1]
-
-    def _places(self, state: State) -> _Ends:
-        return self._system.at_state(state).evaluate(
-            lambda: _Ends(
-                [each.where for each in self._pressings], [each.where for each in self._between]
-            )
-        )
+MIN_POLE_DEFLECTION = 1e-6  # of a mode of size one: a smaller one does not give its sign
+MAX_SNAP_ANGLE = 2000.0  # rad of the third mode of vibration: duration of a snap
+SNAP_ROWS = 500
+QUIET_ENERGY = 1e-6  # kinetic energy over its largest value below which a shell may be at rest
+NO_LOAD = ""  # name of an amplitude of no load
+REST_DISTANCE = 1e-2  # over the system's length: an equilibrium so near is the one at rest
 
 
 @dataclass(frozen=True)
 class MovingState(State):
-    """A state with a velocity, and perhaps one of its supports."""
+    """A state with a velocity, and that of its supports where these move."""
 
     v: Vector
     ground: Vector | None = None
 
 
-def motion(
+def motion_records(
     scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]
 ) -> Records:
-    """The records of a step in time; its return value is the state at its end.
+    """Yield the records of a step in time; the return value is the state at its end.
 
     Parameters
     ----------
+    state
+        Where it begins: a `MovingState`, or at rest.
     held
         Amplitude -> its conjugate, as of `make_stage`.
 
@@ -312,131 +70,255 @@ def motion(
     Stopped
         If steps in time become too small, or the shell does not come to rest.
     """
-    problem, system = scene.problem, scene.model.system
-    loads = LoadsInTime(problem, load, state, scene.motions)
-    drag = float(in_units("1/second")(load.drag)) * (problem.time_unit or 1.0)
-    u, v = state.u, state.v if isinstance(state, MovingState) else 0.0 * state.u
-    if load.push:
-        u, v = pushed_along_mode(scene, load.push, state, v)
-    if load.velocity:
-        v = v + velocity_by_formula(scene, load.velocity)
-
-    def begin() -> tuple[Integrator, Motion]:
-        viscous, device, ground = (
-            viscosity(scene, state),
-            make_stage(scene, state, held).device,
-            None,
-        )
-        if moving := scene.motions & set(load.drives):
-            if viscous:
-                raise CaseError(
-                    f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest"
-                )
-            carried = state.ground if isinstance(state, MovingState) else None
-            ground = SupportInertia(
-                system,
-                mass_with_supports(scene.model),
-                lambda t, b: (loads(t, b), loads.rates(t, b, moving)),
-                carried,
-            )
-        pressings = {name: pressing for name, (pressing, _) in scene.model.contacts.items()}
-        between = scene.model.shell_contacts
-        touching = ContactsInTime(system, pressings, between) if pressings or between else None
-        integrator = Integrator(
-            system,
-            mass(scene.model),
-            loads,
-            load.rho_inf,
-            drag,
-            viscous,
-            Surroundings(load.drives, device, ground, touching),
-        )
-        return integrator, integrator.begin(0.0, u, v)
-
-    integrator, now = begin()
-    ground, duration = integrator.supports, dimensionless_time(problem, load.duration)
-    fixed = None if load.step is None else dimensionless_time(problem, load.step)
-    steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
-    dt, most = steps.first, integrator.kinetic(now)
-    total = most + system.stored_energy(now.u, now.mu)
-    outputs = [duration * i / load.points for i in range(1, load.points + 1)]
-    watched, ended, size = _watched(scene, load.event, state), "", scene.model.multiplicity
-
-    def crossed(before: Motion, now: Motion) -> bool:
-        return bool(
-            watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before)
-        )
-
-    def over(before: Motion, now: Motion, most: float) -> bool:
-        quiet = (
-            load.until == "rest"
-            and max(integrator.kinetic(before), integrator.kinetic(now)) <= QUIET * most
-        )
-        return quiet or crossed(before, now)
-
-    whole = load.errors == "motion" and fixed is None
-    rehearse = StepRefinement(scene, held, loads.marks, begin, outputs, over) if whole else None
-    walk = MotionRows(scene, integrator, held, steps, loads.marks, rehearse)
-    for end in outputs:
-        before, first = now, dt
-        now, dt, point = walk.journalled(before, first, end)
-        if watched and crossed(before, now):
-            now, dt, point = walk.journalled(
-                before, first, walk.crossing(before, first, now, watched)
-            )
-            ended = "event"
-        kinetic = integrator.kinetic(now)
-        most = max(most, kinetic)
-        clock = {
-            "time": now.t * (problem.time_unit or 1.0),
-            "kinetic": size * kinetic,
-            "dissipated": size * now.dissipated,
-            "work": size * now.work,
-            "imbalance": size
-            * (kinetic + system.stored_energy(now.u, now.mu) + now.dissipated - now.work - total),
-        }
-        excluded = None if scene.free_in_time else scene.model.excluded_modes
-        unseen = sum(excluded.counts(point.state)) if excluded else 0
-        rest = load.until == "rest" and kinetic <= QUIET * most and _rest(scene, held, point.state)
-        if load.until == "instability" and point.negative_pivots + unseen:
-            ended = "instability"
-        if load.until == "duration" and end == outputs[-1]:
-            ended = "duration"
-        yield Record(
-            "target" if ended else "step", "time", point, excluded_pivots=unseen, clock=clock
-        )
+    start = _MotionStart(scene, load, state, held)
+    integrator, motion = start.begin()
+    duration = dimensionless_time(scene.problem, load.duration)
+    steps = _time_steps(scene, load)
+    energies = _Energies(scene, integrator, motion)
+    row_times = [duration * i / load.points for i in range(1, load.points + 1)]
+    end_of_motion = _MotionEnd(load, integrator, _event_function(scene, load.event, state))
+    marks = start.loads.marks
+    refinement = None
+    if load.errors == "motion" and steps.fixed is None:
+        refinement = StepRefinement(scene, held, marks, start.begin, row_times, end_of_motion)
+    rows = MotionRows(scene, integrator, held, steps, marks, refinement)
+    time_step, ending = steps.first, ""
+    for end in row_times:
+        before, first_step = motion, time_step
+        motion, time_step, point = rows.journalled(before, first_step, end)
+        if end_of_motion.event and end_of_motion.has_event(before, motion):
+            event_time = rows.crossing(before, first_step, motion, end_of_motion.event)
+            motion, time_step, point = rows.journalled(before, first_step, event_time)
+            ending = "event"
+        clock = energies.clock(motion)
+        excluded_pivots = _excluded_pivots(scene, point.state)
+        rest = None
+        if load.until == "rest" and energies.is_quiet:
+            rest = _equilibrium_near(scene, held, point.state)
+        if load.until == "instability" and point.negative_pivots + excluded_pivots:
+            ending = "instability"
+        if load.until == "duration" and end == row_times[-1]:
+            ending = "duration"
+        record = Record("step", "time", point, excluded_pivots=excluded_pivots, clock=clock)
+        yield replace(record, label="target") if ending else record
         if rest:
-            pull = system.coordinates  # constant loads do work on the way to rest
-            moved = {
-                n: system.potential(rest.u, rest.mu, n) - q
-                for n, q in now.potentials.items()
-                if n not in pull
-            }
-            work = now.work - sum(now.mu[name] * change for name, change in moved.items())
-            lacks = system.stored_energy(rest.u, rest.mu) + now.dissipated - work - total
-            still = {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * lacks}
-            yield Record(
-                "target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still
-            )
+            clock = energies.clock_at_rest(motion, rest, clock)
+            yield replace(record, label="target", point=replace(point, state=rest), clock=clock)
             return rest
-        if ended:
-            return MovingState(
-                point.state.u,
-                point.state.mu,
-                now.v,
-                ground.velocity(now.t, True) if ground else None,
-            )
+        if ending:
+            supports = integrator.supports
+            velocity = supports.velocity(motion.t, True) if supports else None
+            return MovingState(point.state.u, point.state.mu, motion.v, velocity)
     if load.until == "rest":
         raise Stopped(
-            f"the shell still moves at the end of its duration, kinetic energy {kinetic / most:.2g} of its largest"
+            "the shell still moves at the end of its duration, kinetic energy "
+            f"{energies.kinetic / energies.largest_kinetic:.2g} of its largest"
         )
     raise Stopped(f"until: {load.until}: it has not come within the duration")
 
 
-def _watched(
+def snap_records(
+    scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]
+) -> Records:
+    """Yield the records of a snap from a fold or a bifurcation to rest.
+
+    The return value is the state at its end. Loads are constant, except those whose conjugates are
+    `held`. The shell leaves a fold along the path's direction there, a bifurcation along its mode.
+    Its drag is in proportion to the frequency of its third mode of vibration: the first one has
+    none there.
+
+    Raises
+    ------
+    Stopped
+        If the shell does not come to rest.
+    """
+    state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
+    lowest_modes = ShellModes(scene.model).lowest(state, 3)
+    eigenvalues = [mode.eigenvalue for mode in lowest_modes if not mode.label]
+    omega = float(np.sqrt(max(eigenvalues[1:])))
+    load = TimeSection(
+        kind="time",
+        duration=MAX_SNAP_ANGLE * unit / omega,
+        points=SNAP_ROWS,
+        drag=2 * snap.damping * omega / unit,
+        tolerance=snap.tolerance,
+        errors=snap.errors,
+        until="rest",
+    )
+    direction = system.zero_at_supports(fold.point.du)
+    size = snap.push * system.length / max_abs(system.comm, direction)
+    pushed_state = State(state.u + size * direction, state.mu)
+    return (yield from motion_records(scene, load, pushed_state, held))
+
+
+def _time_steps(scene: Scene, load: TimeSection) -> TimeSteps:
+    """Return the options of the lengths of a step's time steps."""
+    duration = dimensionless_time(scene.problem, load.duration)
+    fixed = None if load.step is None else dimensionless_time(scene.problem, load.step)
+    return TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
+
+
+class _MotionStart:
+    """Begin of a step in time: its loads, and the state with its velocity.
+
+    Attributes
+    ----------
+    loads
+        The amplitudes as functions of time.
+    """
+
+    def __init__(
+        self, scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]
+    ) -> None:
+        self._scene, self._load, self._state, self._held = scene, load, state, held
+        self.loads = LoadsInTime(scene.problem, load, state, scene.motions)
+        unit = scene.problem.time_unit or 1.0
+        self._drag = float(in_units("1/second")(load.drag)) * unit
+        u, v = state.u, state.v if isinstance(state, MovingState) else 0.0 * state.u
+        if load.push:
+            u, v = pushed_along_mode(scene, load.push, state, v)
+        if load.velocity:
+            v = v + velocity_by_formula(scene, load.velocity)
+        self._u, self._v = u, v
+
+    def begin(self) -> tuple[Integrator, Motion]:
+        """Return a new integrator, and the motion where it begins."""
+        scene, state, load = self._scene, self._state, self._load
+        viscous = viscosity(scene, state)
+        device = make_stage(scene, state, self._held).device
+        supports = self._support_inertia(is_viscous=viscous is not None)
+        body_contacts = {name: contact for name, (contact, _) in scene.model.contacts.items()}
+        shell_contacts = scene.model.shell_contacts
+        contact = None
+        if body_contacts or shell_contacts:
+            contact = ContactsInTime(scene.model.system, body_contacts, shell_contacts)
+        integrator = Integrator(
+            scene.model.system,
+            mass(scene.model),
+            self.loads,
+            load.rho_inf,
+            self._drag,
+            viscous,
+            Surroundings(load.drives, device, supports, contact),
+        )
+        return integrator, integrator.begin(0.0, self._u, self._v)
+
+    def _support_inertia(self, *, is_viscous: bool) -> SupportInertia | None:
+        """Return what supports that move bring to the motion; None if all are at rest."""
+        scene, state, loads = self._scene, self._state, self.loads
+        moving = scene.motions & set(self._load.drives)
+        if not moving:
+            return None
+        if is_viscous:
+            raise CaseError(
+                f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest"
+            )
+        return SupportInertia(
+            scene.model.system,
+            mass_with_supports(scene.model),
+            lambda t, before: (loads(t, before), loads.rates(t, before, moving)),
+            state.ground if isinstance(state, MovingState) else None,
+        )
+
+
+@dataclass(frozen=True)
+class _MotionEnd:
+    """What ends a motion before its duration: an event, or rest.
+
+    Attributes
+    ----------
+    event
+        Function of a motion that changes its sign at the event; None without one.
+    """
+
+    load: TimeSection
+    integrator: Integrator
+    event: Callable[[Motion], float] | None
+
+    def has_event(self, before: Motion, after: Motion) -> bool:
+        """Whether the event is between two motions."""
+        if self.event is None:
+            return False
+        return self.event(before) * self.event(after) <= 0 and self.event(after) != self.event(
+            before
+        )
+
+    def __call__(self, before: Motion, after: Motion, largest_kinetic: float) -> bool:
+        """Return whether a motion need not be followed beyond the second of two rows.
+
+        Parameters
+        ----------
+        largest_kinetic
+            The largest kinetic energy so far.
+        """
+        if self.load.until == "rest":
+            kinetic = max(self.integrator.kinetic(before), self.integrator.kinetic(after))
+            if kinetic <= QUIET_ENERGY * largest_kinetic:
+                return True
+        return self.has_event(before, after)
+
+
+class _Energies:
+    """Energies of a motion since its begin, as columns of its rows.
+
+    Attributes
+    ----------
+    kinetic, largest_kinetic
+        Kinetic energy of the model at the last row, and the largest one so far.
+    """
+
+    def __init__(self, scene: Scene, integrator: Integrator, begin: Motion) -> None:
+        self._scene, self._integrator = scene, integrator
+        self.kinetic = self.largest_kinetic = integrator.kinetic(begin)
+        self._at_begin = self.kinetic + scene.model.system.stored_energy(begin.u, begin.mu)
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether the shell may be at rest at the last row."""
+        return self.kinetic <= QUIET_ENERGY * self.largest_kinetic
+
+    def clock(self, motion: Motion) -> dict[str, float]:
+        """Return time and energies of a row, which is the last one then."""
+        size = self._scene.model.multiplicity
+        self.kinetic = self._integrator.kinetic(motion)
+        self.largest_kinetic = max(self.largest_kinetic, self.kinetic)
+        stored = self._scene.model.system.stored_energy(motion.u, motion.mu)
+        imbalance = self.kinetic + stored + motion.dissipated - motion.work - self._at_begin
+        return {
+            "time": motion.t * (self._scene.problem.time_unit or 1.0),
+            "kinetic": size * self.kinetic,
+            "dissipated": size * motion.dissipated,
+            "work": size * motion.work,
+            "imbalance": size * imbalance,
+        }
+
+    def clock_at_rest(
+        self, motion: Motion, rest: State, clock: Mapping[str, float]
+    ) -> dict[str, float]:
+        """Return the clock of the equilibrium near a row; `clock` is that of the row."""
+        system, size = self._scene.model.system, self._scene.model.multiplicity
+        # constant loads do work on the way to rest
+        changes = {
+            name: system.potential(rest.u, rest.mu, name) - potential
+            for name, potential in motion.potentials.items()
+            if name not in system.coordinates
+        }
+        work = motion.work - sum(motion.mu[name] * change for name, change in changes.items())
+        stored = system.stored_energy(rest.u, rest.mu)
+        imbalance = stored + motion.dissipated - work - self._at_begin
+        return {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * imbalance}
+
+
+def _excluded_pivots(scene: Scene, state: State) -> int:
+    """Return the number of unstable directions at a state that the model excludes."""
+    symmetry_breaking_modes = None if scene.free_in_time else scene.model.symmetry_breaking_modes
+    return sum(symmetry_breaking_modes.counts(state)) if symmetry_breaking_modes else 0
+
+
+def _event_function(
     scene: Scene, event: EventSection | None, state: State
 ) -> Callable[[Motion], float] | None:
-    """What changes its sign at an event; None without one."""
+    """Return the function of a motion that changes its sign at an event; None without one."""
     if event is None:
         return None
     if event.column not in (columns := scene.observe(state)):
@@ -444,19 +326,38 @@ def _watched(
             f"loading: event.column: {event.column}: no such column; allowed: {', '.join(columns)}"
         )
 
-    def beyond(now: Motion) -> float:
-        return (
-            scene.observe(scene.model.system.with_moved_supports(State(now.u, now.mu)))[
-                event.column
-            ]
-            - event.value
-        )
+    def excess(motion: Motion) -> float:
+        moved_state = scene.model.system.with_moved_supports(State(motion.u, motion.mu))
+        return scene.observe(moved_state)[event.column] - event.value
 
-    return beyond
+    return excess
+
+
+def _equilibrium_near(
+    scene: Scene, held: Mapping[str, HeldConjugate], state: State
+) -> State | None:
+    """Return the equilibrium near a state; None if there is none near, or an unstable one."""
+    stage, comm = make_stage(scene, state, held), scene.model.system.comm
+    start = stage.enter(state)
+    start, raised = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
+    while True:
+        outcome = stage.newton.solve(start, NO_LOAD, PrescribedLoad(NO_LOAD, 0.0))
+        distance = max_abs(comm, outcome.state.u - start.u) / scene.model.system.length
+        if not outcome.converged or distance > REST_DISTANCE:
+            return None
+        rest = stage.leave(outcome.state)
+        stiffer = raised_stiffnesses(scene, rest)
+        if not stiffer:
+            break
+        raised |= stiffer
+        start = State(outcome.state.u, {**outcome.state.mu, **raised})
+    if stage.newton.factor_at(outcome.state).negative_pivots:
+        return None
+    return State(rest.u, state.mu | {name: rest.mu[name] for name in (*held, *raised)})
 
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:
-    """Of the shell at rest in a state; None without."""
+    """Return the viscous forces of the shell at rest in a state; None without."""
     problem, shell = scene.problem, scene.problem.context.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
@@ -469,57 +370,47 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     return Viscosity(model, state.mu, dimensionless_time(problem, shell.viscosity or 0.0), branches)
 
 
-def snap_records(
-    scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]
-) -> Records:
-    """The records of a snap from a fold, or a bifurcation, to rest; its return value is the state
-    at its end.
+def pushed_along_mode(
+    scene: Scene, push: PushSection, state: State, v: Vector
+) -> tuple[Vector, Vector]:
+    """Return displacement and velocity with a natural mode of the model, inward at the pole."""
+    comm = scene.model.system.comm
+    modes = ShellModes(scene.model)
+    symmetric_modes = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
+    if len(symmetric_modes) < push.mode:  # modes of other symmetries were lower
+        symmetric_modes = [mode for mode in modes.lowest(state, push.mode) if not mode.label]
+    mode = symmetric_modes[push.mode - 1].vector
+    phi = np.asarray(mode / max_abs(comm, mode))
+    deflection = scene.model.deflection(phi, "pole")
+    if abs(deflection) < MIN_POLE_DEFLECTION:
+        deflection = dot(comm, phi, phi**2)
+    h = np.copysign(scene.problem.material.h, deflection)
+    unit = scene.problem.time_unit or 1.0
+    return state.u + push.displacement * h * phi, v + push.velocity * unit * h * phi
 
-    Loads are constant, except those whose conjugates are `held`.
 
-    The shell leaves the fold along the path's direction there, a bifurcation along its mode. Its
-    drag is in proportion to the frequency of its third mode of vibration: the first one has none
-    there.
+def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
+    """Return the velocity at the nodes by formulas of the undeformed place; zero at supports."""
+    model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
+    unit, axes = scene.problem.time_unit or 1.0, model.axes
+    places = vectors_in_space(model.r0.x.array, len(axes))
+    velocity = vector_function(components)(R * places @ Q) @ Q.T * unit / R
+    owned = np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
+    return np.asarray(model.system.zero_at_supports(owned))
 
-    Raises
-    ------
-    Stopped
-        If the shell does not come to rest.
+
+def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
+    """Return the clock of the state before a step in time, with the energy of its velocity.
+
+    It is empty if the step has no initial velocity.
     """
-    state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
-    own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
-    omega = float(np.sqrt(max(own[1:])))
-    load = TimeSection(
-        kind="time",
-        duration=LONGEST * unit / omega,
-        points=MOST,
-        drag=2 * snap.damping * omega / unit,
-        tolerance=snap.tolerance,
-        errors=snap.errors,
-        until="rest",
-    )
-    away = scene.model.system.zero_at_supports(fold.point.du)
-    size = snap.push * system.length / max_abs(system.comm, away)
-    return (yield from motion(scene, load, State(state.u + size * away, state.mu), held))
-
-
-def _rest(scene: Scene, held: Mapping[str, HeldConjugate], state: State) -> State | None:
-    """The equilibrium near a state; None if there is none near, or an unstable one."""
-    stage = make_stage(scene, state, held)
-    start = stage.enter(state)
-    start, raised = start.with_(start.u, IDLE, 0.0), dict[str, float]()
-    while True:
-        outcome = stage.newton.solve(start, IDLE, PrescribedLoad(IDLE, 0.0))
-        moved = (
-            max_abs(scene.model.system.comm, outcome.state.u - start.u) / scene.model.system.length
-        )
-        if not outcome.converged or moved > NEAR:
-            return None
-        stiffer = raised_stiffnesses(scene, at_rest := stage.leave(outcome.state))
-        if not stiffer:
-            break
-        raised |= stiffer
-        start = State(outcome.state.u, {**outcome.state.mu, **raised})
-    if stage.newton.factor_at(outcome.state).negative_pivots:
-        return None
-    return State(at_rest.u, state.mu | {name: at_rest.mu[name] for name in (*held, *raised)})
+    v = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
+    if load.push and load.push.velocity:
+        v = pushed_along_mode(scene, load.push, state, v)[1]
+    if not max_abs(scene.comm, v):
+        return {}
+    M = mass(scene.model)
+    x, Mx = M.createVecs()
+    x.setArray(v)
+    M.mult(x, Mx)
+    return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}

@@ -87,7 +87,7 @@ def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
     assert isinstance(magnetic.remanent, ControlledPattern)
     return np.asarray(
         field_gradient.field.function_space.mesh.comm.allreduce(
-            magnetic.remanent.pulled(field_gradient.places, field_gradient.forces)
+            magnetic.remanent.transposed(field_gradient.places, field_gradient.forces)
         )
     )
 
@@ -115,7 +115,7 @@ class Vectors:
     @property
     def planar(self) -> bool:
         """Whether the vectors stay in a plane."""
-        return self.controls.around or not self.controls.places[:, 1].any()
+        return self.controls.is_axisymmetric or not self.controls.places[:, 1].any()
 
     @property
     def angles(self) -> int:
@@ -161,7 +161,7 @@ class Vectors:
             size = self.lengths[0] + other_variables[-1] * grows
         lengths = size[:, None]
         if self.planar:
-            no_component = [] if self.controls.around else [0 * s]
+            no_component = [] if self.controls.is_axisymmetric else [0 * s]
             unit, polar_derivative = (
                 np.stack(v, axis=1) for v in ([s, *no_component, c], [c, *no_component, -s])
             )
@@ -243,10 +243,10 @@ class ControlPointField(Bounded):
         """The points in the frame of one of several shells, over its own length."""
         control_points = self.controls.places
         x = place.to_shell_frame(
-            np.insert(control_points, 1, 0.0, axis=1) if self.controls.around else control_points
+            np.insert(control_points, 1, 0.0, axis=1) if self.controls.is_axisymmetric else control_points
         )
         points_of_shell = (
-            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.around else x
+            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.is_axisymmetric else x
         )
         return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
 
@@ -275,7 +275,7 @@ class ControlPointField(Bounded):
         return f"({' + '.join(parts)})/({' + '.join(weights)})"
 
     def _square(self, place: Array) -> str:
-        names = ("sqrt(x**2 + y**2)", "z") if self.controls.around else ("x", "y", "z")
+        names = ("sqrt(x**2 + y**2)", "z") if self.controls.is_axisymmetric else ("x", "y", "z")
         return " + ".join(
             f"({name} - {float(c)!r})**2" for name, c in zip(names, place, strict=True)
         )

@@ -197,14 +197,14 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     """Draw the vectors at their places on the undeformed shell and its edges."""
     assert vary.controls
     places, vectors = vary.controls.places, vary.vectors(x)
-    names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
+    names = (r"\rho", "z") if vary.controls.is_axisymmetric else ("x", "y", "z")
     widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
     planar = vary.remanence is not None and vary.remanence.planar
     first, second = (0, len(names) - 1) if planar else sorted(int(i) for i in widest)
     horizontal, up = places[:, first], places[:, second]
-    line_style = "-" if vary.controls.around or not places[:, 1:].any() else ""
+    line_style = "-" if vary.controls.is_axisymmetric or not places[:, 1:].any() else ""
     axes.plot(horizontal, up, line_style + ".", color="0.6", markersize=3, linewidth=1)
-    if shape is not None and not vary.controls.around:
+    if shape is not None and not vary.controls.is_axisymmetric:
         axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
     size = ARROW * float(np.ptp(places, axis=0).max()) / longest
@@ -251,7 +251,7 @@ def _unit(result: str) -> str:
 def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
     """Draw values at the points: along a meridian or strip as lines, else as colours from above."""
     places, title = field.controls.places, TITLES[field.name]
-    if field.controls.around or not places[:, 1:].any():
+    if field.controls.is_axisymmetric or not places[:, 1:].any():
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )

@@ -164,7 +164,7 @@ def variables(source: Source, case: Case, design: DesignSection, make_case: Make
     scalars, remanence = refuse_unfit_numbers(source, case, design), None
     if design.remanence:
         remanence = _remanence(case, design.remanence)
-        if not (case.shell.geometry == "strip" or remanence.controls.around):
+        if not (case.shell.geometry == "strip" or remanence.controls.is_axisymmetric):
             source = copy.deepcopy(source)
             source.data["symmetry"] = "none"
             case = make_case(source)

@@ -67,7 +67,7 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
-    modes = scene.model.excluded_modes
+    modes = scene.model.symmetry_breaking_modes
     if fold.unstable or (modes and modes.is_unstable(fold.state)):
         raise FoldLost("another instability comes before the fold")
 
@@ -246,7 +246,7 @@ class Scenes:
         key = _apart_from_strength(case)
         earlier_scene = self._kept.pop(key, None)
         if earlier_scene:
-            scene = earlier_scene.retuned(case.context)
+            scene = earlier_scene.with_field_strength(case.context)
         else:
             scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene

@@ -117,8 +117,8 @@ def field_of(
     if section is None:
         return None, source
     controls, start = controls_of(case, section.points, section.filter, FIELD_KEY)
-    in_plane = controls.around or case.shell.geometry == "strip"
-    free_components = (0, 1) if controls.around else (0, 2) if in_plane else (0, 1, 2)
+    in_plane = controls.is_axisymmetric or case.shell.geometry == "strip"
+    free_components = (0, 1) if controls.is_axisymmetric else (0, 2) if in_plane else (0, 1, 2)
     if len(start) * len(free_components) > MAX_FIELD_NUMBERS:
         raise CaseError(
             f"{FIELD_KEY}: {len(start)} points with {len(free_components)} components each; "

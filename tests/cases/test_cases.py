@@ -132,7 +132,7 @@ def test_dimple_drift_on_the_shell() -> None:
     records = list(follow(scene := Scene(Case.load(CASES / "dimple_drift.yaml"))))
     shell = Scene(Case.load(CASES / "dimple_drift.yaml", ["symmetry=half", "mesh.refinement=1.5"]))
     assert isinstance(scene.model, MeridianModel)
-    assert shell.model.excluded_modes
+    assert shell.model.symmetry_breaking_modes
     x, y, z = shell.model.r0.x.array.reshape(-1, 3).T
     rho = np.hypot(x, y)
     c, s = (np.divide(a, rho, out=np.zeros_like(a), where=rho > 0) for a in (x, y))
@@ -160,7 +160,7 @@ def test_dimple_drift_on_the_shell() -> None:
         assert there.state.mu["pressure"] == pytest.approx(
             record.point.state.mu["pressure"], rel=4e-3
         )
-        tangents = shell.newton, shell.model.excluded_modes
+        tangents = shell.newton, shell.model.symmetry_breaking_modes
         found.append([tangent.factor_at(there.state).negative_pivots for tangent in tangents])
     assert found == [[1, 0], [2, 1], [2, 1], [1, 0]]
 

@@ -88,7 +88,7 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
         },
     }  # fmt: skip
     scene = Scene(Case.model_validate(case))
-    state, (touching,) = scene.unloaded(), scene.model.touchings
+    state, (touching,) = scene.unloaded(), scene.model.shell_contacts
     for factor in (0.01, 0.1, 1.0):
         outcome = scene.newton.solve(
             state.with_(state.u, "load", factor), "load", PrescribedLoad("load", factor)
@@ -96,8 +96,8 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
         assert outcome.converged, outcome.reason
         state = outcome.state
     at = scene.model.system.at_state(state)
-    _, _, (_, at_points, _) = at.evaluate(touching._pressed)
-    in_cells = at.evaluate(touching.of_cells)[0]
+    _, _, (_, at_points, _) = at.evaluate(touching._active_set)
+    in_cells = at.evaluate(touching.cell_pressures_and_gaps)[0]
     expected = P - SOFT * at.evaluate(touching.penetration) / (2 * h)
     assert at_points == pytest.approx(np.full(len(at_points), expected), rel=1e-3)
     assert in_cells == pytest.approx(np.full(len(in_cells), expected), rel=1e-3)

@@ -12,8 +12,8 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.parts.touching.mirrored import Mirrored
-from magshell_fenicsx.parts.touching.touching import Touching
+from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages
+from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 
 Array = NDArray[np.float64]
 RING: dict[str, Any] = {
@@ -37,9 +37,9 @@ def ring() -> Scene:
     return Scene(Case.model_validate(RING))
 
 
-def touching() -> Touching:
-    (found,) = ring().model.touchings
-    assert isinstance(found, Touching)
+def touching() -> SurfaceContact:
+    (found,) = ring().model.shell_contacts
+    assert isinstance(found, SurfaceContact)
     return found
 
 
@@ -81,8 +81,8 @@ def test_derivatives(seed: int) -> None:
     if seed:
         r = ring().model.r0.x.array.reshape(-1, 3)
         slid = u.reshape(-1, 3) + 0.7 * seed * h * np.outer(np.tanh(r[:, 1] / 0.2), [1, 0, 0])
-        mu = mu | {term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.recut)}
-        assert system.at_state(State(u, mu)).evaluate(lambda: len(term._pressed()[0].point)) > 2000
+        mu = mu | {term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.improved_cuts)}
+        assert system.at_state(State(u, mu)).evaluate(lambda: len(term._active_set()[0].point)) > 2000
     v = system.zero_at_supports(
         1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size)
     )
@@ -120,7 +120,7 @@ def test_states_with_the_same_cuts_share_a_pattern() -> None:
     """The matrix is one object, which is analysed once, and its values are of the state alone."""
     system, mu, term = ring().model.system, ring().unloaded().mu, touching()
     u, deeper = (flattened(half, 0.02) for half in (0.499, 0.498))
-    mu = mu | {term.pair.cuts: system.at_state(State(u, mu)).evaluate(term.recut)}
+    mu = mu | {term.pair.cuts: system.at_state(State(u, mu)).evaluate(term.improved_cuts)}
     K = system.tangent(u, mu)
     first = K.getValuesCSR()[2]
     assert system.tangent(deeper, mu).handle == K.handle
@@ -150,7 +150,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         )
         for symmetry in ("half", "none")
     )
-    plane, other = half.problem.mirror, half.model.excluded_modes
+    plane, other = half.problem.mirror, half.model.symmetry_breaking_modes
     assert plane is not None
     assert isinstance(other, AntisymmetricModes)
     places, all_places = (scene.model.r0.x.array.reshape(-1, 3) for scene in (half, whole))
@@ -159,7 +159,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         np.where(beyond[:, None], plane.image(all_places), all_places)
     )
     assert far.max() < 1e-12
-    (own,), (of_whole,) = (scene.model.touchings for scene in (half, whole))
+    (own,), (of_whole,) = (scene.model.shell_contacts for scene in (half, whole))
     system, state = (
         half.model.system,
         State(flattened(0.497, of=half, **pressed), half.unloaded().mu),
@@ -186,7 +186,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
         v = of.zero_at_supports(np.random.default_rng(4).standard_normal(of.size))
         image = sign * v.reshape(-1, 3)[node] @ plane.reflection
         v_of_whole = np.where(beyond[:, None], image, v.reshape(-1, 3)[node]).ravel()
-        (term,) = (each for each in of.terms if isinstance(each, Mirrored))
+        (term,) = (each for each in of.terms if isinstance(each, ContactWithImages))
         second = v @ times([(1.0, of.at_state(state).evaluate(term.entries))], v)
         assert v_of_whole @ times([(1.0, entries_of_whole)], v_of_whole) == pytest.approx(
             2 * second, rel=1e-9
@@ -213,16 +213,16 @@ def test_nearest_places() -> None:
     model, term = ring().model, touching()
     at = model.system.at_state(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
     h, cells, points = model.material.h, term._cells, term._rule
-    places = at.evaluate(lambda: term._facing.found(term._now(), 4 * h))
-    r = at.evaluate(lambda: term._r0 + term._now())
-    x, n = term._facing.x_of(points, r), 40
+    places = at.evaluate(lambda: term._search.found(term._displacement(), 4 * h))
+    r = at.evaluate(lambda: term._r0 + term._displacement())
+    x, n = term._search.x_of(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
     inner = np.flatnonzero(np.abs(x[places.point, 0]) < 0.4)
     assert len(inner) > 300
     for k in inner[::20]:
         i = points.cell[places.point[k]]
-        _, far = term._facing._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
+        _, far = term._search._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
         least = np.linalg.norm(fine[far] - x[places.point[k]], axis=-1).min()
         assert places.distance[k] <= least + 1e-12
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
@@ -257,17 +257,17 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
         "loading": loading,
     }
     scene = Scene(Case.model_validate(case | {"symmetry": 6}))
-    (term,), system = scene.model.touchings, scene.model.system
-    assert isinstance(term, Mirrored)
+    (term,), system = scene.model.shell_contacts, scene.model.system
+    assert isinstance(term, ContactWithImages)
     u = system.zero_at_supports(2e-3 * np.random.default_rng(3).standard_normal(system.size))
     at = system.at_state(State(u, scene.unloaded().mu))
     facing, far, points = (
-        term._facing,
-        term._far,
-        at.evaluate(lambda: term._pressed() and term._points),
+        term._search,
+        term._reach,
+        at.evaluate(lambda: term._active_set() and term._points),
     )
     every, few = (
-        at.evaluate(lambda least=least: facing.found(term._now(), far, points, least=least))
+        at.evaluate(lambda least=least: facing.found(term._displacement(), far, points, least=least))
         for least in (0, 1)
     )
     assert len(few.point) < 3 * len(points.cell) < len(every.point)
@@ -286,7 +286,7 @@ def test_folds_between_cells_have_no_jump(deep: float) -> None:
     """
     thick = {**RING["shell"], "thickness": 0.08}
     scene = Scene(Case.model_validate(RING | {"shell": thick, "mesh": {"size": 0.3, "degree": 3}}))
-    model, (term,) = scene.model, scene.model.touchings
+    model, (term,) = scene.model, scene.model.shell_contacts
     system, h, r = model.system, model.material.h, model.r0.x.array.reshape(-1, 3)
     u = np.zeros_like(r)
     u[:, 1] = np.tanh(r[:, 1] / 0.3) * ((1 - deep) * h / 2 + 0.4 * r[:, 0] ** 2) - r[:, 1]
@@ -295,7 +295,7 @@ def test_folds_between_cells_have_no_jump(deep: float) -> None:
     mu = scene.unloaded().mu
     at = system.at_state(State(u, mu))
     Kv = times([(1.0, at.evaluate(term.entries))], v)
-    _, joined, _ = at.evaluate(term._pressed)
+    _, joined, _ = at.evaluate(term._active_set)
     assert joined.several.any()
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()

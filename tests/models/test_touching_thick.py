@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.gap import SOFT
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION
 
 Array = NDArray[np.float64]
 h = 0.02
@@ -50,7 +50,7 @@ def sheets(factors: tuple[str | None, str | None], apart: float = h, thick: floa
 
 def gap_of(scene: Scene) -> float:
     return float(
-        scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.touchings[0].least_gap)
+        scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.shell_contacts[0].least_gap)
     )
 
 
@@ -74,7 +74,7 @@ def test_pressed_wedges() -> None:
     """
     inclined = np.sqrt(1 - (0.03 * h) ** 2)
     scene = sheets(("0.97 + 0.06*x", "1.03 - 0.06*x"), h / inclined)
-    model, (term,) = scene.model, scene.model.touchings
+    model, (term,) = scene.model, scene.model.shell_contacts
     system, r0, mu = (
         model.system,
         model.r0.x.array.reshape(-1, 3),
@@ -94,10 +94,10 @@ def test_pressed_wedges() -> None:
     q = (PRESSURE + FOUNDATION * u.reshape(-1, 3)[upper, 2].mean() / h) / inclined
     force = system.at_state(State(u, mu)).evaluate(term.force)
     assert force == pytest.approx(q, rel=1e-5)
-    p = system.at_state(State(u, mu)).evaluate(term.of_cells)[0]
+    p = system.at_state(State(u, mu)).evaluate(term.cell_pressures_and_gaps)[0]
     assert np.ptp(p) < 1e-3 * p.mean()
-    s = np.sqrt(2 * SOFT * h * q / term.stiffness.value)
-    assert s < SOFT * h  # the penalty is k s^2/(2 SOFT h)
+    s = np.sqrt(2 * SOFT_PENETRATION * h * q / term.stiffness.value)
+    assert s < SOFT_PENETRATION * h  # the penalty is k s^2/(2 SOFT_PENETRATION h)
     assert d == pytest.approx((h - s) / inclined, abs=1e-6 * h)
 
 

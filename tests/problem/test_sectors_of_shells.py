@@ -100,22 +100,22 @@ def test_copies_make_the_half(name: str) -> None:
     scene = Scene(sector(name))
     model, waves = scene.model, scene.problem.mirror.waves  # type: ignore[union-attr]
     assert isinstance(model, ShellModel)
-    assert isinstance(model.excluded_modes, SectorModes)
-    half = model.excluded_modes.half
+    assert isinstance(model.symmetry_breaking_modes, SectorModes)
+    half = model.symmetry_breaking_modes.half_model
     assert (model.multiplicity, half.multiplicity) == (2 * waves, 2)
     size = {"rings": 0.4, "gripper": 2.0, "joined": 1e-7}[
         name
     ]  # the sine of its angles is the angle
     u, mu = symmetric(scene, size), {**scene.unloaded().mu}
     mu |= {key: 1e-3 for key in ("lambda_m", "pressure", "fold") if key in mu}
-    copies = model.excluded_modes.unfolded(u)
+    copies = model.symmetry_breaking_modes.unfold(u)
     way = symmetric(scene, 1.0) * (
         1 + np.arange(model.system.size) % 2
     )  # of no meaning, and not along u
     way = u if name == "gripper" else model.system.zero_at_supports(way)
     works = [
         model.system.residual(u, mu) @ way,
-        half.system.residual(copies, mu) @ model.excluded_modes.unfolded(way),
+        half.system.residual(copies, mu) @ model.symmetry_breaking_modes.unfold(way),
     ]
     assert works[1] == pytest.approx(waves * works[0], rel=1e-9)
     if name == "joined":
@@ -147,9 +147,9 @@ def test_a_ball_on_a_sector() -> None:
     scene = Scene(Case.from_source(data))
     model = scene.model
     assert isinstance(model, ShellModel)
-    assert isinstance(model.excluded_modes, SectorModes)
-    half, u = model.excluded_modes.half, symmetric(scene, -0.1)
-    copies = model.excluded_modes.unfolded(u)
+    assert isinstance(model.symmetry_breaking_modes, SectorModes)
+    half, u = model.symmetry_breaking_modes.half_model, symmetric(scene, -0.1)
+    copies = model.symmetry_breaking_modes.unfold(u)
     mu = scene.unloaded().mu | {"approach": 0.5}
     deep = [
         each.region(State(v, mu), "approach").penetration

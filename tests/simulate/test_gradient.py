@@ -68,7 +68,7 @@ def of_points(scene: Scene, found: object) -> Array:
     assert scene.problem.loads.magnetic
     remanent = scene.problem.loads.magnetic.remanent
     assert isinstance(remanent, ControlledPattern)
-    return remanent.pulled(found.places, found.forces)
+    return remanent.transposed(found.places, found.forces)
 
 
 def solved(scene: Scene) -> Record:

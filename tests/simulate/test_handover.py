@@ -146,8 +146,8 @@ def test_a_sector_follows_the_branch_of_larger_models(name: str) -> None:
         assert found.converged
         assert found.state.mu["pressure"] == pytest.approx(state.mu["pressure"], rel=1e-3)
         counted = record.point.negative_pivots + record.excluded_pivots
-        assert full.model.excluded_modes
-        others = sum(full.model.excluded_modes.counts(found.state))
+        assert full.model.symmetry_breaking_modes
+        others = sum(full.model.symmetry_breaking_modes.counts(found.state))
         assert full.newton.factor_at(found.state).negative_pivots + others in (counted, counted + 1)
 
 
@@ -196,7 +196,7 @@ def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     one, two = old.scene.observe(old.point.state), new.scene.observe(new.point.state)
     for column in ("energy", "volume_change", "w_pole_over_h"):
         assert two[column] == pytest.approx(one[column], rel=3e-4)
-    waves = old.scene.model.excluded_modes.waves
+    waves = old.scene.model.symmetry_breaking_modes.waves
     stiff = abs(nearest_to_zero(waves.factor_at(records[1].point.state, 5))[0])
     assert abs(nearest_to_zero(waves.factor_at(old.point.state, 5))[0]) < 1e-6 * stiff
     lowest = ShellModes(new.scene.model).lowest(new.point.state, 2)

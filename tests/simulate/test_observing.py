@@ -73,7 +73,7 @@ def test_a_strip_rolled_up_in_time() -> None:
     *_, begin, middle, last = follow(scene)
     for record in (last, middle):
         energy = scene.observe(record.point.state)["energy"]
-        stored = scene.stored(record.point.state, energy) - scene.stored(
+        stored = scene.energy_of_shell(record.point.state, energy) - scene.energy_of_shell(
             begin.point.state, energies(scene, [begin])[0]
         )
         clock = record.clock
@@ -175,7 +175,7 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     values = [np.array(part.getValuesCSR()[2]) for part in parts]
     if isinstance(scene.model, MeridianModel):
         values.append(
-            np.array(scene.model.excluded_modes.waves.tangent(state, 2).getValuesCSR()[2])
+            np.array(scene.model.symmetry_breaking_modes.waves.tangent(state, 2).getValuesCSR()[2])
         )
     return [
         shown,

@@ -14,8 +14,8 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.stage import staged
-from magshell_fenicsx.simulate.steps import held_by
+from magshell_fenicsx.simulate.stage import make_stage
+from magshell_fenicsx.simulate.steps import held_conjugates_of_step
 
 HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3}
 SHELL: dict[str, Any] = {
@@ -147,8 +147,8 @@ def test_half_and_full_shell_have_as_many_unstable_directions(name: str) -> None
     sections, targets = KINDS[name]
     meridian, half = (scene_of(**sections, symmetry=each) for each in ("auto", "half"))
     full = scene_of(**sections, symmetry="none") if name in FULL else None
-    assert half.model.excluded_modes is not None
-    (family,) = half.model.excluded_modes.families
+    assert half.model.symmetry_breaking_modes is not None
+    (family,) = half.model.symmetry_breaking_modes.families
     records = list(follow(meridian))
     assert [record.excluded_pivots for record in records if record.label == "target"] == targets
     for record in records:
@@ -172,8 +172,10 @@ def unstable(meridian: Scene, other: Scene, record: Record, state: State) -> int
     """With what the record's step holds."""
     held = {}
     if record.step:
-        held = held_by(meridian, meridian.problem.programme[record.step - 1], record.point.state)
-    stage = staged(other, state, held)
+        held = held_conjugates_of_step(
+            meridian, meridian.problem.programme[record.step - 1], record.point.state
+        )
+    stage = make_stage(other, state, held)
     return stage.newton.factor_at(stage.enter(state)).negative_pivots
 
 

@@ -226,7 +226,7 @@ def test_the_displacement_as_a_function(dome: Dome) -> None:
         R * scene.model.displacement(record.point.state.u, "pole"), abs=1e-8
     )
     assert np.abs(values[np.abs(places[:, 2]) < 1e-9]).max() == 0
-    pushed = R * scene.model.carrier.mesh.comm.allreduce(np.abs(record.point.state.u).max())
+    pushed = R * scene.model.domain.mesh.comm.allreduce(np.abs(record.point.state.u).max())
     assert np.abs(values).max() == pytest.approx(pushed, rel=1e-12)
     *_, traced = ms.trace(scene, "pressure", targets=[0.1])
     assert 0 < np.abs(traced.u.x.array).max() < pushed

@@ -63,17 +63,17 @@ class Meridian:
     @property
     def order(self) -> NDArray[np.int64]:
         """The cells along the parameter."""
-        return np.argsort(self._ends.mean(axis=1))
+        return np.argsort(self._cell_ends.mean(axis=1))
 
     @property
     def cells(self) -> Array:
         """(cells, 2) parameters at the ends of the cells, along it."""
-        return self._ends[self.order]
+        return self._cell_ends[self.order]
 
     @property
     def poles(self) -> Array:
         """The parameters of the points on the axis, in ascending order."""
-        return np.sort(self._at(self.axis))
+        return np.sort(self._parameters_of(self.axis))
 
     @property
     def reach(self) -> float:
@@ -82,25 +82,25 @@ class Meridian:
 
     def parameter(self, end: str) -> float:
         """s there."""
-        return float(self._at(self.ends[end])[0])
+        return float(self._parameters_of(self.ends[end])[0])
 
     def begins(self, end: str) -> bool:
         """Whether the parameter grows from there."""
-        return bool(np.isclose(self._ends.min(axis=1), self.parameter(end)).any())
+        return bool(np.isclose(self._cell_ends.min(axis=1), self.parameter(end)).any())
 
     def facets_at(self, point: str) -> NDArray[np.int32]:
         """The point of the axis at a named place, or next to it."""
-        away = np.abs(self._at(self.axis) - self.points[point][0])
+        away = np.abs(self._parameters_of(self.axis) - self.points[point][0])
         return np.asarray(self.axis[away == away.min(initial=inf)][:1])
 
     @property
     def bodies(self) -> list[NDArray[np.bool_]]:
         """The cells of each shell, or of those that joints connect."""
-        bodies = [*self.patches.values()] or [np.ones(len(self._ends), dtype=bool)]
+        bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
         for both in self.tied:
             begin, end = (
-                self._ends[:, :1] - PARAMETER_TOLERANCE,
-                self._ends[:, 1:] + PARAMETER_TOLERANCE,
+                self._cell_ends[:, :1] - PARAMETER_TOLERANCE,
+                self._cell_ends[:, 1:] + PARAMETER_TOLERANCE,
             )
             at = ((begin < both) & (both < end)).any(axis=1)
             parts = [of for of in bodies if (of & at).any()]
@@ -114,18 +114,18 @@ class Meridian:
         """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a
         T-junction.
         """
-        near = [np.abs(self._ends - one) < PARAMETER_TOLERANCE for one, _ in self.tied]
+        near = [np.abs(self._cell_ends - one) < PARAMETER_TOLERANCE for one, _ in self.tied]
         return [
             1.0 * at[:, 1] - 1.0 * at[:, 0] if one == other else None
             for at, (one, other) in zip(near, self.tied, strict=True)
         ]
 
     @property
-    def _ends(self) -> Array:
+    def _cell_ends(self) -> Array:
         """The same in the order of the cells' numbers."""
         return np.sort(self.mesh.geometry.x[compat.geometry_dofs(self.mesh), 0], axis=1)
 
-    def _at(self, facets: NDArray[np.int32]) -> Array:
+    def _parameters_of(self, facets: NDArray[np.int32]) -> Array:
         """Parameters of facets, of which dolfinx wants one at least."""
         if not len(facets):
             return np.empty(0)

@@ -52,7 +52,7 @@ class WaveHessians:
 
     def __init__(
         self,
-        carrier: IntegrationDomain,
+        domain: IntegrationDomain,
         u: fem.Function,
         energies: Sequence[Energy],
         log: KernelLog,
@@ -62,9 +62,9 @@ class WaveHessians:
         for e in energies:
             places.setdefault(_support_of(e), []).append(e)
         self._sites = [
-            _WaveBatch(carrier, u, batch, at_place, log)
+            _WaveBatch(domain, u, batch, at_place, log)
             for at_place in places.values()
-            for batch in _batches(carrier, at_place[0].density)
+            for batch in _batches(domain, at_place[0].density)
         ]
         nodes = [site.nodes(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
@@ -96,17 +96,17 @@ class _WaveBatch:
 
     def __init__(
         self,
-        carrier: IntegrationDomain,
+        domain: IntegrationDomain,
         u: fem.Function,
         batch: EntityBatch,
         energies: Sequence[Energy],
         log: KernelLog,
     ) -> None:
         self._batch, self._energies, self._log, self._u = batch, energies, log, u
-        self._carrier, self._sides = carrier, range(len(batch.cells))
+        self._domain, self._sides = domain, range(len(batch.cells))
         self._points = points = PointStorage(batch.size)
         sides = len(self._sides)
-        self._at_u, self._at_r0, self._drawn = (
+        self._at_u, self._at_r0, self._at_initial = (
             points.field(PLANE * DERIVATIVES * sides) for _ in range(3)
         )
         self._wave, self._geometry = (
@@ -114,7 +114,11 @@ class _WaveBatch:
             points.field(2 * sides),
         )
         fill(self._geometry, batch.geometry)
-        fixed = [carrier.r0] if carrier.drawn is None else [carrier.r0, carrier.drawn]
+        fixed = (
+            [domain.r0]
+            if domain.initial_placement is None
+            else [domain.r0, domain.initial_placement]
+        )
         self._placed = Memo(self._place, lambda: tuple(field.x.array for field in fixed))
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [
@@ -161,9 +165,9 @@ class _WaveBatch:
         return whole
 
     def _place(self) -> None:
-        fill(self._at_r0, self._derivatives(self._carrier.r0))
-        if self._carrier.drawn is not None:
-            fill(self._drawn, self._derivatives(self._carrier.drawn))
+        fill(self._at_r0, self._derivatives(self._domain.r0))
+        if self._domain.initial_placement is not None:
+            fill(self._at_initial, self._derivatives(self._domain.initial_placement))
 
     @cached_property
     def _kernels(self) -> list[PointKernel]:
@@ -171,7 +175,7 @@ class _WaveBatch:
         both = [wave_jets_of(each, self._m) for each in waves]
         u, r0, drawn = (
             [revolved_jet_of(self._of_sides(field, PLANE, side)) for side in self._sides]
-            for field in (self._at_u, self._at_r0, self._drawn)
+            for field in (self._at_u, self._at_r0, self._at_initial)
         )
         kernels = []
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
@@ -190,10 +194,10 @@ class _WaveBatch:
         return kernels
 
     def _is_drawn(self, e: Energy) -> bool:
-        return e.drawn and self._carrier.drawn is not None
+        return e.from_initial and self._domain.initial_placement is not None
 
     def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
-        """The covector on every side and the width, as of the carrier."""
+        """The covector on every side and the width, as of the domain."""
         density = self._energies[0].density
         if density is None or not density.on_edges:
             return None
@@ -292,13 +296,14 @@ def _perturbed_density(
     edge: tuple[Sequence[Expr], Expr] | None,
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """A density with the Hessian in v, at v = 0, of that at u + v; see `Energy.added`."""
+    """A density with the Hessian in v, at v = 0, of that at u + v; see `Energy.perturbed_form`."""
     more = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:
-        return density.at([r0, more], edge, parameters)
+        return density.value_at([r0, more], edge, parameters)
     less = [a - b for a, b in zip(u, v, strict=True)]
     return (
-        density.at([r0, more, v], edge, parameters) - density.at([r0, less, v], edge, parameters)
+        density.value_at([r0, more, v], edge, parameters)
+        - density.value_at([r0, less, v], edge, parameters)
     ) / 4
 
 
@@ -336,16 +341,16 @@ def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
     return e.density.sides, e.density.quadrature or 0, facets
 
 
-def _batches(carrier: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
+def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
     """The points where a density lives; the geometry of each is the covector and the length of the
     cell, by sides.
     """
-    V = carrier.r0.function_space
+    V = domain.r0.function_space
     topology, lengths = V.mesh.topology, _lengths(V)
     assert density
     if not density.on_edges:
         X, weights = basix.make_quadrature(
-            basix.CellType.interval, density.quadrature or carrier.rule
+            basix.CellType.interval, density.quadrature or domain.rule
         )
         every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
         yield EntityBatch(

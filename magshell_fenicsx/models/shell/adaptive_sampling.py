@@ -54,14 +54,14 @@ class SubCells:
     def __getitem__(self, which: slice | NDArray[np.bool_]) -> "SubCells":
         return SubCells(self.cell[which], self.corner[which], self.sides[which])
 
-    def of(self, cells: Numbers) -> "SubCells":
+    def in_each_cell(self, cells: Numbers) -> "SubCells":
         """The same in each of some cells."""
         times = len(cells)
         numbers = np.repeat(cells, len(self.cell))
         return SubCells(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
 
     @classmethod
-    def together(cls, several: "Sequence[SubCells]") -> "SubCells":
+    def concatenate(cls, several: "Sequence[SubCells]") -> "SubCells":
         return cls(
             *(
                 np.concatenate([getattr(one, name) for one in several])
@@ -69,7 +69,7 @@ class SubCells:
             )
         )
 
-    def pieces(self) -> "list[SubCells]":
+    def batches(self) -> "list[SubCells]":
         """A few at a time."""
         return [self[i : i + BATCH_SIZE] for i in range(0, len(self.cell), BATCH_SIZE)]
 
@@ -108,7 +108,7 @@ class Lattice:
     count: int
 
     @classmethod
-    def of(cls, kind: basix.CellType, count: int) -> "Lattice":
+    def make(cls, kind: basix.CellType, count: int) -> "Lattice":
         """With `count` parts of each side."""
         corners = basix.geometry(kind)
         every = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
@@ -197,8 +197,10 @@ def refine_where_hidden(
         ):
             break
         smaller = parts[again].divided()
-        parts = SubCells.together([parts[~again], smaller])
-        seen = _Samples.together([seen.of(~again), _sample(formulas, smaller, look, lattice)])
+        parts = SubCells.concatenate([parts[~again], smaller])
+        seen = _Samples.concatenate(
+            [seen.select(~again), _sample(formulas, smaller, look, lattice)]
+        )
     away = (size**2).mean(axis=1)
     share = left / max(variation, np.finfo(float).tiny)
     return RefinedParts(
@@ -224,11 +226,11 @@ class _Samples:
     between: Array
     values: Array
 
-    def of(self, which: NDArray[np.bool_]) -> "_Samples":
+    def select(self, which: NDArray[np.bool_]) -> "_Samples":
         return _Samples(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
     @classmethod
-    def together(cls, several: "Sequence[_Samples]") -> "_Samples":
+    def concatenate(cls, several: "Sequence[_Samples]") -> "_Samples":
         return cls(
             *(
                 np.concatenate([getattr(one, name) for one in several])

@@ -34,13 +34,13 @@ class ControlPoints:
     width: float
 
     @property
-    def around(self) -> bool:
+    def is_axisymmetric(self) -> bool:
         """Whether the field turns about e3."""
         return self.places.shape[1] == 2
 
     def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
         """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
-        at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.around else x
+        at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.is_axisymmetric else x
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
         looked = min(FIRST_NEIGHBOURS, count)
         while True:
@@ -70,14 +70,14 @@ class ControlledPattern:
         x = np.asarray(r0.reshape(-1, 3))
         x = x if self.frame is None else x @ self.frame
         vectors: Array = np.asarray(self.controls.weights(x) @ self.values)
-        if self.controls.around:
+        if self.controls.is_axisymmetric:
             rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
             vectors = np.column_stack([vectors[:, :1] * x[:, :2] / rho, vectors[:, 1]])
         return np.asarray(vectors if self.frame is None else vectors @ self.frame.T).reshape(
             r0.shape
         )
 
-    def pulled(self, r0: Array, forces: Array) -> Array:
+    def transposed(self, r0: Array, forces: Array) -> Array:
         """The transposed map: what multiplies each of the values in sum(forces .
 
         B) over places (cells, nodes, 3).
@@ -85,7 +85,7 @@ class ControlledPattern:
         x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:
             x, f = x @ self.frame, f @ self.frame
-        if self.controls.around:
+        if self.controls.is_axisymmetric:
             rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
             f = np.column_stack([np.sum(f[:, :2] * x[:, :2] / rho, axis=1), f[:, 2]])
         return np.asarray(self.controls.weights(x).T @ f)

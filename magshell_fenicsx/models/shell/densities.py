@@ -84,7 +84,7 @@ def normal_moment(
 
 def law_at(law: Law, r0: Jet) -> Law:
     """The law at a place, where that of plies has a direction."""
-    return law.at(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
+    return law.at_point(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

@@ -200,7 +200,7 @@ class Kernel:
             for field in ((r0, u, z) if of_v else (r0, u))
         ]
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
-        W = density.at(
+        W = density.value_at(
             jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters
         )
         if (

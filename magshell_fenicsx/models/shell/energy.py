@@ -34,12 +34,12 @@ class Density:
 
     Attributes
     ----------
-    of
+    function
         On cells of (r0, u, *parameters), per area of the coordinates; on boundary edges of
         (r0, u, m, width, *parameters), see `edges`; on interior edges the same with pairs of
         jets and covectors.
     parameters
-        Numbers, or fields that vary over the surface; `of` takes a field on interior edges as a
+        Numbers, or fields that vary over the surface; `function` takes a field on interior edges as a
         pair.
     parts
         The parts of the displacement's jet that it depends on.
@@ -54,11 +54,11 @@ class Density:
         cells.
     quadrature
         Degree of its rule on cells; None for `cell_quadrature`.
-    still
+    reference_parts
         Further parts of the placement's jet alone.
     """
 
-    of: Callable[..., Expr]
+    function: Callable[..., Expr]
     parameters: tuple[Parameter, ...]
     parts: tuple[str, ...] = FIRST_DERIVATIVES
     linear: tuple[str, ...] = ()
@@ -66,18 +66,18 @@ class Density:
     sides: int = 1
     work: Callable[..., Expr] | None = None
     quadrature: int | None = None
-    still: tuple[str, ...] = ()
+    reference_parts: tuple[str, ...] = ()
 
     @property
     def jet_parts(self) -> tuple[str, ...]:
         """All that must be known of jets."""
-        return *self.parts, *self.still
+        return *self.parts, *self.reference_parts
 
     @property
     def on_edges(self) -> bool:
         return self.facets is not None or self.sides == 2
 
-    def at(
+    def value_at(
         self,
         jets: Sequence[Sequence[Jet]],
         edge: tuple[Sequence[Expr], Expr] | None,
@@ -101,7 +101,7 @@ class Density:
         fields = [
             _halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters
         ]
-        of = self.work if self.work and len(jets) == 3 else self.of
+        of = self.work if self.work and len(jets) == 3 else self.function
         return of(*sided, *(edge[1:] if edge else ()), *fields)
 
 

@@ -84,12 +84,12 @@ class FastTangent:
         V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
         self._u, self._sites, self._nodes = u, sites, V.dofmap.list
         self._moving = moving[0] if moving else None
-        self._near = moving[1] if moving else ()
+        self._moving_sites = moving[1] if moving else ()
         self._matrix = BlockMatrix(
             V, [batch.cells for site in sites for batch in site.coupling], clamped
         )
         cells, functions = V.dofmap.list.shape
-        self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
+        self._element_matrices = np.empty((cells, 9, functions * (functions + 1) // 2))
 
     def tangent(self, factors: Mapping[str, float], stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         """The assembled matrix, at the present u; it is reused by the next call. Collective.
@@ -100,15 +100,15 @@ class FastTangent:
             Displacements, ghosts included, with weights: the sum of their membrane strains makes
             the membrane stress in place of the present strain.
         """
-        self._same[:] = 0
+        self._element_matrices[:] = 0
         self._matrix.clear()
         first = 0
         for site in self._sites:
             if stress and isinstance(site, HessianIntegral):
                 site.replace_strain(self._u.x.array, stress, self._moving)
-            site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
+            site.add(self._u.x.array, factors, self._element_matrices, partial(self._couple, first))
             first += len(site.coupling)
-        self._matrix.add_cells(self._same)
+        self._matrix.add_cells(self._element_matrices)
         return self._matrix.assemble()
 
     def times(self, v: Array, factors: Mapping[str, float]) -> Array:
@@ -116,8 +116,8 @@ class FastTangent:
         nodes move.
         """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
-        same = np.zeros(self._same.shape)
-        for site in self._near:
+        same = np.zeros(self._element_matrices.shape)
+        for site in self._moving_sites:
 
             def couple(batch: int, K: Array, site: ElementIntegral = site) -> None:
                 first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)

@@ -74,7 +74,9 @@ class CellGeometry:
     def dimension(self) -> int:
         return {INTERVAL: 1, TRIANGLE: 2}.get(self.element.cell_type, 3)
 
-    def at(self, X: Array, cells: Numbers | slice = slice(None)) -> tuple[Array, Array, Array]:
+    def evaluate(
+        self, X: Array, cells: Numbers | slice = slice(None)
+    ) -> tuple[Array, Array, Array]:
         """Places and normals (cells, n, 3), and length or area over that of the reference cell
         (cells, n).
 
@@ -95,7 +97,7 @@ class CellGeometry:
         size = np.linalg.norm(m, axis=-1)
         return x, m / size[..., None], size
 
-    def sum(self, of_cells: Array) -> Array:
+    def sum_over_ranks(self, of_cells: Array) -> Array:
         """The sum over the cells of all ranks; collective."""
         return np.asarray(self.comm.allreduce(of_cells[: self.owned].sum(axis=0)))
 
@@ -157,12 +159,12 @@ def project_formula(
     """
     d, parts = cells.dimension, _uniform_parts(cells)
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
-    x, normals, area = cells.at(X)
+    x, normals, area = cells.evaluate(X)
     f = values(x, normals)
     off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
     magnitude, area = np.linalg.norm(f, axis=-1), area * w
     square_of = (area * magnitude**2).sum(axis=1)
-    sums = cells.sum(
+    sums = cells.sum_over_ranks(
         np.stack([*((area * v).sum(axis=1) for v in (magnitude, off)), square_of], axis=-1)
     )
     size, differs, square = map(float, sums)
@@ -170,10 +172,10 @@ def project_formula(
     narrow = (
         _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
         if formulas
-        else _HiddenDetail.nothing(len(scale))
+        else _HiddenDetail.none(len(scale))
     )
     hidden = scale * narrow.hidden
-    more = float(cells.sum(hidden))
+    more = float(cells.sum_over_ranks(hidden))
     size += more
     if not (
         differs + more > INTERPOLATION_TOLERANCE * size
@@ -184,7 +186,7 @@ def project_formula(
     chosen = np.flatnonzero(
         (off @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum()) | (hidden > PART_TOLERANCE * size)
     )
-    ahead = narrow.parts(chosen, parts)
+    ahead = narrow.parts_of(chosen, parts)
     space = basix.create_element(
         basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
     )
@@ -197,7 +199,7 @@ def project_formula(
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
     unshown, lost = np.zeros(len(scale)), squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
     unshown[chosen] = scale[chosen] * np.maximum(lost, 0.0)
-    size, rest = float(cells.sum(sizes)), float(cells.sum(unshown))
+    size, rest = float(cells.sum_over_ranks(sizes)), float(cells.sum_over_ranks(unshown))
     side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
     widest = cells.comm.allreduce(
         float(side[unshown > VISIBLE_SHARE * rest].max(initial=0.0)), MPI.MAX
@@ -212,7 +214,7 @@ def project_formula(
     new[chosen] = at_nodes
     nothing = np.finfo(float).tiny  # a formula that is zero but on a line
     square_of[chosen] = scale[chosen] * squares
-    share = float(np.sqrt(rest / max(square, float(cells.sum(square_of)), nothing)))
+    share = float(np.sqrt(rest / max(square, float(cells.sum_over_ranks(square_of)), nothing)))
     return ProjectedFormula(
         new, False, size, missed / max(size, nothing), share, widest, narrow.open
     )
@@ -257,15 +259,15 @@ class _HiddenDetail:
     open: float
 
     @classmethod
-    def nothing(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_HiddenDetail":
+    def none(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_HiddenDetail":
         none = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
         return cls(np.zeros(cells), variation, none, np.zeros(cells, bool), open_)
 
-    def parts(self, chosen: Numbers, alike: SubCells) -> SubCells:
+    def parts_of(self, chosen: Numbers, alike: SubCells) -> SubCells:
         """Of some cells: those that are alike, but of the divided ones the leaves, none larger."""
         deep = self.deep[chosen]
         if not deep.any():
-            return alike.of(chosen)
+            return alike.in_each_cell(chosen)
         parts, largest = (
             self.leaves[np.isin(self.leaves.cell, chosen)],
             1.001 * np.abs(alike.sides[0, 0]),
@@ -275,7 +277,7 @@ class _HiddenDetail:
             small.append(parts[~wide])
             parts = parts[wide].divided()
             wide = np.abs(parts.sides[:, 0]) > largest
-        return SubCells.together([alike.of(chosen[~deep]), *small, parts])
+        return SubCells.concatenate([alike.in_each_cell(chosen[~deep]), *small, parts])
 
 
 def _find_hidden_detail(
@@ -286,7 +288,7 @@ def _find_hidden_detail(
     """
     d, kind = cells.dimension, cells.element.cell_type
     lattice, (points, weights) = (
-        Lattice.of(kind, LATTICE_DIVISIONS[d]),
+        Lattice.make(kind, LATTICE_DIVISIONS[d]),
         basix.make_quadrature(kind, RULE_DEGREE[d]),
     )
 
@@ -294,10 +296,10 @@ def _find_hidden_detail(
         X, w = parts.rule(
             lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places))
         )
-        x, _, area = cells.at(X, parts.cell)
+        x, _, area = cells.evaluate(X, parts.cell)
         return x, (area * w).sum(axis=1)
 
-    first = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(
+    first = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).in_each_cell(
         np.arange(len(cells.nodal))
     )
     seen = refine_where_hidden(formulas, first, look, lattice, cells.owned, cells.comm)
@@ -305,13 +307,13 @@ def _find_hidden_detail(
     divided = np.abs(seen.parts.sides[:, 0]) < 1
     deep[seen.parts.cell[divided]] = True
     fine, parts = np.where(deep[:, None], 0.0, coarse), seen.parts[divided]
-    for some in parts.pieces():
+    for some in parts.batches():
         X, w = some.rule(points, weights)
-        x, normals, _ = cells.at(X, some.cell)
+        x, normals, _ = cells.evaluate(X, some.cell)
         np.add.at(fine, some.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     hidden = np.linalg.norm(fine - coarse, axis=1)
-    if not cells.sum(hidden) > 0:
-        return _HiddenDetail.nothing(len(hidden), seen.variation, seen.open)
+    if not cells.sum_over_ranks(hidden) > 0:
+        return _HiddenDetail.none(len(hidden), seen.variation, seen.open)
     return _HiddenDetail(hidden, seen.variation, parts, deep, seen.open)
 
 
@@ -336,7 +338,7 @@ def _moments(
 
     def evaluated(some: SubCells) -> tuple[Array, Array, Array, Array]:
         X, w = some.rule(points, weights)
-        x, normals, area = cells.at(X, some.cell)
+        x, normals, area = cells.evaluate(X, some.cell)
         return X, w, area * w, values(x, normals)
 
     def integrals(w: Array, f: Array) -> Array:
@@ -349,11 +351,11 @@ def _moments(
         0.0,
         len(CHILDREN[cells.dimension]),
     )
-    whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
+    whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.batches())]
     for depth in range(MAX_DIVISIONS + 1):
         last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(ahead.cell)) > MAX_PARTS
         rest, left = list[SubCells](), list[Array]()
-        for now, before in zip(ahead.pieces(), whole, strict=True):
+        for now, before in zip(ahead.batches(), whole, strict=True):
             smaller = now.divided()
             X, w, area, f = evaluated(smaller)
             fine = integrals(w, f)
@@ -375,7 +377,7 @@ def _moments(
                 np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
             left.append(fine[~kept])
-        ahead = SubCells.together(rest) if rest else ahead
+        ahead = SubCells.concatenate(rest) if rest else ahead
         if not cells.comm.allreduce(len(ahead.cell)):
             break
         together = np.concatenate([np.empty((0, components)), *left])

@@ -89,7 +89,7 @@ class PointGradient:
         self._u, placement, place = (
             points.field(size) for size in (self._size, self._size, geometry.shape[1])
         )
-        self._given = [
+        self._inputs = [
             _KernelInput(placement, r0),
             _KernelInput(place, Memo(lambda: geometry, tuple)),
         ]
@@ -97,7 +97,7 @@ class PointGradient:
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
-            self._given += [
+            self._inputs += [
                 _KernelInput(target, _field_values(field, values)) for target, field in varying
             ]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
@@ -134,11 +134,11 @@ class PointGradient:
         """The points that are treated together, to be evaluated one after the other with what is
         given now.
         """
-        for given in self._given:
+        for given in self._inputs:
             given.values.renew()
         return self._chunks
 
-    def room(self, chunk: slice) -> Array:
+    def input_array(self, chunk: slice) -> Array:
         """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts *
         3).
         """
@@ -149,7 +149,7 @@ class PointGradient:
         """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by
         the next call.
         """
-        for given in self._given:
+        for given in self._inputs:
             given.fill(chunk)
         return self._points.evaluate(kernel, chunk.stop - chunk.start)
 
@@ -160,7 +160,7 @@ class _KernelInput:
 
     Attributes
     ----------
-    room
+    field
         Of the points of a chunk.
     values
         At all points.
@@ -168,14 +168,14 @@ class _KernelInput:
         The chunk whose values the room has, and their version.
     """
 
-    room: fem.Function
+    field: fem.Function
     values: Memo[Array]
     filled: tuple[slice, int] | None = None
 
     def fill(self, chunk: slice) -> None:
         """Have the latest values of a chunk in the room."""
         if self.filled != (chunk, self.values.version):
-            fill(self.room, self.values.latest[chunk])
+            fill(self.field, self.values.latest[chunk])
             self.filled = chunk, self.values.version
 
 
@@ -214,10 +214,10 @@ def _energy(
         for f in fields[1:]
     ]
     if not density.on_edges:
-        return frames[0][-1] * density.at([r0_jets, *others], None, parameters)
+        return frames[0][-1] * density.value_at([r0_jets, *others], None, parameters)
     first = FRAME_SIZE * density.sides
     m = [ufl.as_vector([place[first + 2 * side], place[first + 2 * side + 1]]) for side in sides]
-    return density.at([r0_jets, *others], (m, place[first + 2 * density.sides]), parameters)
+    return density.value_at([r0_jets, *others], (m, place[first + 2 * density.sides]), parameters)
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:

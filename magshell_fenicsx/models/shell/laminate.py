@@ -97,7 +97,7 @@ class Laminated(Law):
     meridian
         Whether the angle 0 is along the meridians of `axis`.
     direction
-        Components, with index down, of the angle 0 at a point, of any length; see `at`.
+        Components, with index down, of the angle 0 at a point, of any length; see `at_point`.
     """
 
     A: Stiffness = field(default=(), kw_only=True)
@@ -109,7 +109,7 @@ class Laminated(Law):
     direction: tuple[Scalar, Scalar] = field(default=(1.0, 0.0), kw_only=True)
 
     @classmethod
-    def of(cls, laminate: Laminate, h: float, nu: float) -> Self:
+    def from_laminate(cls, laminate: Laminate, h: float, nu: float) -> Self:
         """That of plies."""
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
         along, meridian = laminate.direction, laminate.direction is None
@@ -126,10 +126,10 @@ class Laminated(Law):
         return replace(self, t=1, e=1, **dict(zip(names, numbers, strict=True)))
 
     @property
-    def by_place(self) -> bool:
+    def depends_on_place(self) -> bool:
         return self.meridian
 
-    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+    def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
         def dot(v: Any, a: Any) -> Scalar:
             return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
 
@@ -152,28 +152,28 @@ class Laminated(Law):
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
-        return frame.raised(self.e * self.t, _stress(self.A, frame.strain(E)))
+        return frame.components_up(self.e * self.t, _stress(self.A, frame.strain_components(E)))
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         frame = _Frame(self.direction, up)
-        stretched, bent = frame.strain(E), frame.strain(K)
+        stretched, bent = frame.strain_components(E), frame.strain_components(K)
         own, coupled = _work(_stress(self.D, bent), bent), _work(_stress(self.B, bent), stretched)
         return self._of_D / 2 * own - self._of_B * coupled
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
-        return frame.raised(1, self._moment(frame, E, K))
+        return frame.components_up(1, self._moment(frame, E, K))
 
     def edge_moment(
         self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
     ) -> Scalar:
         frame = _Frame(self.direction, up)
-        return _work(self._moment(frame, E, K), frame.twice(across))
+        return _work(self._moment(frame, E, K), frame.product(across))
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
     ) -> Scalar:
-        bent = _Frame(self.direction, up).twice(across)
+        bent = _Frame(self.direction, up).product(across)
         return self._of_D * _work(_stress(self.D, bent), bent)
 
     @property
@@ -185,7 +185,10 @@ class Laminated(Law):
         return self.e * self.h**2 * self.t**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
-        of_D, of_B = _stress(self.D, frame.strain(K)), _stress(self.B, frame.strain(E))
+        of_D, of_B = (
+            _stress(self.D, frame.strain_components(K)),
+            _stress(self.B, frame.strain_components(E)),
+        )
         M1, M2, M6 = (self._of_D * d - self._of_B * b for d, b in zip(of_D, of_B, strict=True))
         return M1, M2, M6
 
@@ -201,7 +204,7 @@ class _Frame:
         self.t1 = raised[0] * over, raised[1] * over
         self.t2 = -(det**0.5) * c2 * over, det**0.5 * c1 * over
 
-    def strain(self, S: Tensor) -> Triple:
+    def strain_components(self, S: Tensor) -> Triple:
         """S_11, S_22 and 2 S_12 of a tensor with indices down."""
 
         def along(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
@@ -210,13 +213,13 @@ class _Frame:
 
         return along(self.t1, self.t1), along(self.t2, self.t2), 2 * along(self.t1, self.t2)
 
-    def twice(self, across: tuple[Scalar, Scalar]) -> Triple:
+    def product(self, across: tuple[Scalar, Scalar]) -> Triple:
         """The same of c c, where the covector c has these components with index up."""
         c = lower_index(across, self._up)
         one, two = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return one**2, two**2, 2 * one * two
 
-    def raised(self, factor: Scalar, S: Triple) -> Components:
+    def components_up(self, factor: Scalar, S: Triple) -> Components:
         """A factor times a stress S_11, S_22, S_12 as components with indices up."""
         (a1, a2), (b1, b2), (S1, S2, S6) = self.t1, self.t2, S
         S11 = S1 * a1**2 + S2 * b1**2 + 2 * S6 * a1 * b1

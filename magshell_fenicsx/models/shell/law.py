@@ -42,7 +42,7 @@ class Law(ABC):
         What multiplies Young's modulus.
     thins
         1 where the thickness follows from the area, so that the volume stays; else 0.
-    by_place
+    depends_on_place
         Whether directions depend on the place itself.
     """
 
@@ -56,7 +56,7 @@ class Law(ABC):
         return 0
 
     @property
-    def some_thin(self) -> bool:
+    def thins_somewhere(self) -> bool:
         """Whether it does so anywhere."""
         return bool(self.thins)
 
@@ -70,10 +70,10 @@ class Law(ABC):
         return type(self)(*numbers)
 
     @property
-    def by_place(self) -> bool:
+    def depends_on_place(self) -> bool:
         return False
 
-    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+    def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
         """The law at an undeformed place (..., 3) with these tangents and a normal of any length:
         of directions.
         """
@@ -83,7 +83,7 @@ class Law(ABC):
         """That of a shell so many times as thick."""
         return replace(self, t=factor * self.t)
 
-    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
         """The law with Young's modulus times e, with another Poisson's ratio where the law has one, and of several laws
         the one with this number."""
         return replace(self, e=e * self.e)
@@ -155,7 +155,7 @@ class Koiter(Law):
     def nu(self) -> Scalar:
         return self.number
 
-    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> "Koiter":
+    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> "Koiter":
         return replace(self, e=e * self.e, number=nu)
 
     @property
@@ -214,12 +214,12 @@ class LawByShell(Law):
     ----------
     laws
         At least two, with the same h.
-    which
+    shell_number
         The number of the law at a place.
     """
 
     laws: tuple[Law, ...] = field(default=(), kw_only=True)
-    which: Scalar = field(default=0, kw_only=True)
+    shell_number: Scalar = field(default=0, kw_only=True)
 
     @property
     def numbers(self) -> tuple[Any, ...]:
@@ -235,31 +235,33 @@ class LawByShell(Law):
 
     @property
     def thins(self) -> Scalar:
-        return self._there([law.thins for law in self.laws])
+        return self._value_at_place([law.thins for law in self.laws])
 
     @property
-    def some_thin(self) -> bool:
-        return any(law.some_thin for law in self.laws)
+    def thins_somewhere(self) -> bool:
+        return any(law.thins_somewhere for law in self.laws)
 
     @property
-    def by_place(self) -> bool:
-        return any(law.by_place for law in self.laws)
+    def depends_on_place(self) -> bool:
+        return any(law.depends_on_place for law in self.laws)
 
-    def at(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        return self._each(lambda law: law.at(r, a1, a2, n))
+    def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+        return self._with_each_law(lambda law: law.at_point(r, a1, a2, n))
 
     def thicker(self, factor: Scalar) -> Self:
-        return self._each(lambda law: law.thicker(factor))
+        return self._with_each_law(lambda law: law.thicker(factor))
 
-    def made_of(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
-        return replace(self._each(lambda law: law.made_of(e, nu)), which=which)
+    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+        return replace(
+            self._with_each_law(lambda law: law.with_material(e, nu)), shell_number=which
+        )
 
     @property
     def linear(self) -> "LawByShell":
         return (
             self
             if all(law.linear is law for law in self.laws)
-            else self._each(lambda law: law.linear)
+            else self._with_each_law(lambda law: law.linear)
         )
 
     @property
@@ -267,44 +269,48 @@ class LawByShell(Law):
         return self.laws[0].bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        return self._there([law.membrane(E, up) for law in self.laws])
+        return self._value_at_place([law.membrane(E, up) for law in self.laws])
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        return self._there([law.bending(E, K, up) for law in self.laws])
+        return self._value_at_place([law.bending(E, K, up) for law in self.laws])
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         S11, S12, S22 = map(
-            self._there, zip(*(law.stress(E, up) for law in self.laws), strict=True)
+            self._value_at_place, zip(*(law.stress(E, up) for law in self.laws), strict=True)
         )
         return S11, S12, S22
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         M11, M12, M22 = map(
-            self._there, zip(*(law.moment(E, K, up) for law in self.laws), strict=True)
+            self._value_at_place, zip(*(law.moment(E, K, up) for law in self.laws), strict=True)
         )
         return M11, M12, M22
 
     def edge_moment(
         self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
     ) -> Scalar:
-        return self._there([law.edge_moment(E, K, up, across, square) for law in self.laws])
+        return self._value_at_place(
+            [law.edge_moment(E, K, up, across, square) for law in self.laws]
+        )
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
     ) -> Scalar:
-        return self._there([law.edge_stiffness(E, up, across, square) for law in self.laws])
+        return self._value_at_place(
+            [law.edge_stiffness(E, up, across, square) for law in self.laws]
+        )
 
-    def _each(self, change: Callable[[Law], Law]) -> Self:
+    def _with_each_law(self, change: Callable[[Law], Law]) -> Self:
         return replace(self, laws=tuple(change(law) for law in self.laws))
 
-    def _there(self, values: Sequence[Scalar]) -> Scalar:
+    def _value_at_place(self, values: Sequence[Scalar]) -> Scalar:
         """Of one value of each law that of the law at a place."""
         chosen = values[0]
         for i, value in enumerate(values[1:]):
-            if isinstance(self.which, Expr):
-                chosen = ufl.conditional(ufl.gt(self.which, i + 0.5), value, chosen)
+            if isinstance(self.shell_number, Expr):
+                chosen = ufl.conditional(ufl.gt(self.shell_number, i + 0.5), value, chosen)
             else:
-                chosen = np.where(np.asarray(self.which) > i + 0.5, value, chosen)
+                chosen = np.where(np.asarray(self.shell_number) > i + 0.5, value, chosen)
         return chosen
 
 
@@ -344,12 +350,12 @@ def work(S: Components, T: Tensor) -> Scalar:
 
 
 def elastic_density(
-    density: Density, law: Law, t: Parameter | None = None, made_of: Parameter | None = None
+    density: Density, law: Law, t: Parameter | None = None, cell_materials: Parameter | None = None
 ) -> Density:
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
     The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1.
-    `made_of` (4,) is `OwnMaterial.numbers`; None for one material.
+    `cell_materials` (4,) is `OwnMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
@@ -357,7 +363,7 @@ def elastic_density(
 
     def of(*arguments: Expr, **keywords: Any) -> Expr:
         given, factors, materials = list(arguments), [1] * density.sides, None
-        if made_of is not None:
+        if cell_materials is not None:
             materials = by_side(given.pop())
         if t is not None:
             factors = [factor[0] for factor in by_side(given.pop())]
@@ -365,15 +371,18 @@ def elastic_density(
         laws = [law.with_numbers(*given[count:]).thicker(factor) for factor in factors]
         if materials is not None:
             laws = [
-                of_side.made_of(own[0], own[1], own[3])
+                of_side.with_material(own[0], own[1], own[3])
                 for of_side, own in zip(laws, materials, strict=True)
             ]
-        return density.of(
+        return density.function(
             *given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords
         )
 
-    fields = (field for field in (t, made_of) if field is not None)
+    fields = (field for field in (t, cell_materials) if field is not None)
     parameters = (*density.parameters, *law.numbers, *fields)
     return replace(
-        density, of=of, parameters=parameters, still=("r",) if law.by_place else density.still
+        density,
+        function=of,
+        parameters=parameters,
+        reference_parts=("r",) if law.depends_on_place else density.reference_parts,
     )

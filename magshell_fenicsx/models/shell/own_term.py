@@ -171,7 +171,7 @@ class OwnTerm:
             raise ValueError(f"{self.name}: on: {self.on!r}: must be the name of one edge")
         if not self.densities:
             raise ValueError(f"{self.name}: has neither a density nor anything that it observes")
-        if self.density is None and (self.free or self.value):
+        if self.density is None and (self.free_parameters or self.value):
             raise ValueError(
                 f"{self.name}: only observes: a value or a Free parameter needs a density"
             )
@@ -179,7 +179,7 @@ class OwnTerm:
             raise ValueError(
                 f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}"
             )
-        if strangers := self._strangers():
+        if strangers := self._foreign_terminals():
             raise ValueError(
                 f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
                 "The position is r0.r, a number that is the same everywhere goes into the parameters"
@@ -197,7 +197,7 @@ class OwnTerm:
                 f"{self.name}: a density is that of a volume or that of an edge, not both"
             )
         self._refuse_coordinates()
-        bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
+        bent = {*self.parts, *self._parts_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(
                 f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}"
@@ -211,19 +211,19 @@ class OwnTerm:
     @cached_property
     def parts(self) -> tuple[str, ...]:
         """The parts of the displacement's jet that the density depends on."""
-        return self._found_in(self._symbolic.u)
+        return self._parts_in(self._symbolic.u)
 
     @cached_property
-    def placed_parts(self) -> tuple[str, ...]:
+    def placement_parts(self) -> tuple[str, ...]:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
         return tuple(
             name
             for name in ("r", *ALL_DERIVATIVES)
-            if name in (*FIRST_DERIVATIVES, *self._found_in(self._symbolic.r0))
+            if name in (*FIRST_DERIVATIVES, *self._parts_in(self._symbolic.r0))
         )
 
     @property
-    def free(self) -> tuple[Free, ...]:
+    def free_parameters(self) -> tuple[Free, ...]:
         """Its parameters that are amplitudes."""
         return tuple(p for p in self.parameters if isinstance(p, Free))
 
@@ -233,7 +233,7 @@ class OwnTerm:
         return any(isinstance(p, UserField | ufl.Coefficient) for p in self.parameters)
 
     @property
-    def by_place(self) -> tuple[FormulaParameter, ...]:
+    def formula_parameters(self) -> tuple[FormulaParameter, ...]:
         """Its parameters that are formulas of the place."""
         return tuple(p for p in self.parameters if isinstance(p, FormulaParameter))
 
@@ -255,7 +255,7 @@ class OwnTerm:
 
     def turned(self, angle: float) -> OwnTerm:
         """The same in a frame that is turned about e3 (rad)."""
-        if not angle or (self.turns and not self.by_place):
+        if not angle or (self.turns and not self.formula_parameters):
             return self
 
         def back(v: Expr, about: Expr) -> Expr:
@@ -328,7 +328,7 @@ class OwnTerm:
 
         samples = enumerate(_random_samples(), 1)
         return not self.varying and all(
-            self._same((r0, u, m), (turned(r0, a), turned(u, a), m)) for a, (r0, u, m) in samples
+            self._is_same((r0, u, m), (turned(r0, a), turned(u, a), m)) for a, (r0, u, m) in samples
         )
 
     def mirrored(self, mirror: Mirror) -> bool:
@@ -351,14 +351,16 @@ class OwnTerm:
 
         if self.on is not None and mirror.image_of_edge(self.on) != self.on:
             return False
-        return all(self._same(sample, image(*sample)) for sample in _random_samples())
+        return all(self._is_same(sample, image(*sample)) for sample in _random_samples())
 
     def leaves(self, outline: Outline) -> SymmetryConstraint:
         """The symmetry that it leaves."""
-        turns = self.turns and all(p.turns(outline) for p in self.by_place)
+        turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 
         def mirrors(mirror: Mirror) -> bool:
-            return self.mirrored(mirror) and all(p.mirrored(mirror, outline) for p in self.by_place)
+            return self.mirrored(mirror) and all(
+                p.mirrored(mirror, outline) for p in self.formula_parameters
+            )
 
         shared, name = (
             self.mirrored(Y0_PLANE) and turns,
@@ -376,11 +378,11 @@ class OwnTerm:
             for density in self.densities
             for sample in _random_samples()
         ]
-        free = [(p.name, p.value) for p in self.free]
+        free = [(p.name, p.value) for p in self.free_parameters]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
         text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, UserField))
-        text += "".join(f" {p.text}" for p in self.by_place)
+        text += "".join(f" {p.text}" for p in self.formula_parameters)
         text += "" if self.on is None else f" on {self.on}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -399,7 +401,7 @@ class OwnTerm:
             ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,)))
         )
         try:
-            return Symbolic(self._at(r0, u, m, self.densities[0]), r0, u, m)
+            return Symbolic(self._expression(r0, u, m, self.densities[0]), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
             said = f"{type(e).__name__}: {e}"
             taken = "r0, u" if self.on is None else "r0, u, an edge"
@@ -409,7 +411,7 @@ class OwnTerm:
                 "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
             ) from e
 
-    def _strangers(self) -> list[Expr]:
+    def _foreign_terminals(self) -> list[Expr]:
         """What else is in the density: fields, constants and coordinates of some mesh."""
         W, r0, u, m = self._symbolic
         arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
@@ -446,7 +448,7 @@ class OwnTerm:
                         "and derivatives along an edge by edge.by_outward and edge.by_length"
                     )
 
-    def _found_in(self, jet: Jet) -> tuple[str, ...]:
+    def _parts_in(self, jet: Jet) -> tuple[str, ...]:
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(
             name
@@ -458,12 +460,12 @@ class OwnTerm:
         """What its densities take after the jets."""
         return () if self.on is None else (Edge.of(r0, m),)
 
-    def _at(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
+    def _expression(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
         return ufl.as_ufl(
             density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters))
         )
 
-    def _same(self, *samples: Sample) -> bool:
+    def _is_same(self, *samples: Sample) -> bool:
         """Whether the density, and each that is observed, is the same at two samples."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
@@ -478,7 +480,9 @@ class OwnTerm:
         r0, u, m = sample
         try:
             lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering
-            return float(lowered(self._at(_as_jet(r0), _as_jet(u), _as_expression(m), density))(()))
+            return float(
+                lowered(self._expression(_as_jet(r0), _as_jet(u), _as_expression(m), density))(())
+            )
         except (ArithmeticError, TypeError, ValueError):
             return np.nan
 

@@ -74,14 +74,14 @@ class Material:
                 LawByShell(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
             )
         if self.laminate:
-            return Laminated.of(self.laminate, self.h, self.nu)
+            return Laminated.from_laminate(self.laminate, self.h, self.nu)
         if isinstance(self.rubber, tuple):
             mu, alpha = self.rubber
             return Ogden(self.h, 0.0, mu=mu, alpha=alpha)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property
-    def every_laminate(self) -> dict[str, Laminate]:
+    def laminate_by_shell(self) -> dict[str, Laminate]:
         """Name of a shell -> its plies; the name is empty where there is one."""
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
@@ -92,7 +92,7 @@ class Material:
         if cells is None:
             return self.law
         e, nu, _, which = np.moveaxis(cells[:, None], -1, 0)
-        return self.law.made_of(e, nu, which)
+        return self.law.with_material(e, nu, which)
 
     @property
     def bending_stiffness(self) -> float:

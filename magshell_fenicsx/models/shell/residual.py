@@ -193,7 +193,7 @@ class _CellTerms:
         each = len(self._weights)
         for chunk in self._points.chunks():
             cells = slice(chunk.start // each, chunk.stop // each)
-            self._sheet.at_points(nodal[cells], self._points.room(chunk))
+            self._sheet.at_points(nodal[cells], self._points.input_array(chunk))
             yield chunk, cells
 
 
@@ -283,7 +283,7 @@ class _EdgeTerms:
                 self._there,
                 numbers,
                 axis=0,
-                out=points.room(chunk).reshape(len(numbers), -1),
+                out=points.input_array(chunk).reshape(len(numbers), -1),
                 mode="clip",
             )
             yield numbers, points.evaluate(chunk, kernel)
@@ -392,6 +392,6 @@ def derivative_by(density: Density, p: fem.Constant) -> Density:
         positions = [first + i for i, q in enumerate(density.parameters) if q is p]
         variable = ufl.variable(arguments[positions[0]])
         given = [variable if i in positions else argument for i, argument in enumerate(arguments)]
-        return ufl.algorithms.expand_derivatives(ufl.diff(density.of(*given), variable))
+        return ufl.algorithms.expand_derivatives(ufl.diff(density.function(*given), variable))
 
-    return replace(density, of=of, work=None, linear=())
+    return replace(density, function=of, work=None, linear=())

@@ -39,7 +39,7 @@ InsideRim = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether the
 
 
 class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
-    """A field that follows from the placement; `again` makes it from another one, which may jump
+    """A field that follows from the placement; `rebuild` makes it from another one, which may jump
     from cell to cell.
     """
 
@@ -47,7 +47,7 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
         self, V: fem.FunctionSpace, name: str, again: Callable[[fem.Function], fem.Function]
     ) -> None:
         super().__init__(V, name=name)
-        self.again = again
+        self.rebuild = again
 
 
 def radial(r0: Array, n0: Array) -> Array:
@@ -156,30 +156,33 @@ class CellPolynomials:
     Attributes
     ----------
     values
-        (cells, nodes, size) at the nodes of the element `of`.
+        (cells, nodes, size) at the nodes of the element `element`.
     cells
         With their places.
     """
 
     values: Array
-    of: Element
+    element: Element
     cells: CellGeometry
 
     def __call__(self, r0: Array, n0: Array | None = None) -> Array:
-        table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[
-            0, :, :, 0
-        ]
+        table = self.element.tabulate(
+            0, self._reference(r0[0]) if len(r0) else self.element.points
+        )[0, :, :, 0]
         return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
 
-    def between(self) -> tuple[Array, Array]:
+    def values_between_nodes(self) -> tuple[Array, Array]:
         """Values (cells, n, size) and places (cells, n, 3) in own cells at its nodes, and between
         them.
         """
         X = basix.create_lattice(
-            self.of.cell_type, 2 * max(self.of.degree, 1), basix.LatticeType.equispaced, True
+            self.element.cell_type,
+            2 * max(self.element.degree, 1),
+            basix.LatticeType.equispaced,
+            True,
         )
         at, drawn = (
-            element.tabulate(0, X)[0, :, :, 0] for element in (self.of, self.cells.element)
+            element.tabulate(0, X)[0, :, :, 0] for element in (self.element, self.cells.element)
         )
         owned = slice(self.cells.owned)
         return np.matmul(at, self.values[owned]), np.matmul(drawn, self.cells.nodal[owned])
@@ -318,7 +321,7 @@ def pattern_on_edge(
     """
     V = r0.function_space
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
-    field.again = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
+    field.rebuild = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
     Q, topology = field.function_space, V.mesh.topology
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
@@ -346,7 +349,7 @@ def pattern_on_edge(
     )
     owned = int(np.sum(facets < topology.index_map(1).size_local))
     edge = CellGeometry(line, nodal, owned, V.mesh.comm)
-    x, normals, _ = edge.at(along.points)
+    x, normals, _ = edge.evaluate(along.points)
     fit = project_pattern(pattern, edge, pattern(inside_cells(x), normals), along)
     nodes = element.points
     near = [

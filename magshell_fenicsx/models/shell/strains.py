@@ -48,7 +48,7 @@ class TangentFrame:
     area: Array
 
     @classmethod
-    def of(cls, jet: Array) -> "TangentFrame":
+    def from_jet(cls, jet: Array) -> "TangentFrame":
         """The frame whose first vector is along r0,_1."""
         m, area = _area_vector(jet)
         n0 = m / area[..., None]
@@ -90,7 +90,7 @@ class TangentFrame:
 
         The stretch s of the thickness is that of a volume that stays where `thins` is 1, else 1.
         """
-        carried = self._carried(self._deformed(u), v, u)
+        carried = self._moved_with(self._deformed(u), v, u)
         if not np.any(thins):
             return carried
         m, area = _area_vector(self.jet[:3] + u[:3])
@@ -102,13 +102,13 @@ class TangentFrame:
         f, n = self._deformed(u), self.normal(u)
         cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
         T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
-        return self._carried((f + cofactor) / T[..., None, None], v, u)
+        return self._moved_with((f + cofactor) / T[..., None, None], v, u)
 
     def _deformed(self, u: Array) -> Array:
         """F t_1, F t_2 (..., 2, 3)."""
         return np.asarray(np.einsum("...ia,a...j->...ij", self.dual, self.jet[1:3] + u[1:3]))
 
-    def _carried(self, t: Array, v: Array, u: Array) -> Array:
+    def _moved_with(self, t: Array, v: Array, u: Array) -> Array:
         """The vector that has the components of v in t and along the deformed normal."""
         in_surface = np.einsum("...ik,...k,...ij->...j", self.t, v, t)
         return np.asarray(in_surface + _dot(self.n0, v)[..., None] * self.normal(u))
@@ -138,7 +138,7 @@ class NaturalFrame:
     thickness: Array
 
     @classmethod
-    def of(
+    def from_tensors(
         cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float
     ) -> "NaturalFrame":
         """From the tensors of `parts.natural.shape.Natural.at`, times R, and the amplitudes."""

@@ -41,7 +41,7 @@ class Thickness:
     given: UserField | None = None
     carried: CellPolynomials | None = None
 
-    def at(self, x: Array) -> Array:
+    def values_at(self, x: Array) -> Array:
         """Its values at places (..., 3), without patches; of what is given in cells (cells, n, 3)."""
         if self.carried:
             return np.array(self.carried(x)[..., 0])
@@ -51,13 +51,13 @@ class Thickness:
             else np.ones(x.shape[:-1])
         )
 
-    def shown(self, cells: CellGeometry, nodal: Array) -> Array:
+    def values_in_cells(self, cells: CellGeometry, nodal: Array) -> Array:
         """The values (cells, nodes) of a formula as `project_formula`; collective."""
         if self.of_position is None:
             return nodal
         element = cells.element
         fit = project_formula(
-            lambda x, n: self.at(x)[..., None],
+            lambda x, n: self.values_at(x)[..., None],
             cells,
             nodal[..., None],
             element,
@@ -72,9 +72,9 @@ class Thickness:
 class PlacedFactor:
     """The thickness of a shell that has a place, times a number."""
 
-    own: Thickness
+    thickness: Thickness
     place: ShellPose
-    times: float
+    factor: float
 
     def in_cells(self, cells: CellGeometry) -> Array:
         """Its values (cells, nodes) in cells in space, or on a meridian around its axis;
@@ -85,7 +85,9 @@ class PlacedFactor:
         else:
             x = self.place.to_shell_frame(np.insert(cells.nodal, 1, 0.0, axis=-1))
             nodal = np.stack([np.hypot(x[..., 0], x[..., 1]), x[..., 2]], axis=-1)
-        return self.times * self.own.shown(replace(cells, nodal=nodal), self.own.at(x))
+        return self.factor * self.thickness.values_in_cells(
+            replace(cells, nodal=nodal), self.thickness.values_at(x)
+        )
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
@@ -115,12 +117,12 @@ def thickness_field(
     """
     V = r0.function_space
     nodes, _ = positions_and_normals(r0)
-    values = thickness.at(nodes)
+    values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     if thickness.carried:
-        between, sampled = thickness.carried.between()
+        between, sampled = thickness.carried.values_between_nodes()
         refuse_unfit(between[..., 0], sampled, V.mesh.comm)
-    values = thickness.shown(cell_geometry(r0), values)
+    values = thickness.values_in_cells(cell_geometry(r0), values)
     for name, factor in (thickness.patches or {}).items():
         inside = patch_of(patches or {}, name, "shell.thickness_factor")
         values[inside] = (
@@ -178,6 +180,6 @@ def thickness_weighted(density: Density, t: fem.Function, component: int = 0) ->
 
     def of(*arguments: Expr) -> Expr:
         *given, factor = arguments
-        return factor[component] * density.of(*given)
+        return factor[component] * density.function(*given)
 
-    return replace(density, of=of, parameters=(*density.parameters, t))
+    return replace(density, function=of, parameters=(*density.parameters, t))

@@ -146,9 +146,9 @@ class MooneyRivlin:
 
     Examples
     --------
-    >>> MooneyRivlin.of(0.0, 100.0)
+    >>> MooneyRivlin.from_poisson_ratio(0.0, 100.0)
     MooneyRivlin(shear=0.5, bulk=0.3333333333333333, share=0.0)
-    >>> rubber = MooneyRivlin.of(0.5, 100.0)
+    >>> rubber = MooneyRivlin.from_poisson_ratio(0.5, 100.0)
     >>> round(rubber.bulk / rubber.shear, 9), round(rubber.youngs_modulus, 5), round(rubber.nu, 5)
     (100.0, 0.99668, 0.49502)
     """
@@ -158,7 +158,9 @@ class MooneyRivlin:
     share: float = 0.0
 
     @classmethod
-    def of(cls, nu: float, bulk_to_shear: float, share: float = 0.0) -> "MooneyRivlin":
+    def from_poisson_ratio(
+        cls, nu: float, bulk_to_shear: float, share: float = 0.0
+    ) -> "MooneyRivlin":
         """With Young's modulus 1 for small strains.
 
         For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times

@@ -68,7 +68,7 @@ class RevolvedGatherer:
             None if model.thickness is None else swept.scalars(model.thickness, points)
             for points in (ENDS, self._inner)
         )
-        cell_materials, made_of = model.made_of, None
+        cell_materials, made_of = model.cell_materials, None
         if cell_materials is not None:
             cell_dofs = cell_materials.function_space.dofmap.list[swept.order, 0]
             made_of = cell_materials.x.array.reshape(-1, 4)[cell_dofs]

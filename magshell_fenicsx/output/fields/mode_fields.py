@@ -169,7 +169,7 @@ def _revolved_wave(
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
-    vertices = swept.vertices(model.excluded_modes.waves.V)
+    vertices = swept.vertices(model.symmetry_breaking_modes.waves.V)
     U_and_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)

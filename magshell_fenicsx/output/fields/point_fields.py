@@ -176,9 +176,9 @@ class Stresses:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
-        self.frame = frame = TangentFrame.of(r0)
+        self.frame = frame = TangentFrame.from_jet(r0)
         self._thickness = thickness
-        self._law = material.law_in(made_of).at(
+        self._law = material.law_in(made_of).at_point(
             r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
         )
         self._natural = natural and natural.at(r0[0], self.frame.n0)
@@ -207,7 +207,7 @@ class Stresses:
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
         if self._natural:
             total["E_total"] = E
-            shape = NaturalFrame.of(
+            shape = NaturalFrame.from_tensors(
                 frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
             )
             E, M = shape.elastic(E), shape.moment(E, K, law)
@@ -243,7 +243,7 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
     sigma_1, sigma_2
         Force per deformed area of the middle layer, in the same directions.
     """
-    if not law.some_thin:
+    if not law.thins_somewhere:
         return {}
     E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
     squared_stretch = 1 + 2 * E
@@ -316,7 +316,7 @@ class PointFields:
         made_of: Array | None = None,
     ) -> None:
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
-        self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
+        self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
         self._natural = (
             natural.at(r0[0], self._frame.n0)
             if natural and contacts and np.any(self._thins)
@@ -399,7 +399,7 @@ class PointFields:
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
         if self._natural is not None:
-            shape = NaturalFrame.of(
+            shape = NaturalFrame.from_tensors(
                 self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
             )
             stretch = stretch * shape.thickness / np.linalg.det(shape.inverse)

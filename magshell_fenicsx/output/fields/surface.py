@@ -302,7 +302,7 @@ class SurfaceGatherer:
 
     def _cell_materials(self) -> Array | None:
         """Return the material (cells, 4) of each owned cell, where shells have their own."""
-        materials = self._model.made_of
+        materials = self._model.cell_materials
         if materials is None:
             return None
         cell_dofs = materials.function_space.dofmap.list[: self._owned_cells, 0]
@@ -317,7 +317,7 @@ class SurfaceGatherer:
         e, nu, _, law_number = (
             self._averaged(np.repeat(values[:, None], count, axis=1)) for values in materials.T
         )
-        return law.made_of(e, nu, law_number)
+        return law.with_material(e, nu, law_number)
 
     def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
         """Return the sparse matrix of the area-weighted mean over the cells that share a node.

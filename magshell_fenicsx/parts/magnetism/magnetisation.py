@@ -230,7 +230,7 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     if remanent.file:
         by_place = by_points(remanent)
         fields.append(lambda x: by_place(x, x))
-        reasons += [] if by_place.controls.around else ["the remanence is given at points in space"]
+        reasons += [] if by_place.controls.is_axisymmetric else ["the remanence is given at points in space"]
     patterns = {
         name: remanence
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)

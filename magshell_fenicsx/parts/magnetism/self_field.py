@@ -90,7 +90,7 @@ class SelfField:
 
     def _interpolation_element(self) -> Any:
         """Return the element that interpolates a remanence that rotates or is induced."""
-        return self._model.carrier.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
+        return self._model.domain.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
 
     def families(
         self, mu: Mapping[str, float], *, include_uncharged: bool = False
@@ -230,7 +230,7 @@ class SelfField:
 
         Charges of this field stay with the material. `r0` and `u` are jets at its nodes.
         """
-        frame, magnetisation = TangentFrame.of(np.concatenate([r0, 0 * r0])), self.magnetisation
+        frame, magnetisation = TangentFrame.from_jet(np.concatenate([r0, 0 * r0])), self.magnetisation
         n = frame.normal(u)
         J, soft = np.zeros_like(n), magnetisation.soft
         if not (soft and soft.alone):
@@ -401,7 +401,7 @@ def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
 def self_field(sight: Sight) -> SelfField:
     """Return the self-field of a model, which keeps it until its magnetisation is replaced."""
     model, magnetisation = sight.model, magnetisation_of(sight.loads)
-    field_of_model = model.kept.get(SelfField)
+    field_of_model = model.part_caches.get(SelfField)
     if field_of_model is None or field_of_model.magnetisation is not magnetisation:
         if sight.model.r0.function_space.mesh.topology.dim == 3:
             # late, as it derives from the class here
@@ -410,7 +410,7 @@ def self_field(sight: Sight) -> SelfField:
             field_of_model = SelfFieldOfSolid(sight)
         else:
             field_of_model = SelfField(sight)
-        model.kept[SelfField] = field_of_model
+        model.part_caches[SelfField] = field_of_model
     return field_of_model
 
 

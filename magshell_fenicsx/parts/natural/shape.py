@@ -174,7 +174,7 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
         direction.
     """
     message, element = None, V.element.basix_element
-    r0, n0, _ = cells.at(element.points)
+    r0, n0, _ = cells.evaluate(element.points)
     try:
         _refuse_unfit(natural, r0, n0)
         T, kappa, t = natural.at(r0, n0)
@@ -316,11 +316,11 @@ def grown(density: Density, shape: Shape) -> Density:
         given, (field, *amplitudes) = arguments[:count], arguments[count:]
         r0 = given[0]
         if isinstance(r0, Jet):
-            return density.of(*given, natural=shape.forms(r0, field, *amplitudes))
+            return density.function(*given, natural=shape.forms(r0, field, *amplitudes))
         sides = tuple(shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True))
-        return density.of(*given, natural=sides)
+        return density.function(*given, natural=sides)
 
-    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
+    return replace(density, function=of, parameters=(*density.parameters, *shape.parameters))
 
 
 def covariant(r0: Jet, field: Expr, first: int) -> Expr:

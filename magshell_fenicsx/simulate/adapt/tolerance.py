@@ -121,7 +121,7 @@ class _TangentEnergy:
         )
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
         material_directions = None
-        if (made_of := getattr(model, "made_of", None)) is not None:
+        if (made_of := getattr(model, "cell_materials", None)) is not None:
             rows = made_of.x.array.reshape(-1, 4)[
                 : made_of.function_space.dofmap.index_map.size_local
             ]

@@ -224,7 +224,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     if record.step and scene.problem.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric
-    if model.tees:
+    if model.t_junction_terms:
         raise CaseError(
             f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half"
         )
@@ -254,7 +254,7 @@ def variation(
     model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]
 ) -> Functional:
     """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
-    terms, system, mu = model.waves.along(phi, m), model.system, state.mu
+    terms, system, mu = model.waves.energies_along(phi, m), model.system, state.mu
     rates = {name: by_amplitude(model, terms, name, mu) for name in names}
 
     def present() -> Functional:
@@ -556,7 +556,9 @@ def energies_along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float
         phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)
         if d.stiffness:
             assert model.axisymmetric
-            energies += [(term, d.stiffness) for term in model.waves.along(phi, d.wave or 0)]
+            energies += [
+                (term, d.stiffness) for term in model.waves.energies_along(phi, d.wave or 0)
+            ]
         if d.inertia:
             energies.append((mass_along(model, phi, d.wave), d.inertia))
     return energies

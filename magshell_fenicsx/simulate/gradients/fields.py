@@ -255,8 +255,8 @@ def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[Weighte
 def _as_form(scene: Scene, slope: Slope) -> FormTerm:
     """A derivative at points as a form."""
     assert scene.model.thin
-    carrier = scene.model.carrier
-    energy = carrier.integral(slope.density, carrier.jet(scene.model.u))
+    domain = scene.model.domain
+    energy = domain.integral(slope.density, domain.jet(scene.model.u))
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
 
@@ -451,8 +451,8 @@ def mass(scene: Scene) -> Adjoint:
             return 1.0, []
         rho = (
             fem.Constant(t.function_space.mesh, 1.0)
-            if scene_there.model.made_of is None
-            else scene_there.model.made_of[2]
+            if scene_there.model.cell_materials is None
+            else scene_there.model.cell_materials[2]
         )
         terms = (
             FormTerm("mass", thickness_integral(rho * t[0]), u, log),

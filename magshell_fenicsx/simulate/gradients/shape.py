@@ -136,5 +136,7 @@ def rates(
             moved_coordinates = coordinates.copy()
             moved_coordinates[: len(normals), k] += sign * step * normals[:, k][:, model.axes]
             nodes[node_dofs] = moved_coordinates
-            values.append(field.again(r).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs])
+            values.append(
+                field.rebuild(r).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs]
+            )
         yield np.asarray((values[0] - values[1]) / (2 * step))

@@ -13,7 +13,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import RevolvedGatherer
-from magshell_fenicsx.parts.gap import SOFT, penalty
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION, penalty
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
@@ -206,7 +206,7 @@ def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]
         else cap(hole=hole)
     )
     scene = touching(upper, z, PRESSURE, **shell)
-    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
+    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.shell_contacts
     at = system.at_state(state)
     assert at.evaluate(contact.force) > 0
     v = system.zero_at_supports(np.random.default_rng(1).standard_normal(state.u.size))
@@ -260,8 +260,8 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
     u = np.zeros((model.system.size // model.V.dofmap.bs, model.V.dofmap.bs))
     of_shells = model.meridian.patches if model.axisymmetric else model.midsurface.patches
     u[np.unique(model.V.dofmap.list[of_shells["tube"]]), -1] = 0.02 * h
-    (contact,), at = model.touchings, model.system.at_state(State(u.ravel(), scene.unloaded().mu))
-    pressure, force = at.evaluate(contact.of_cells)[0], at.evaluate(contact.force)
+    (contact,), at = model.shell_contacts, model.system.at_state(State(u.ravel(), scene.unloaded().mu))
+    pressure, force = at.evaluate(contact.cell_pressures_and_gaps)[0], at.evaluate(contact.force)
     points = contact._rule if model.axisymmetric else contact._points
     area = np.bincount(points.cell, points.weight, len(pressure))
     assert force > 0
@@ -278,9 +278,9 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
     """
     shell, thick = ({"thickness_factor": factor}, 1.25) if factor else ({}, 1.0)
     scene = touching(cap(radius=1.3), 2.3 + (thick + 1e-4) * h, PRESSURE, **shell)
-    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.touchings
+    system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.shell_contacts
     at = system.at_state(state)
-    faced, (H, nodes) = at.evaluate(contact._pressed), at.evaluate(lambda: contact._second(m))
+    faced, (H, nodes) = at.evaluate(contact._active_set), at.evaluate(lambda: contact._second_derivative(m))
     r = scene.model.r0.x.array.reshape(-1, 2)
     U, V, W, T = (
         100 * r[:, 0] ** 2 * np.cos(k * r[:, 0] + r[:, 1]) for k in (1, 2, 3, 4)
@@ -330,7 +330,7 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
                 total += (
                     rule.weight[point]
                     / 2
-                    * penalty(np.array(deep), k, SOFT * size)[0]
+                    * penalty(np.array(deep), k, SOFT_PENETRATION * size)[0]
                     / len(angles)
                 )
         return total
@@ -343,10 +343,10 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
 def test_messages() -> None:
     """Why there is no meridian."""
     beside = cap() | {"place": {"position": [3, 0, 0]}}
-    dented = cap(imperfections=[{"kind": "formula", "w0": "0.1*x"}])
+    dented_states = cap(imperfections=[{"kind": "formula", "w0": "0.1*x"}])
     for other, reason in (
         (beside, r"shells.upper.place: its axis is not e3 through the origin"),
-        (dented, r"shells.upper.an imperfection differs around e3"),
+        (dented_states, r"shells.upper.an imperfection differs around e3"),
     ):
         data = {
             "shells": {"lower": cap(), "upper": other},
@@ -413,7 +413,7 @@ def test_ridges_that_are_highest_between_nodes() -> None:
         "loading": loading,
     }
     scene = Scene(Case.from_source(data))
-    (touching,) = scene.model.touchings
+    (touching,) = scene.model.shell_contacts
     assert scene.model.axisymmetric
     assert scene.model.system.at_state(scene.unloaded()).evaluate(
         touching.least_gap

@@ -26,7 +26,7 @@ def second_variation(size: float, half: bool) -> float:
     v = (edge * np.column_stack([x * y, 0.5 + x + y**2, y * (1 - x)])).ravel()
     state = State(u, {"pressure": 0.3})
     if half:
-        modes = model.excluded_modes
+        modes = model.symmetry_breaking_modes
         assert modes is not None
         K = modes.factor_at(state).matrix
     else:
@@ -60,7 +60,7 @@ def test_waves_come_in_pairs() -> None:
         "symmetry": "half",
     }
     scene = Scene(Case.from_source(Source("pairs", data)))
-    modes = scene.model.excluded_modes
+    modes = scene.model.symmetry_breaking_modes
     assert modes is not None
     states = [record.point.state for record in follow(scene) if record.label == "target"]
     seen, excluded = (

@@ -68,7 +68,7 @@ def test_terms_together(shell: Shells, half: bool, energy: str, degree: int) -> 
 
 def test_excluded_modes(shell: Shells) -> None:
     model = shell(2, half=True)
-    modes = model.excluded_modes
+    modes = model.symmetry_breaking_modes
     assert modes is not None
     # the interior edges' form has the widest coupling here too
     assert difference(modes.system, random_displacement(model, 1e-3), MU) <= 1e-12
@@ -159,8 +159,8 @@ def test_run_compiles_no_forms_but_energies() -> None:
     """Nor do the modes that a half shell excludes."""
     scene = Scene(Case.from_source(Source("half", HALF_SHELL)))
     states = [record.point.state for record in follow(scene)]
-    assert scene.model.excluded_modes
-    scene.model.excluded_modes.factor_at(states[-1])
+    assert scene.model.symmetry_breaking_modes
+    scene.model.symmetry_breaking_modes.factor_at(states[-1])
     names = scene.model.kernels.names
     assert len(names) == len(set(names))
     assert [name for name in names if name.endswith(("tangent", "residual"))] == []
@@ -180,7 +180,7 @@ scene = Scene(Case.from_source(Source("half", {HALF_SHELL!r})))
 model, mu = scene.model, dict(pressure=0.3, lambda_m=0.4)
 x = model.r0.x.array[: model.system.size].reshape(-1, 3)  # each node's own place makes the same u on all ranks
 u = (1e-2 * np.sin(40 * x @ np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]]))).ravel()
-for fast in (model.system, model.excluded_modes.system):
+for fast in (model.system, model.symmetry_breaking_modes.system):
     K, v = fast.tangent(u, mu), fast.zero_at_supports(np.roll(u, 3))
     given, found = K.createVecs()
     given.array[:] = v

@@ -123,7 +123,7 @@ def test_moments_of_a_step_on_coarse_cells_and_a_polynomial_that_stays():
     def step(x, n):
         return np.sign(0.05**2 - (x[..., :1] - 0.31) ** 2 - (x[..., 1:2] - 0.23) ** 2) / 2 + 0.5
 
-    x, normals, _ = cells.at(element.points)
+    x, normals, _ = cells.evaluate(element.points)
     fit = project_formula(step, cells, step(x, normals), element, 3)
     assert not fit.smooth
     assert fit.size == pytest.approx(over_sphere(np.ones_like, 0.05), rel=1e-3)

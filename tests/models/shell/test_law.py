@@ -15,7 +15,7 @@ from magshell_fenicsx.models.shell.law import Koiter, Law, work
 from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.rubber import Rubber
 
-COUPLED = Laminated.of(laminate(ply(20, 3.0, fraction=0.3), ply(-70, 0.7)), 0.05, 0.3)
+COUPLED = Laminated.from_laminate(laminate(ply(20, 3.0, fraction=0.3), ply(-70, 0.7)), 0.05, 0.3)
 LAWS: list[Law] = [
     Koiter(0.05, 0.3),
     Koiter(0.1, 0.5).thicker(1.3),

@@ -63,7 +63,7 @@ def test_homogeneous_deformations(name: str) -> None:
 def test_as_it_is_drawn() -> None:
     """The same rotation at random points of any curvature."""
     jet, u = np.random.default_rng(0).standard_normal((2, 6, 50, 3))
-    frame, v = TangentFrame.of(jet), np.random.default_rng(1).standard_normal((50, 3))
+    frame, v = TangentFrame.from_jet(jet), np.random.default_rng(1).standard_normal((50, 3))
     identity = np.stack(
         [frame.convected(np.broadcast_to(e, v.shape), u) for e in np.eye(3)], axis=-1
     )

@@ -136,7 +136,7 @@ def test_residual_and_tangent(kind: dict[str, bool]) -> None:
 
 def test_modes_that_a_half_excludes() -> None:
     model = shell(0.2, half=True)
-    modes = model.excluded_modes
+    modes = model.symmetry_breaking_modes
     assert modes is not None
     assert difference(modes.system, random_displacement(model, 1e-3), MU) <= 1e-12
 
@@ -159,7 +159,7 @@ def test_thinned_remanence() -> None:
     jet = np.zeros((3, 1, 3))
     jet[1:] = np.eye(3)[:2, None]
     frame, moved = (
-        TangentFrame.of(np.concatenate([jet, np.zeros((3, 1, 3))])),
+        TangentFrame.from_jet(np.concatenate([jet, np.zeros((3, 1, 3))])),
         jet * [0.2, -0.1, 0.0],
     )
     assert frame.convected(along[None], moved, thins=True)[0] == pytest.approx(

@@ -37,7 +37,7 @@ def test_any_rigid_motion_strains_nothing() -> None:
     jet = RNG.standard_normal((6, 50, 3))
     Q, _ = np.linalg.qr(RNG.standard_normal((3, 3)))
     Q *= np.linalg.det(Q)
-    frame, u = TangentFrame.of(jet), jet @ Q.T - jet
+    frame, u = TangentFrame.from_jet(jet), jet @ Q.T - jet
     u[0] += [1.0, -2.0, 3.0]
     assert frame.membrane_strain(u) == pytest.approx(0, abs=1e-11)
     assert frame.curvature_change(u) == pytest.approx(0, abs=1e-10)

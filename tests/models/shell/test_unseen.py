@@ -10,7 +10,7 @@ from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, SubCells, _
 def test_a_rank_without_parts() -> None:
     """As of three ranks one often is, where few cells are divided."""
     lattice, none = (
-        Lattice.of(basix.CellType.triangle, 4),
+        Lattice.make(basix.CellType.triangle, 4),
         SubCells(np.zeros(0, int), np.zeros((0, 2)), np.ones((0, 2))),
     )
     formulas = FormulaGroup([formula("exp(0.6*x + 0.8*y)"), formula("x")], None, 1.0)

@@ -25,7 +25,7 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
 
     With `whole`, compression takes all 27 quadrature points.
     """
-    material = MooneyRivlin.of(0.5, bulk_to_shear)
+    material = MooneyRivlin.from_poisson_ratio(0.5, bulk_to_shear)
     loads = Loads(pressure=True)
     model = SolidModel(plate(0.3, H, half=True), Material(0.5, H), material, CONDITIONS, loads)  # type: ignore[arg-type]
     system = model.system

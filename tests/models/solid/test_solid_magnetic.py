@@ -24,7 +24,7 @@ H = 0.1
 G = FIELD.gradient
 assert G is not None
 LINEAR = [f"{b} + {g[0]}*x + {g[1]}*y + {g[2]}*z" for b, g in zip(FIELD.applied, G, strict=True)]
-MATERIAL, NEO_HOOKEAN = Material(0.5, H), MooneyRivlin.of(0.5, 100.0)
+MATERIAL, NEO_HOOKEAN = Material(0.5, H), MooneyRivlin.from_poisson_ratio(0.5, 100.0)
 BR, BA = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8])
 THIN = 1.1**-0.5
 DEFORMATIONS = {

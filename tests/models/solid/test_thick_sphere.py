@@ -65,7 +65,7 @@ def test_inflation() -> None:
     """Drawn outwards until the inner radius has grown by an eighth: each face to 1e-3 of its
     displacement.
     """
-    material, pressure = MooneyRivlin.of(0.5, 100.0, 0.6), -0.1
+    material, pressure = MooneyRivlin.from_poisson_ratio(0.5, 100.0, 0.6), -0.1
     body = hemisphere(0.35, THICKNESS, layers=2, half=True)
     model = SolidModel(body, Material(0.5, THICKNESS), material, {}, Loads())
     factory = TermFactory(body, model.u, material, THICKNESS, model.kernels)

@@ -1,0 +1,500 @@
+"""The search for the places of other cells that the points of a surface face, at a displacement.
+
+A tree gives the pairs of cells that are near, which stay while nodes move little; Newton's method
+the closest point in each cell (`projection`). Of these the places count from which the surface goes
+on to no nearer one. docs/theory.md, Contact.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
+from magshell_fenicsx.parts.contact.projection import (
+    SELF_CONTACT_DISTANCE,
+    LATTICE_RADIUS_FACTOR,
+    CELL_RADIUS_FACTOR,
+    PLACE_SHAPES,
+    MAX_DIRECTIONS,
+    Cells,
+    SearchLimits,
+    Longs,
+    Projections,
+    UndeformedPairs,
+    polynomial_bound,
+    jets,
+    near_spheres,
+    nearest_places,
+    points_in_cells,
+)
+from magshell_fenicsx.parts.contact.segments import ContactPoints
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+TRACKING_MARGIN = 0.5  # cells' mean radii that nodes move before near pairs are sought again
+MAX_DISTANCES_AT_ONCE = 2_000_000  # between nodes of cells that may be folded
+BLUR_DISTANCE = 1e-6  # thicknesses over which places count as one, see `JoinedPlaces`
+# thicknesses by which a place is farther than the nearest and still counts
+DISTANCE_TOLERANCE = 40 * BLUR_DISTANCE
+SAME_DIRECTION_COSINE = 0.5  # between the directions to places that are joined: folds are smaller
+FOLD_SHRINKAGE = 0.9  # deformed over undeformed distance of corners, below which cells are folded
+STEEP_COSINE = 0.87  # between normals of cells, below which an edge is no part of a face
+FIRST_REACHES = 0.3, 0.5  # parts of a reach that are searched first, which costs less
+
+
+class ClosestPointSearch:
+    """The search for the closest points of a surface to its own points.
+
+    Parameters
+    ----------
+    rule
+        Points on all cells of this rank.
+    may_touch
+        Whether points of cells (n,) may touch cells (n,).
+    h
+        Thickness over R.
+    r0
+        (nodes, 3) undeformed.
+    offsets
+        Half the thickness where it varies, or changes with the state; None where it is h/2.
+
+    Attributes
+    ----------
+    half_thickness
+        (nodes,) undeformed, over R.
+    """
+
+    def __init__(
+        self,
+        cells: Cells,
+        rule: ContactPoints,
+        may_touch: Callable[[Longs, Longs], Flags],
+        h: float,
+        r0: Array,
+        offsets: FaceOffsets | None,
+        comm: MPI.Comm,
+    ) -> None:
+        self._cells, self._rule, self._may_touch, self._h = cells, rule, may_touch, h
+        self._r0, self._offsets, self._comm = r0, offsets, comm
+        self.half_thickness: Array = np.full(len(r0), h / 2)
+        if offsets:
+            self.half_thickness = offsets.undeformed_half_thickness
+        self._largest_thickness = 2 * self._bound(self.half_thickness)
+        distance = 2 * SELF_CONTACT_DISTANCE * self.half_thickness
+        self._near_keys = cells.near_within_surface(r0, distance)
+        self._undeformed_nodes = np.column_stack([r0, self.half_thickness])
+        undeformed_points = self.places_of_points(rule, self._undeformed_nodes)
+        self._undeformed_points: tuple[ContactPoints, Array] = rule, undeformed_points
+        self._own_cells = np.unique(rule.cell)  # of this rank, that are modelled
+        self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
+
+    def places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
+        """Return the places (nodes, 3) of all nodes at a displacement.
+
+        (nodes, 4) where the thickness varies and faces are asked for: with half of it less h/2.
+        """
+        r = self._r0 + u
+        if not (to_faces and self._offsets):
+            return r
+        return np.column_stack([r, self._offsets.half_thickness(u) - self._h / 2])
+
+    def _bound(self, nodal: Array) -> float:
+        """Return an upper bound of the field with values (nodes,) at nodes."""
+        return polynomial_bound(nodal[self._cells.nodes], self._cells.lebesgue_constant)
+
+    def places_of_points(self, points: ContactPoints, r: Array, which: Any = slice(None)) -> Array:
+        """Return the places of some points; see `points_in_cells`."""
+        return points_in_cells(self._cells, r, points.cell[which], points.shape[which])
+
+    def come_near(self, u: Array, v: Array) -> bool:
+        """Return whether any cells that may touch come near each other on the way from u to v.
+
+        Collective.
+        """
+        spheres = [self._bounding_spheres(self._r0 + each) for each in (u, v)]
+        centres = (spheres[0][0] + spheres[1][0]) / 2
+        half_motion = np.linalg.norm(spheres[1][0] - spheres[0][0], axis=1) / 2
+        radii = np.maximum(spheres[0][1], spheres[1][1]) + half_motion
+        reach = self._largest_thickness
+        near = near_spheres(centres, radii, reach, self._own_cells)
+        pairs = self._select_pairs(*near, reach, self._r0 + u, self._r0 + v)
+        return bool(self._comm.allreduce(len(pairs[0])))
+
+    def _bounding_spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
+        """Return centres and radii of spheres around cells."""
+        nodal = r[self._cells.nodes[cell]]
+        centres = nodal.mean(axis=1)
+        radii = np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+        return centres, CELL_RADIUS_FACTOR * radii
+
+    def _select_pairs(
+        self, i: Longs, j: Longs, reach: float, *surfaces: Array
+    ) -> tuple[Longs, Longs]:
+        """Return the pairs of cells that may touch.
+
+        Of cells that are near within the surface those where one of some deformed surfaces is
+        folded.
+        """
+        allowed = self._may_touch(i, j)
+        i, j = i[allowed], j[allowed]
+        is_selected = ~self._are_near_in_surface(i * len(self._cells.nodes) + j)
+        neighbours = np.flatnonzero(~is_selected)
+        for r in surfaces:
+            is_selected[neighbours] |= self._are_folded(i[neighbours], j[neighbours], r, reach)
+        return i[is_selected], j[is_selected]
+
+    def _are_near_in_surface(self, keys: Longs) -> Flags:
+        """Return whether pairs i * cells + j are of cells that are near within the surface."""
+        position = np.minimum(np.searchsorted(self._near_keys, keys), len(self._near_keys) - 1)
+        return np.asarray(self._near_keys[position] == keys)
+
+    def _are_folded(self, i: Longs, j: Longs, r: Array, reach: float) -> Flags:
+        """Return whether places of cells i (n,) may be nearer than the reach to those of cells j.
+
+        Only places that are not near within the undeformed surface count.
+        """
+        is_folded, nodes = np.zeros(len(i), dtype=bool), self._cells.nodes
+        _, radii = self._bounding_spheres(r)
+        _, undeformed_radii = self._bounding_spheres(self._r0)
+        spacing = LATTICE_RADIUS_FACTOR / self._cells.element.degree
+        chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE
+        for chunk in np.array_split(np.arange(len(i)), chunks):
+            corners = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
+            has_shrunk = _distances_of_nodes(r, *corners) < (
+                FOLD_SHRINKAGE * _distances_of_nodes(self._r0, *corners)
+            )
+            pairs = chunk[has_shrunk.any(axis=(1, 2))]
+            own, other = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
+            margin = spacing * (radii[i[pairs]] + radii[j[pairs]])
+            is_close = _distances_of_nodes(r, own, other) < reach + margin[:, None, None]
+            margin = spacing * (undeformed_radii[i[pairs]] + undeformed_radii[j[pairs]])
+            thickness = self.half_thickness[own] + self.half_thickness[other]
+            least = SELF_CONTACT_DISTANCE * thickness - margin[:, None, None]
+            was_apart = _distances_of_nodes(self._r0, own, other) > least
+            is_folded[pairs] = (is_close & was_apart).any(axis=(1, 2))
+        return is_folded
+
+    def _near_pairs(self, u: Array, reach: float) -> tuple[Longs, Longs]:
+        """Return pairs of a cell with points of this rank and any cell near by.
+
+        They are cached while nodes move little.
+        """
+        if reach in self._tracked:
+            tracked_u, margin, pairs = self._tracked[reach]
+            motion = 2 * float(np.linalg.norm(u - tracked_u, axis=1).max(initial=0.0))
+            if motion + reach <= margin:
+                return pairs
+        centres, radii = self._bounding_spheres(self._r0 + u)
+        margin = reach + TRACKING_MARGIN * float(radii.mean())
+        near = near_spheres(centres, radii, margin, self._own_cells)
+        pairs = self._select_pairs(*near, margin, self._r0 + u)
+        self._tracked[reach] = np.array(u), margin, pairs
+        return pairs
+
+    def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
+        """Return the least gap over R between faces at nodes that supports hold, at a displacement.
+
+        Of nodes that may touch and are no neighbours undeformed; infinite without, or if the shell
+        thins.
+        """
+        if self._offsets and not self._offsets.is_constant:
+            return np.inf
+        count = len(self._cells.nodes)
+
+        def may_touch(i: Longs, j: Longs) -> Flags:
+            return np.asarray(self._may_touch(i, j) & ~self._are_near_in_surface(i * count + j))
+
+        nodes, half = self._cells.nodes, self.half_thickness
+        return gap_between_supports(supported_nodes, nodes, self._r0, u, half, may_touch)
+
+    def projections(
+        self,
+        u: Array,
+        reach: float,
+        points: ContactPoints | None = None,
+        *,
+        to_faces: bool = True,
+        least_only: bool = False,
+    ) -> Projections:
+        """Return the places that points face at a displacement.
+
+        Parameters
+        ----------
+        reach
+            Largest distance between faces, or mid-surfaces, over R.
+        points
+            By default those of the rule.
+        to_faces
+            Whether the reach is between faces.
+        least_only
+            Whether only the places of each point's least distance are needed; some others are among
+            them.
+        """
+        points = points or self._rule
+        r = self.places_of_nodes(u, to_faces=to_faces)
+        places = self.projections_in_cells(points, u, r, reach, least_only=least_only)
+        return self._select_nearest(points, places)
+
+    def least_distance(
+        self, u: Array, max_reach: float, points: ContactPoints | None = None
+    ) -> float:
+        """Return the least distance of any point at a displacement, at most the reach; collective.
+        """
+        for reach in (*(part * max_reach for part in FIRST_REACHES), max_reach):
+            places = self.projections(u, reach, points, least_only=True)
+            own_least = float(places.distance.min(initial=max_reach))
+            nearest = float(self._comm.allreduce(own_least, MPI.MIN))
+            if nearest < reach:
+                return nearest
+        return max_reach
+
+    @cached_property
+    def _separate_surfaces(self) -> tuple[Longs, Flags]:
+        """Connected surfaces: the number (n,) of each cell's, and which face each other wholly.
+
+        The flags (m, m) say of two surfaces whether places of one face all of the other. Then each
+        point's nearest place counts: the surface goes on from there to none that is nearer, and no
+        place of it is near the point in the point's own surface.
+        """
+        cell, side = np.nonzero(self._cells.neighbours >= 0)
+        n, neighbour = len(self._cells.nodes), self._cells.neighbours[cell, side]
+        joined = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (n, n))
+        count, number = scipy.sparse.csgraph.connected_components(joined, directed=False)
+        sizes, (_, first_cells) = np.bincount(number), np.unique(number, return_index=True)
+        faced = np.zeros((count, count), dtype=np.int64)  # cells of one surface that another faces
+        for surface, cell in enumerate(first_cells):
+            faced_cells = self._may_touch(np.full(n, cell), np.arange(n))
+            faced[surface] = np.bincount(number[faced_cells], minlength=count)
+        is_near = np.zeros((count, count), dtype=bool)
+        is_near[number[self._near_keys // n], number[self._near_keys % n]] = True
+        faces_all = faced == sizes
+        return number, faces_all & faces_all.T & ~is_near & ~np.eye(count, dtype=bool)
+
+    def _limits(
+        self,
+        searched: Longs,
+        x: Array,
+        r: Array,
+        pairs: tuple[Longs, Longs],
+        cell: Longs,
+        max_distance: float,
+    ) -> SearchLimits:
+        """Return how far the nearest place of a separate surface is at most.
+
+        Its nearest node within the largest distance is a place.
+
+        Parameters
+        ----------
+        searched, cell
+            (m,) numbers of the points x that are searched, and their cells.
+        """
+        number, are_separate = self._separate_surfaces
+        variation = 0.0
+        if r.shape[1] > 3:
+            variation = self._bound(r[:, 3]) + self._bound(-r[:, 3])
+        reach, surface = np.full(len(x), np.inf), number[cell]
+        is_near = np.zeros(len(self._cells.nodes), dtype=bool)
+        is_near[pairs[1]] = True
+        for number_of_surface in np.unique(surface):
+            near_separate_cells = is_near & are_separate[number_of_surface][number]
+            nodes = np.unique(self._cells.nodes[near_separate_cells])
+            if len(nodes):
+                own_points = searched[surface == number_of_surface]
+                tree = scipy.spatial.cKDTree(r[nodes, :3])
+                distance, _ = tree.query(x[own_points, :3], distance_upper_bound=max_distance)
+                reach[own_points] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
+        return SearchLimits(are_separate[number[pairs[0]], number[pairs[1]]], reach)
+
+    def projections_in_cells(
+        self, points: ContactPoints, u: Array, r: Array, reach: float, *, least_only: bool = False
+    ) -> Projections:
+        """Return the nearest place of each near cell to points, within a distance.
+
+        Parameters
+        ----------
+        r
+            Nodes as of `places_of_nodes`, at the displacement u.
+        """
+        largest_offset = self._bound(r[:, 3]) if r.shape[1] > 3 else 0.0
+        face_reach, reach = reach, reach + 2 * largest_offset
+        i, j = self._near_pairs(u, reach)
+        order, cell_of = points.by_cell
+        first = np.searchsorted(cell_of, i)
+        count = np.searchsorted(cell_of, i, "right") - first
+        searched = order[np.isin(cell_of, i)]
+        x = np.zeros((len(order), r.shape[1]))
+        x[searched] = self.places_of_points(points, r, searched)
+        if self._undeformed_points[0] is not points:
+            self._undeformed_points = points, self.places_of_points(points, self._undeformed_nodes)
+        is_near = self._are_near_in_surface(i * len(self._cells.nodes) + j)
+        undeformed = UndeformedPairs(
+            is_near, self._undeformed_nodes, self._undeformed_points[1], SELF_CONTACT_DISTANCE
+        )
+        limits = None
+        if least_only:
+            limits = self._limits(searched, x, r, (i, j), points.cell[searched], reach)
+        pairs = j, first, count, order
+        return nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)[1]
+
+    def select_distant_cells(self, points: ContactPoints, places: Projections) -> Projections:
+        """Return the places in cells that are not near within the surface.
+
+        Only such cells are cut along each other.
+        """
+        keys = points.cell[places.point] * len(self._cells.nodes) + places.cell
+        return places.select(~self._are_near_in_surface(keys))
+
+    def thickness(self, points: ContactPoints, places: Projections) -> Array:
+        """Return the mean undeformed thickness (n,) at points and their places, over R."""
+        half = self.half_thickness[self._cells.nodes]
+        nodal = half[places.cell][..., None]
+        (_, half_at_places), *_ = jets(self._cells.element, places.X, nodal, 0)
+        shape, own_cell = points.shape[places.point], points.cell[places.point]
+        half_at_points = np.sum(shape * half[own_cell], axis=1)
+        return np.asarray(half_at_points + half_at_places[:, 0])
+
+    def _select_nearest(self, points: ContactPoints, places: Projections) -> Projections:
+        """Return the places from which the surface goes on to no nearer one.
+
+        Each point has one in each direction at most: on both sides of its own surface, and before
+        its edge. Places at the same distance in neighbouring cells stay, see `JoinedPlaces`.
+        """
+        cells, number = self._cells, len(self._cells.nodes)
+        keys = places.point * number + places.cell
+        order = np.argsort(keys, kind="stable")
+        places, keys = places.select(order), keys[order]
+        on_sides = np.column_stack([1 - places.X.sum(axis=1), places.X]) == 0.0
+        key_of_point_cell = points.cell[places.point] * number
+        is_nearest = np.ones(len(keys), dtype=bool)
+        for side in range(3):
+            neighbour = cells.neighbours[places.cell, side]
+            is_on_side = on_sides[:, side] & (neighbour >= 0)
+            neighbour_key = places.point * number + neighbour
+            row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
+            is_listed = keys[row] == neighbour_key
+            is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
+            # the surface that goes on there is not searched
+            is_folded = places.above & self._are_near_in_surface(key_of_point_cell + neighbour)
+            is_nearest &= ~is_on_side | (is_listed & ~is_nearer) | is_folded
+        places = places.select(is_nearest)
+        if not len(places.point):
+            return places
+        places = _number_directions(places.select(np.lexsort((places.distance, places.point))))
+        first = places.firsts
+        least = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
+        return places.select(places.distance < least + DISTANCE_TOLERANCE * self._h)
+
+    def are_left_to_edges(self, points: ContactPoints, places: Projections, normals: Array) -> Flags:
+        """Return which places (n,) do not count, since an edge's own points are there.
+
+        They are those of points inside a surface that face an edge of another one, steeply. Such
+        points see a line, which is narrower than they are apart: it would be held back where it
+        slides over one of them. Places of one point and direction are as the nearest.
+
+        Parameters
+        ----------
+        normals
+            (cells, 3) where the cuts were made.
+        """
+        first = places.firsts
+        nearest = places.select(first)
+        is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
+        is_left = is_on_edge & is_steep & ~points.is_on_edge[nearest.point]
+        return np.asarray(np.repeat(is_left, np.diff([*first, len(places.point)])))
+
+    def are_edges_alone(self, points: ContactPoints, nearest: Projections, normals: Array) -> Flags:
+        """Return which points are of an edge that presses on a face alone.
+
+        The face's own points are left to the edge, see `are_left_to_edges`.
+
+        Parameters
+        ----------
+        nearest
+            The nearest place of each point.
+        """
+        is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
+        return np.asarray(is_steep & ~is_on_edge)
+
+    def _edge_and_steepness(self, points: ContactPoints, nearest: Projections, normals: Array) -> tuple[Flags, Flags]:
+        """Return which places are on an edge, and which are in a cell that is steep to the point's.
+        """
+        on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
+        moves_along_side = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
+        is_boundary = self._cells.neighbours[nearest.cell] < 0
+        is_on_edge = moves_along_side & (on_side & is_boundary).any(axis=1)
+        # in a corner an edge goes on from one cell to another, or turns
+        in_corner = on_side.sum(axis=1) == 2
+        is_on_edge |= in_corner & (~on_side & self._cells.is_on_edge[nearest.cell]).any(axis=1)
+        cosine = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
+        return np.asarray(is_on_edge), np.asarray(cosine < STEEP_COSINE)
+
+
+def _distances_of_nodes(r: Array, nodes: Longs, others: Longs) -> Array:
+    """Return the distances between nodes and others, which are broadcast, at places (nodes, 3)."""
+    return np.asarray(np.linalg.norm(r[nodes] - r[others], axis=3))
+
+
+def _number_directions(places: Projections) -> Projections:
+    """Give places in one direction from their point one number, `side`, and order them by it.
+
+    Parameters
+    ----------
+    places
+        In the order of points and distances.
+    """
+    direction_numbers = np.full(len(places.point), MAX_DIRECTIONS - 1)
+    remaining = np.arange(len(places.point))
+    for direction in range(MAX_DIRECTIONS - 1):
+        first = np.flatnonzero(np.diff(places.point[remaining], prepend=-1))
+        nearest = np.repeat(remaining[first], np.diff([*first, len(remaining)]))
+        cosine = np.sum(places.way[remaining] * places.way[nearest], axis=1)
+        is_same = cosine > SAME_DIRECTION_COSINE
+        direction_numbers[remaining[is_same]] = direction
+        remaining = remaining[~is_same]
+    places = replace(places, side=direction_numbers)
+    return places.select(np.lexsort((places.distance, direction_numbers, places.point)))
+
+
+def gap_between_supports(
+    supported_nodes: Longs,
+    nodes: Longs,
+    r0: Array,
+    u: Array,
+    half_thickness: Array,
+    may_touch: Callable[[Longs, Longs], Flags],
+) -> float:
+    """Return the least gap over R between faces at supported nodes, at a displacement.
+
+    See `ClosestPointSearch.gap_at_supports`.
+
+    Parameters
+    ----------
+    nodes
+        (cells, functions) of all cells.
+    may_touch
+        Whether cells (n,) may touch others and are not near them within the surface.
+    """
+    cell_of = np.zeros(len(r0), dtype=np.int64)
+    cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    cells, undeformed = cell_of[supported_nodes], r0[supported_nodes]
+    deformed, half = (r0 + u)[supported_nodes], half_thickness[supported_nodes]
+    thickness = half[:, None] + half
+    distance = scipy.spatial.distance.cdist(undeformed, undeformed)
+    i, j = np.nonzero(distance > (1 - DISTANCE_TOLERANCE) * thickness)
+    gap = np.linalg.norm(deformed[i] - deformed[j], axis=1) - thickness[i, j]
+    is_closed = gap < 0
+    i, j, gap = i[is_closed], j[is_closed], gap[is_closed]
+    return float(gap[may_touch(cells[i], cells[j])].min(initial=np.inf))
+
+
+def no_projections() -> Projections:
+    """Return no places."""
+    no_numbers = np.zeros(0, dtype=np.int64)
+    X, free, distance, way = (np.zeros((0, *shape)) for shape in PLACE_SHAPES)
+    return Projections(no_numbers, no_numbers, X, free, distance, no_numbers, way, no_numbers > 0)

@@ -1,0 +1,322 @@
+"""Offsets of faces: how far they are from a mid-surface whose thickness varies or changes.
+
+It is half the thickness, continuous from cell to cell. At each node it is the undeformed volume per
+deformed area of the cells around, and between nodes their polynomial:
+
+    H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell keeps its volume, else J0,
+
+with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has
+grown V is the natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by
+the displacement and by this amplitude are exact. docs/theory.md, Contact.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.free_parameters import SettableNumber
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.parts.contact.projection import Longs
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _AreaVectors:
+    """Area vectors a_1 x a_2 of some cells at their nodes.
+
+    Attributes
+    ----------
+    J
+        (cells, places) their lengths.
+    normal
+        (cells, places, 3) their directions.
+    by_node
+        (cells, places, 3 nodes, 3): derivatives of a_1 x a_2 by the components of all nodes.
+    """
+
+    J: Array
+    normal: Array
+    by_node: Array
+
+    @property
+    def slope(self) -> Array:
+        """The derivatives (cells, places, 3 nodes) of J."""
+        return np.asarray(np.einsum("cqmi,cqi->cqm", self.by_node, self.normal))
+
+
+class CellNodes(Protocol):
+    """Cells with a basix element, and (cells, functions) the numbers of their nodes."""
+
+    @property
+    def element(self) -> Any: ...
+    @property
+    def nodes(self) -> Longs: ...
+
+
+class FaceOffsets:
+    """Half the thickness at all nodes of a mid-surface, over R.
+
+    Parameters
+    ----------
+    r0
+        (nodes, 3) undeformed.
+    h
+        Thickness over R.
+    volume_factors
+        (powers, cells, functions) V over h J0 at the nodes of each cell, by powers of the
+        amplitude.
+    keeps_volume
+        (cells,) whether the thickness follows from the area.
+    same_place
+        (nodes,) for each node the first of those at its place: images share what is on their
+        planes.
+    amplitude
+        The natural stretch, on which V depends; None without.
+
+    Attributes
+    ----------
+    undeformed_half_thickness
+        (nodes,) over R, before anything grows.
+    """
+
+    def __init__(
+        self,
+        cells: CellNodes,
+        r0: Array,
+        h: float,
+        volume_factors: Array,
+        keeps_volume: NDArray[np.bool_],
+        same_place: Longs,
+        amplitude: SettableNumber | None = None,
+    ) -> None:
+        self._cells, self._r0, self._keeps_volume = cells, r0, keeps_volume
+        self._thinning_cells = np.flatnonzero(keeps_volume)
+        self._same_place, self.amplitude = same_place, amplitude
+        self._place_numbers = same_place[cells.nodes]
+        self._components = r0.shape[1]  # of a displacement
+        all_cells = slice(None)
+        J0 = self._areas(r0, all_cells)
+        volumes = [self._sum_at_nodes(all_cells, factor * J0) for factor in volume_factors]
+        self._volume_coefficients = h / 2 * np.array(volumes)
+        self._thickness_factor = volume_factors[0]
+        self._volume_per_factor = h / 2 * volume_factors / volume_factors[0]
+        self._fixed_area = self._sum_at_nodes(~keeps_volume, J0[~keeps_volume])
+        self.undeformed_half_thickness = np.asarray(
+            self._volume_coefficients[0] / self._sum_at_nodes(all_cells, J0)
+        )
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the thickness does not depend on the displacement."""
+        return not len(self._thinning_cells)
+
+    @property
+    def growth(self) -> float:
+        """The present value of the amplitude; 0 without."""
+        return float(self.amplitude.value) if self.amplitude is not None else 0.0
+
+    def half_thickness(self, u: Array) -> Array:
+        """Return H (nodes,) over R at a displacement (nodes, 3)."""
+        return np.asarray(self._half_volumes() / self._areas_at_nodes(u))
+
+    def growth_derivative(self, u: Array, order: int = 1) -> Array:
+        """Return the derivative (nodes,) of H by the amplitude."""
+        return np.asarray(self._half_volumes(order) / self._areas_at_nodes(u))
+
+    def slope(self, u: Array, f: Array) -> Array:
+        """Return the derivative (nodes, 3) of sum f H by the displacement, with f (nodes,)."""
+        if self.is_constant:
+            return np.zeros_like(u)
+        return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(len(u), -1))
+
+    def jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
+        """Return the sparse derivative (nodes, 3 nodes) of H, with rows of the needed nodes."""
+        area = self._areas_at_nodes(u)
+        return scipy.sparse.diags_array(
+            np.where(is_needed, -self._half_volumes() / area**2, 0.0)
+        ) @ self._area_jacobian(u, is_needed)
+
+    def change(self, u: Array, w: Array) -> Array:
+        """Return the derivative (nodes,) of H along w (nodes, 3)."""
+        if self.is_constant:
+            return 0 * u[:, 0]
+        return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel())
+
+    def volumes_and_areas(self, u: Array) -> tuple[Array, Array]:
+        """Return the volumes and areas (nodes,) whose ratio is H."""
+        return self._half_volumes(), self._areas_at_nodes(u)
+
+    def by_factor(self, by_volume: Array) -> Array:
+        """Return derivatives (cells, functions) by the factor of h, of those (nodes,) by the
+        volumes.
+        """
+        by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[self._place_numbers]
+        volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
+        return np.asarray(by_place_volume * volume_per_factor * self._areas(self._r0, slice(None)))
+
+    def by_area(self, by_volume: Array, by_area: Array) -> Array:
+        """Return derivatives (nodes, 3) by the undeformed place, of those by volumes and areas.
+
+        Only what of these depends on the undeformed place alone counts.
+        """
+        at_volumes, at_areas = (
+            np.bincount(self._same_place, f, len(f))[self._place_numbers] for f in (by_volume, by_area)
+        )
+        volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
+        by_J0 = at_volumes * volume_per_factor * self._thickness_factor
+        by_J0 += at_areas * ~self._keeps_volume[:, None]
+        loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
+        forces = np.zeros(self._r0.size)
+        by_place = np.einsum("cq,cqm->cm", by_J0[loaded_cells], self._area_slopes(0 * self._r0, loaded_cells))
+        np.add.at(forces, self._unknowns_of_cells(loaded_cells), by_place)
+        return forces.reshape(self._r0.shape)
+
+    def slope_by_growth(self, u: Array, f: Array) -> Array:
+        """Return the derivative (nodes, 3) of sum f dH, with dH by the amplitude."""
+        weight = -f * self._half_volumes(1) / self._areas_at_nodes(u) ** 2
+        return np.asarray((self._area_jacobian(u, f != 0).T @ weight).reshape(len(u), -1))
+
+    def hessian(self, u: Array, f: Array) -> Any:
+        """Return the sparse second derivative (3 nodes, 3 nodes) of sum f H."""
+        loaded_cells, areas = self._cells_around(f != 0), self._areas_at_nodes(u)
+        area_jacobian = self._area_jacobian(u, f != 0)
+        weight = -f * self._half_volumes() / areas**2
+        at_places = np.bincount(self._same_place, weight, len(weight)).astype(float)
+        of_areas = area_jacobian.T @ scipy.sparse.diags_array(-2 * weight / areas) @ area_jacobian
+        H = self._area_hessians(u, loaded_cells, at_places[self._place_numbers[loaded_cells]])
+        dofs = self._unknowns_of_cells(loaded_cells)
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+        blocks = H.ravel(), (rows.ravel(), columns.ravel())
+        return of_areas + scipy.sparse.coo_array(blocks, of_areas.shape).tocsr()
+
+    def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
+        """Return entries of a second derivative by u, of one by the places and H of nodes.
+
+        Parameters
+        ----------
+        f
+            (nodes,) the first derivative by H.
+        """
+        rows, columns, values = entries
+        count = self._components * len(f)
+        size = count + len(f)
+        if self.is_constant:
+            is_of_places = (rows < count) & (columns < count)
+            return rows[is_of_places], columns[is_of_places], values[is_of_places]
+        is_coupled = np.zeros(size, dtype=bool)
+        is_coupled[rows] = True
+        unknowns_by_u = scipy.sparse.vstack(
+            [scipy.sparse.eye_array(count), self.jacobian(u, is_coupled[count:])]
+        ).tocsr()
+        K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
+        i, j, v = scipy.sparse.find(unknowns_by_u.T @ K @ unknowns_by_u + self.hessian(u, f))
+        return i.astype(np.int64), j.astype(np.int64), v
+
+    def coupled_pairs(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
+        """Return pairs of nodes that act on each other, where places and H at pairs of nodes do."""
+        if self.is_constant:
+            return rows, columns
+        nodes, count = self._place_numbers, len(self._r0)
+        cell_rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+        cells_to_places = scipy.sparse.coo_array(
+            (np.ones(nodes.size), (cell_rows, nodes.ravel())), (len(nodes), count)
+        ).tocsr()
+        cells_to_nodes = scipy.sparse.coo_array(
+            (np.ones(nodes.size), (cell_rows, self._cells.nodes.ravel())), cells_to_places.shape
+        ).tocsr()
+        to_place_numbers = scipy.sparse.coo_array(
+            (np.ones(count), (np.arange(count), self._same_place)), (count, count)
+        ).tocsr()
+        nodes_of_thickness = scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
+        couplings = scipy.sparse.coo_array(
+            (np.ones(len(rows)), (rows, columns)), (count, count)
+        ).tocsr()
+        i, j = (nodes_of_thickness.T @ couplings @ nodes_of_thickness).nonzero()
+        return i.astype(np.int64), j.astype(np.int64)
+
+    def _half_volumes(self, order: int = 0) -> Array:
+        """Return (h/2) sum V at all nodes, or its derivative of an order by the amplitude."""
+        powers = np.polynomial.polynomial
+        return np.asarray(powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order)))
+
+    def _areas_at_nodes(self, u: Array) -> Array:
+        return self._fixed_area + self._sum_at_nodes(self._thinning_cells, self._areas(self._r0 + u, self._thinning_cells))
+
+    def _sum_at_nodes(self, cells: Any, values: Array) -> Array:
+        """Return sums at nodes of values (cells, functions) in some cells."""
+        sums = np.bincount(self._place_numbers[cells].ravel(), values.ravel(), len(self._r0))
+        return np.asarray(sums[self._same_place], dtype=float)
+
+    def _cells_around(self, is_needed: NDArray[np.bool_]) -> Longs:
+        """Return the cells that keep their volume and have any of the needed nodes."""
+        needs_place = np.bincount(self._same_place, is_needed, len(is_needed)) > 0
+        return np.flatnonzero(needs_place[self._place_numbers].any(axis=1) & self._keeps_volume)
+
+    def _area_jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
+        """Return derivatives (nodes, 3 nodes) of the areas, with rows of the needed nodes."""
+        cells = self._cells_around(is_needed)
+        slope, places = self._area_slopes(u, cells), self._place_numbers[cells]
+        rows, columns = np.broadcast_arrays(places[:, :, None], self._unknowns_of_cells(cells)[:, None, :])
+        size = len(self._r0), self._components * len(self._r0)
+        return scipy.sparse.coo_array(
+            (slope.ravel(), (rows.ravel(), columns.ravel())), size
+        ).tocsr()[self._same_place]
+
+    def _unknowns_of_cells(self, cells: Longs) -> Longs:
+        """Return numbers of the displacement's unknowns in some cells."""
+        return unknown_numbers(self._cells.nodes[cells], len(self._r0), self._components, self._components)
+
+    # of surfaces
+
+    @cached_property
+    def _slope_table(self) -> Array:
+        """The derivatives (2, places, functions) of shape functions at the nodes."""
+        return np.asarray(self._cells.element.tabulate(1, self._cells.element.points)[1:, :, :, 0])
+
+    def _areas(self, r: Array, cells: Any) -> Array:
+        a1, a2 = np.einsum("dqk,cki->dcqi", self._slope_table, r[self._cells.nodes[cells]])
+        return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
+
+    def _area_slopes(self, u: Array, cells: Longs) -> Array:
+        """Return derivatives (cells, places, dofs) of areas by what moves the nodes of their cells.
+        """
+        return self._area_vectors(u, cells).slope
+
+    def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
+        """Return second derivatives (cells, dofs, dofs) of areas times w (cells, places)."""
+        vectors = self._area_vectors(u, cells)
+        T, slope = vectors.by_node, vectors.slope
+        H = np.einsum("cqmi,cqni->cmn", T * (w / vectors.J)[..., None, None], T)
+        H -= np.einsum("cqm,cqn->cmn", slope * (w / vectors.J)[..., None], slope)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            twist = np.einsum("cq,qm,qn->cmn", w * vectors.normal[..., k], *self._slope_table)
+            twist -= np.swapaxes(twist, 1, 2)
+            H[:, i::3, j::3] += twist
+            H[:, j::3, i::3] -= twist
+        return np.asarray(H)
+
+    def _area_vectors(self, u: Array, cells: Longs) -> _AreaVectors:
+        a1, a2 = np.einsum("dqk,cki->dcqi", self._slope_table, (self._r0 + u)[self._cells.nodes[cells]])
+        n = np.cross(a1, a2)
+        J = np.linalg.norm(n, axis=-1)
+        slopes1, slopes2 = self._slope_table[..., None]
+        # the derivative along e is e x rotation_vectors
+        rotation_vectors = slopes1 * a2[:, :, None] - slopes2 * a1[:, :, None]
+        by_node = np.cross(np.eye(3), rotation_vectors[..., None, :])
+        return _AreaVectors(J, n / J[..., None], by_node.reshape(*J.shape, 3 * J.shape[1], 3))
+
+
+def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3) -> Longs:
+    """Return numbers (n, components functions) of the unknowns at nodes (n, functions).
+
+    The unknowns of places come first, `dim` of each of `count` nodes; those of H, the last of the
+    components where these are more than `dim`, come after all of them.
+    """
+    of_place = dim * nodes[:, :, None] + np.arange(dim)
+    dofs = np.concatenate([of_place, dim * count + nodes[:, :, None]], axis=2)[..., :components]
+    return np.asarray(dofs.reshape(len(nodes), components * nodes.shape[1]))

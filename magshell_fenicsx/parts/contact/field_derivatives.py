@@ -1,0 +1,247 @@
+"""Derivatives of a contact's energy by the growth of its faces, the thickness and the placement.
+
+The gap depends on half the thickness H at nodes, H = V/A with V = (h/2) sum t J0 of the cells
+around (see `face_offsets`), and on the places r0 + u; the energy is a sum over points with the
+weights J0(X). So of e Pi + f w . Pi,u the derivative is
+
+    by t:  (h/2) J0 g_V,    g_V = g/A + f Pi,H (H,u w)/V,    g = e Pi,H + f (Pi,Hu w + Pi,HH H,u w),
+
+and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay
+in their cells.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.parts.contact.face_offsets import CellNodes, FaceOffsets
+from magshell_fenicsx.parts.contact.gap_derivatives import distance_slopes, forces_on_nodes
+from magshell_fenicsx.parts.contact.projection import JoinedPlaces, Longs, Projections
+from magshell_fenicsx.parts.contact.segments import ContactPoints
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.contact.meridian_projection import MeridianProjections, MeridianPoints
+
+Array = NDArray[np.float64]
+Penalty = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class ContactFields:
+    """The fields that a gap depends on.
+
+    Attributes
+    ----------
+    r0, thickness
+        The undeformed place, and the factor of h; None for 1.
+    nodes
+        (cells, functions) of all cells that are modelled.
+    own
+        The rows of this rank's cells.
+    """
+
+    r0: fem.Function
+    thickness: fem.Function | None
+    nodes: Longs
+    own: slice
+
+    def shared_by_cells(self, forces: Array) -> Array:
+        """Return forces (nodes, d) as parts (own cells, functions, d), equal in all cells."""
+        count = np.bincount(self.nodes.ravel(), minlength=len(forces))
+        shares = forces / np.maximum(count, 1)[:, None]
+        return np.asarray(shares[self.nodes[self.own]])
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """A contact at a state; all is of this rank's points.
+
+    Attributes
+    ----------
+    r0, u
+        (nodes, 3) of all nodes.
+    penalties
+        The penalty of joined places, with its derivatives by the penetration.
+    forces
+        (nodes, 3 or 4) derivatives of the energy by places and H.
+    find_entries_by_place_and_offset, find_entries
+        Return second derivatives by places and H, and by u.
+    geometry
+        Returns distances, normals, and beta with its nodes, of places; see `gap_geometry`.
+    """
+
+    cells: CellNodes
+    r0: Array
+    u: Array
+    offsets: FaceOffsets | None
+    points: "ContactPoints | MeridianPoints"
+    places: "Projections | MeridianProjections"
+    joined: JoinedPlaces
+    penalties: Penalty
+    forces: Array
+    find_entries_by_place_and_offset: Callable[[], Entries]
+    find_entries: Callable[[], Entries]
+    geometry: Callable[[Any], tuple[Array, Array, Array, Longs]]
+
+    @cached_property
+    def required_offsets(self) -> FaceOffsets:
+        """The offsets, of a contact whose thickness varies."""
+        assert self.offsets
+        return self.offsets
+
+    def force_rates(self, rates: Array) -> Array:
+        """Return the rates (nodes, 4) of the forces, of those of places and H."""
+        rows, columns, values = self.find_entries_by_place_and_offset()
+        flat = np.concatenate([rates[:, :-1].ravel(), rates[:, -1]])
+        product = np.bincount(rows, values * flat[columns], len(flat))
+        count = self.r0.size
+        return np.column_stack([product[:count].reshape(self.r0.shape), product[count:]])
+
+    def unknown_rates(self, w: Array) -> Array:
+        """Return the rates of places and H along w (nodes, 3)."""
+        return np.column_stack([w, self.offsets.change(self.u, w)]) if self.offsets else w
+
+    def forces_on_nodes(self, forces: Array) -> Array:
+        """Return the forces by u, see `gap_derivatives.forces_on_nodes`."""
+        return forces_on_nodes(self.offsets, self.u, forces)
+
+    def weight_slopes(self, tables: Array, places: Array) -> Array:
+        """Return relative derivatives (n, functions, 3) of the points' weights by nodes.
+
+        Parameters
+        ----------
+        tables, places
+            Shape functions at points with their derivatives (3, n, functions), and so the places
+            (3, n, 3).
+        """
+        n = np.cross(*places[1:])
+        n = n / np.sum(n * n, axis=1)[:, None]
+        by_first = np.cross(places[2], n)[:, None]
+        by_second = np.cross(n, places[1])[:, None]
+        return np.asarray(tables[1][..., None] * by_first + tables[2][..., None] * by_second)
+
+    def penetration_rates(self, w: Array) -> Array:
+        """Return the rates of the penetrations of joined places along w (nodes, 3)."""
+        _, n, beta, nodes = self.geometry(self.places)
+        rates = self.unknown_rates(w)
+        slopes = distance_slopes(n, beta, rates.shape[1])
+        closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
+        joined = self.joined
+        closing = np.bincount(joined.group, joined.weight * closing, len(joined.first))
+        return closing.astype(float)
+
+
+@dataclass(frozen=True)
+class GrowthDerivative:
+    """A derivative of the energy by the natural stretch, on which the offsets of faces depend.
+
+    Attributes
+    ----------
+    find_state
+        Returns the contact at the present state.
+    add
+        Adds forces (nodes, 3) to a vector; collective.
+    order
+        Of the derivative, 1 or 2.
+    """
+
+    find_state: Callable[[], ContactState]
+    add: Callable[[Array, Array], None]
+    order: int = 1
+    amplitude: str | None = None
+
+    def energy(self) -> float:
+        """Return the derivative of this rank's energy."""
+        state = self.find_state()
+        offsets, u = state.required_offsets, state.u
+        of_forces = 0.0
+        if self.order == 2:
+            of_forces = float(_growth_forces(state)[:, -1] @ offsets.growth_derivative(u))
+        return of_forces + float(state.forces[:, -1] @ offsets.growth_derivative(u, self.order))
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor times the gradient of the first derivative; collective."""
+        state = self.find_state()
+        forces = state.forces_on_nodes(_growth_forces(state))
+        forces = forces + state.required_offsets.slope_by_growth(state.u, state.forces[:, -1])
+        self.add(b, factor * forces)
+
+
+def with_growth(
+    growth: FreeParameter,
+    find_state: Callable[[], ContactState],
+    add: Callable[[Array, Array], None],
+) -> FreeParameter:
+    """Return the parameter of growth with the derivatives of a contact by it among its own."""
+
+    def second_derivatives(q: object) -> Sequence[Derivative]:
+        of_contact = [GrowthDerivative(find_state, add, 2)] if q is growth.constant else []
+        return [*growth.differentiate_slopes(q), *of_contact]
+
+    slopes = [*growth.slopes, GrowthDerivative(find_state, add)]
+    return replace(growth, slopes=slopes, differentiate_slopes=second_derivatives)
+
+
+def _growth_forces(state: ContactState) -> Array:
+    """Return the rates of the forces (nodes, 4) as the faces grow and nothing moves."""
+    rates = state.required_offsets.growth_derivative(state.u)
+    return state.force_rates(np.column_stack([0 * state.u, rates]))
+
+
+@dataclass(frozen=True)
+class EnergyWeights:
+    """Weights of the sum energy Pi + force w . Pi,u, with w (nodes, 3)."""
+
+    w: Array
+    energy: float
+    force: float
+
+
+def by_factor(state: ContactState, weights: EnergyWeights) -> Array:
+    """Return the sum's derivatives (cells, functions) by the factor of h in the cells."""
+    return state.required_offsets.by_factor(_by_volumes(state, weights)[0])
+
+
+def by_place(state: ContactState, weights: EnergyWeights) -> Array:
+    """Return the sum's derivatives (nodes, 3) by the undeformed place."""
+    rows, columns, values = state.find_entries()
+    rates = np.bincount(rows, values * weights.w.ravel()[columns], state.r0.size)
+    forces = weights.energy * state.forces_on_nodes(state.forces)
+    forces = forces + weights.force * rates.reshape(state.r0.shape) + _by_weights(state, weights)
+    return forces + state.offsets.by_area(*_by_volumes(state, weights)) if state.offsets else forces
+
+
+def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Array]:
+    """Return the sum's derivatives (nodes,) by the volumes V, and by the areas A."""
+    H_w = state.required_offsets.change(state.u, weights.w)
+    force_rates = state.force_rates(np.column_stack([weights.w, H_w]))
+    g = weights.energy * state.forces[:, -1] + weights.force * force_rates[:, -1]
+    volume, area = state.required_offsets.volumes_and_areas(state.u)
+    by_H_w = weights.force * state.forces[:, -1] * H_w
+    return g / area + by_H_w / volume, -(g * volume / area + 2 * by_H_w) / area
+
+
+def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
+    """Return what the sum (nodes, 3) changes by as the areas around the points do."""
+    forces = np.zeros_like(state.r0)
+    if not len(state.places.point):
+        return forces
+    value, first, _ = state.penalties
+    points, point = state.points, state.places.point[state.joined.first]
+    rates = state.penetration_rates(weights.w)
+    of_places = (weights.energy * value + weights.force * first * rates) / 2
+    per_weight = np.bincount(point, of_places, len(points.cell))
+    pressed = np.unique(point)
+    element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed]]
+    tables = element.tabulate(1, points.shape[pressed] @ element.points)[..., 0]
+    slopes = state.weight_slopes(tables, np.einsum("dnk,nki->dni", tables, state.r0[nodes]))
+    of_points = per_weight[pressed] * points.weight[pressed]
+    np.add.at(forces, nodes, of_points[:, None, None] * slopes)
+    return forces

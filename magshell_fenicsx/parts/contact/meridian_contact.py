@@ -1,0 +1,629 @@
+"""Contact of shells with one axis on their meridians: the penalty of the gap as on surfaces.
+
+A point x of one curve has the closest place y of the other. Both curves have points, so that each
+has half of the penalty. With d = |x - y|, n = (x - y)/d, F = d^2/2,
+A = F,ss = |y'|^2 - (x - y) . y'' and changes D = dx - dy:
+
+    d,uu = [D . D - (n . D)^2 - C_s^2/A - C_theta^2/B]/d,   C_s = -D . y' - (x - y) . dy',
+    B = rho_x rho_y
+
+Where the thickness varies d is the least of |x - y| - H(y), less H(x), plus h, with half the
+thickness H. Then n . y' is -H', C_s has y' less its part along n, and A is
+|y'|^2 - (x - y) . y'' - H'^2 - |x - y| H''. H less h/2 is a third component of places.
+
+Along e_theta the closest place moves as it does along the curve. A wave (U cos, V sin, W cos) of
+m theta moves it by C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves
+it stays. The points are those of a rule on each cell. At a free end one is next to the end, which
+an edge stands on. docs/theory.md, Contact.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from zlib import crc32
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.contact.closest_points import STEEP_COSINE, gap_between_supports
+from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL, Pair
+from magshell_fenicsx.parts.contact.face_offsets import unknown_numbers
+from magshell_fenicsx.parts.contact.field_derivatives import (
+    ContactFields,
+    ContactState,
+    EnergyWeights,
+    by_factor,
+    by_place,
+)
+from magshell_fenicsx.parts.contact.gap_derivatives import distance_slopes
+from magshell_fenicsx.parts.contact.meridian_offsets import IN_PLANE, MeridianOffsets
+from magshell_fenicsx.parts.contact.meridian_projection import (
+    COMPONENT_SIGNS,
+    DISTANCE_TOLERANCE,
+    CandidateSearch,
+    MeridianCurves,
+    MeridianProjections,
+    NeighbouringMaterial,
+    distances,
+    no_projections,
+    slopes,
+)
+from magshell_fenicsx.parts.contact.model_surface import PENETRATION_TOLERANCE
+from magshell_fenicsx.parts.contact.projection import (
+    FOLLOW_ITERATIONS,
+    JoinedPlaces,
+    polynomial_bound,
+)
+from magshell_fenicsx.parts.contact.surface_contact import (
+    CROSSING_DISTANCE,
+    FULL_CONTACT_SHARE,
+    MAX_MOTION_PER_SAMPLE,
+    SEARCH_REACH,
+)
+from magshell_fenicsx.parts.contact.time_averaging import (
+    ContactTerm,
+    SampleCache,
+    SampleRates,
+    at_each_sample,
+)
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION, GrownSurface, expanded_penalty, penalty
+
+Array = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ModelMeridian:
+    """The meridians of a model, as contact needs them; every rank has all of them.
+
+    Attributes
+    ----------
+    r0, u
+        Undeformed placement (rho, z) and displacement, in one space.
+    patches
+        Name -> whether each cell belongs to the patch.
+    h
+        Thickness over R; where it varies, that of the first shell.
+    degree
+        Of the quadrature.
+    thickness
+        Factor of h, (1,) per node; None for 1.
+    thins
+        1 in the cells (cells, 1) whose thickness follows from their area, as of rubber, or for all;
+        else 0.
+    natural
+        The natural shape; None if it is the undeformed one.
+    """
+
+    r0: fem.Function
+    u: fem.Function
+    patches: Mapping[str, Flags]
+    h: float
+    degree: int
+    thickness: fem.Function | None = None
+    thins: Array | int = 0
+    natural: GrownSurface | None = None
+
+    @cached_property
+    def nodes(self) -> Longs:
+        """(cells, functions): numbers of nodes, the ends first."""
+        return np.asarray(self.r0.function_space.dofmap.list.astype(np.int64))
+
+    @cached_property
+    def places(self) -> Array:
+        """(nodes, 2) undeformed."""
+        return np.array(self.r0.x.array.reshape(-1, 2))
+
+    @cached_property
+    def curves(self) -> MeridianCurves:
+        """The undeformed curves."""
+        element = self.r0.function_space.element.basix_element
+        return MeridianCurves(element, self.nodes, self.places, self.h)
+
+    @property
+    def fields(self) -> ContactFields:
+        """The fields that gaps depend on."""
+        return ContactFields(self.r0, self.thickness, self.nodes, slice(None))
+
+    @cached_property
+    def offsets(self) -> MeridianOffsets | None:
+        """Half the thickness where it varies or changes with the state; None where it is h/2."""
+        keeps_volume = np.broadcast_to(np.asarray(self.thins) > 0, (len(self.nodes), 1))[:, 0]
+        if self.thickness is None and not keeps_volume.any():
+            return None
+        factor = np.ones(self.nodes.shape)
+        if self.thickness is not None:
+            factor = self.thickness.x.array[self.thickness.function_space.dofmap.list]
+        curves, r0, h = self.curves, self.places, self.h
+        offsets = MeridianOffsets(curves, r0, h, np.array([factor]), keeps_volume)
+        if not (self.natural and self.natural.stretch is not None):
+            return offsets
+        tangents, points = offsets.undeformed_tangents(), curves.element.points
+        rates = self.natural.volume_coefficients(tangents, points)
+        rates[:, ~keeps_volume] = np.eye(4)[0][:, None, None]
+        return MeridianOffsets(curves, r0, h, factor * rates, keeps_volume, self.natural.stretch)
+
+
+class MeridianContact(ContactTerm):
+    """The contact energy of a pair on the meridian; a `Term` and a `NonlocalTerm` of `assembly`.
+
+    Parameters
+    ----------
+    sides
+        (cells,) whether each cell belongs to the first shell, and to the second.
+    """
+
+    def __init__(self, pair: Pair, model: ModelMeridian, sides: tuple[Flags, Flags]) -> None:
+        super().__init__(pair, model.fields, model.offsets)
+        self._h, self._u, self._curves = model.h, model.u, model.curves
+        self._meridian_offsets = model.offsets
+        self._nodes, self._sides, self._r0 = model.nodes, sides, model.places
+        self._points = self._curves.rule(model.degree // 2 + 1, sides)
+        self._normals = self._curves.cell_normals()
+        self._half = np.full(len(self._r0), self._h / 2)
+        if self._offsets:
+            self._half = self._offsets.undeformed_half_thickness
+        self._nodes_of_pair = np.unique(self._nodes[np.any(sides, axis=0)])
+        thickest = 2 * float(self._half[self._nodes_of_pair].max())
+        self._reach = self._h + (SEARCH_REACH - 1) * thickest
+        self._material: NeighbouringMaterial | None = None
+        if np.any(sides[0] & sides[1]):
+            undeformed = np.column_stack([self._r0, self._half])
+            nodal = undeformed[self._nodes]
+            x = self._places_of_points(undeformed)
+            self._material = NeighbouringMaterial(x, nodal, self._nodes, self._points.cell)
+        self._at = np.full_like(self._r0, np.nan)
+        self._growth = 0.0  # the natural stretch at that displacement
+        self._places = no_projections()
+        self._active_sets = SampleCache[tuple[Array, MeridianProjections]]()
+        # the active set of another scene, and its penetrations
+        self._frozen: tuple[MeridianProjections, Array] | None = None
+        self._candidates = CandidateSearch(
+            self._points, self._nodes, sides, self._curves.element, self._material
+        )
+
+    # as a term
+
+    def energy(self) -> float:
+        """Return the energy of the whole shell over E h R^2."""
+        places = self._active_set()
+        return float(self._points.weight[places.point] @ self._penalty(places)[0]) / 2
+
+    def _add(self, b: Array, forces: Array) -> None:
+        b[: forces.size] += forces.ravel()
+
+    def _forces(self) -> Array:
+        """Return the derivative (nodes, 2) by the places of all nodes, or with H (nodes, 3)."""
+        places = self._active_set()
+        weight = self._points.weight[places.point] / 2 * self._penalty(places)[1]
+        _, n, beta, nodes = self._geometry(places)
+        forces = np.zeros((len(self._r0), 3 if self._offsets else 2))
+        by_unknowns = distance_slopes(n, beta, forces.shape[1])
+        np.add.at(forces, nodes, -weight[:, None, None] * by_unknowns)
+        return forces
+
+    def _entries_by_place_and_offset(self) -> Entries:
+        """Return entries of the second derivative by the places of nodes and the offsets H."""
+        return self._block_entries(*self._second_derivative(0.0), [0, 2])
+
+    def _entries(self) -> Entries:
+        entries = self._entries_by_place_and_offset()
+        if not self._offsets:
+            return entries
+        return self._offsets.entries(self._at, entries, self._forces()[:, -1])
+
+    def _block_entries(self, H: Array, nodes: Longs, of_place: list[int]) -> Entries:
+        """Return the entries of blocks by some components of nodes, and by H where it varies.
+
+        Parameters
+        ----------
+        H, nodes
+            (n, dofs, dofs) blocks by (U, V, W, H), at nodes (n, functions).
+        of_place
+            The components among (U, V, W) that are unknowns.
+        """
+        components = [*of_place, 3] if self._offsets else of_place
+        rows_of_block = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, components))
+        dofs = unknown_numbers(nodes, len(self._r0), len(components), len(of_place))
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
+        values = H[:, rows_of_block[:, None], rows_of_block]
+        return rows.ravel(), columns.ravel(), values.ravel()
+
+    @property
+    def pattern_key(self) -> float:
+        """A number of the pairs of cells in contact, see `NonlocalTerm`."""
+        return float(crc32(self._cells_in_contact().tobytes()))
+
+    def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """Return pairs of nodes of cells in contact, see `NonlocalTerm`."""
+        nodes = np.concatenate([self._nodes[cells] for cells in self._cells_in_contact().T], axis=1)
+        return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
+
+    def _cells_in_contact(self) -> Longs:
+        """Return pairs (n, 2) of cells, of the point and of its place."""
+        pairs = [
+            np.column_stack([self._points.cell[places.point], places.cell])
+            for places in at_each_sample(self, self._active_set)
+        ]
+        return np.asarray(np.unique(np.concatenate(pairs), axis=0))
+
+    def entries_of_waves(self, m: float) -> Entries:
+        """Return the entries of the second variation along waves of m theta.
+
+        They are by the coefficients (U + V, V, W), as in `Waves`.
+        """
+        rows, columns, values = self._block_entries(*self._second_derivative(m), [0, 1, 2])
+        if self._meridian_offsets:
+            offsets, by_offset = self._meridian_offsets.waves(m), self._forces()[:, -1]
+            rows, columns, values = offsets.entries(self._at, (rows, columns, values), by_offset)
+        for _ in range(2):  # of rows and columns: with P = U + V, U is P - V
+            is_U = columns % 3 == 0
+            values = np.concatenate([values, -values[is_U]])
+            rows, columns = (
+                np.concatenate([columns, columns[is_U] + 1]),
+                np.concatenate([rows, rows[is_U]]),
+            )
+        return rows, columns, values / 2
+
+    def by_field(
+        self, name: str, direction: fem.Function, energy: float, force: float
+    ) -> tuple[fem.Function, Array] | None:
+        """Return the derivative by the thickness or the placement.
+
+        See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+        """
+        field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
+        if field is None:
+            return None
+        w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
+        state, weights = self._state(), EnergyWeights(w, energy, force)
+        if name == "thickness":
+            return field, by_factor(state, weights)[..., None]
+        return field, self._fields.shared_by_cells(by_place(state, weights))
+
+    def _state(self) -> ContactState:
+        places = self._active_set()
+        each, ones = np.arange(len(places.point)), np.ones(len(places.point))
+        joined = JoinedPlaces(each, each, places.distance, ones, ones == 0)
+        geometry = self._curves, self._r0, self._at, self._offsets, self._points
+        derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
+        return MeridianContactState(
+            *geometry, places, joined, self._penalty(places), self._forces(), *derivatives
+        )
+
+    # what is observed
+
+    def force(self) -> float:
+        """Return the integral of the pressure over the contact, over E h R."""
+        places = self._active_set()
+        return float(self._points.weight[places.point] @ self._penalty(places)[1]) / 2
+
+    def least_gap(self) -> float:
+        """Return the least gap over R; nan where no faces are within the reach."""
+        u = self._displacement()
+        reach = self._reach
+        if not self._material:  # no place is farther than nodes
+            reach = min(reach, self._distance_to_nodes(u) * (1 + DISTANCE_TOLERANCE))
+        least = self._projections(u, reach).distance.min(initial=np.inf)
+        return float(least - self._h) if np.isfinite(least) else np.nan
+
+    def _distance_to_nodes(self, u: Array) -> float:
+        """Return the least distance of points from the nodes of the other shell."""
+        r = self._places_of_nodes(u)
+        x, is_first = self._places_of_points(r), self._points.is_first
+        first, second = (np.unique(self._nodes[side]) for side in self._sides)
+        ways = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
+        return min(float(distances(way).min()) for way in ways)
+
+    def penetration(self) -> float:
+        """Return the largest penetration over R, 0 without contact."""
+        return float((self._h - self._active_set().distance).max(initial=0.0))
+
+    def relative_penetration(self) -> float:
+        """Return the largest penetration over the undeformed thickness there."""
+        places, half = self._active_set(), self._half[self._nodes]
+        shape, own_cell = self._points.shape[places.point], self._points.cell[places.point]
+        at_points = np.sum(shape * half[own_cell], axis=1)
+        at_places = np.sum(self._curves.table(0, places.X)[0] * half[places.cell], axis=1)
+        penetration = self._h - places.distance
+        return float((penetration / (at_points + at_places)).max(initial=0.0))
+
+    def gap_at_supports(self, held: Longs, u: Array) -> float:
+        """Return the least gap over R at nodes that supports hold.
+
+        See `ClosestPointSearch.gap_at_supports`.
+        """
+        if self._offsets and not self._offsets.is_constant:
+            return np.inf
+        first, second = self._sides
+
+        def may_touch(i: Longs, j: Longs) -> Flags:
+            is_pair = first[i] & second[j] | second[i] & first[j]
+            return np.asarray(
+                is_pair & ~self._material.are_near(i, j) if self._material else is_pair
+            )
+
+        return gap_between_supports(held, self._nodes, self._r0, u, self._half, may_touch)
+
+    def refuse_overlap(self) -> None:
+        """See that the shells do not overlap undeformed.
+
+        Raises
+        ------
+        MeshError
+            With the place.
+        """
+        places = self._projections(0 * self._r0, self._h)
+        penetration = self._h - places.distance
+        if len(penetration) and penetration.max() > PENETRATION_TOLERANCE * self._h:
+            deepest = places.point[int(penetration.argmax())]
+            rho, z = self._places_of_points(self._r0)[deepest]
+            where, by = f"{rho:.4g}, 0, {z:.4g}", penetration.max() / self._h
+            raise MeshError(
+                f"contact: {self.pair.words} overlap undeformed, by {by:.4g} h at ({where}) R: "
+                "move them apart"
+            )
+
+    def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
+        """Return what each cell has; see `SurfaceContact.cell_pressures_and_gaps`.
+
+        Returns
+        -------
+        pressure
+            (cells,) the mean over E h/R^2.
+        gap
+            (cells,) the least over R, up to the reach.
+        is_full
+            (cells,) whether all of the cell is pressed.
+        """
+        places, count = self._active_set(), len(self._nodes)
+        cell, weight = self._points.cell, self._points.weight
+        area = np.bincount(cell, weight, count)
+        force_of_places = weight[places.point] * self._penalty(places)[1]
+        at_end, is_steep = self._end_and_steepness(places)
+        own_share = np.where(is_steep & ~at_end, 0.5, 1.0)
+        force = np.bincount(cell[places.point], own_share * force_of_places, count)
+        force = force + np.bincount(places.cell, (1 - own_share) * force_of_places, count)
+        gap = np.full(count, self._reach - self._h)
+        near = self._projections(self._displacement(), self._reach)
+        np.minimum.at(gap, cell[near.point], near.distance - self._h)
+        pressed = np.unique(places.point)
+        pressed_area = np.bincount(cell[pressed], weight[pressed], count)
+        is_full = (area > 0) & (pressed_area > FULL_CONTACT_SHARE * area)
+        return force / np.where(area > 0, area, 1.0), gap, is_full
+
+    def passes_through(self, u: Array, v: Array) -> bool:
+        """Return whether points pass through a curve on the straight way from u to v (nodes, 2).
+
+        Between two samples no point moves, relative to another, by more than a part of the least
+        thickness.
+        """
+        halves = [self._half_at(each)[self._nodes_of_pair] for each in (0 * u, u, v)]
+        least = 2 * min(float(half.min()) for half in halves)
+        motion = v - u
+        motion = motion - [0.0, motion[:, 1].mean()]
+        farthest = 2 * np.linalg.norm(motion, axis=1).max()
+        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least)))
+        reach = CROSSING_DISTANCE * least
+        samples = (u + k / count * (v - u) for k in range(1, count))
+        return any(len(self._projections(each, reach, to_faces=False).point) for each in samples)
+
+    # in a step in time, see `TimeAveragedContact`
+
+    images_pass_through = passes_through
+
+    @property
+    def displacement(self) -> Array:
+        """The present displacement (nodes, 2) of all nodes."""
+        return np.array(self._displacement())
+
+    def sample_rates(self, motion: Array) -> SampleRates:
+        """Return the penalty of the points with its rates along a motion (nodes, 2)."""
+        places = self._active_set()
+        if self._offsets:
+            motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
+        _, n, beta, nodes = self._geometry(places)
+        by_unknowns = distance_slopes(n, beta, motion.shape[1])
+        closing = -np.einsum("nki,nki->n", by_unknowns, motion[nodes])
+        return SampleRates.sum_over_points(
+            len(self._points.weight),
+            places.point,
+            self._h - places.distance,
+            closing,
+            self.stiffness.value,
+            SOFT_PENETRATION * self._h,
+        )
+
+    # geometry
+
+    def _displacement(self) -> Array:
+        if self.sample:
+            return self.sample.u
+        return np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
+
+    def _active_set(self) -> MeridianProjections:
+        """Return the places in contact at the present state, or sample."""
+        u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
+        if self._frozen:
+            self._at, places = np.array(u), self._frozen[0]
+            return self._follow(places) if len(places.point) else places
+        if growth != self._growth or not np.array_equal(u, self._at):
+            self._at, self._places = self._active_sets.get(
+                (u, growth), lambda: self._find_places(np.array(u))
+            )
+            self._growth = growth
+        return self._places
+
+    def _find_places(self, u: Array) -> tuple[Array, MeridianProjections]:
+        """Return a displacement with its places that count."""
+        places = self._projections(u, self._h)
+        return u, places.select(~self._are_left_to_edges(places))
+
+    def _penalty(self, places: MeridianProjections) -> tuple[Array, Array, Array]:
+        """Return the penalty of places, with its derivatives by the penetration."""
+        penetration, k = self._h - places.distance, self.stiffness.value
+        soft = SOFT_PENETRATION * self._h
+        if self._frozen:
+            is_held = self.held is not None
+            return expanded_penalty(
+                penetration, self._frozen[1], k, soft, with_third_order=is_held
+            )
+        penalties = penalty(penetration, k, soft)
+        return self.sample.weigh(places.point, penalties) if self.sample else penalties
+
+    def freeze(self) -> tuple[MeridianProjections, Array]:
+        """Return the active set of the present state, and its penetrations over R."""
+        places = self._active_set()
+        return places, self._h - places.distance
+
+    def expand_about(self, frozen: tuple[MeridianProjections, Array]) -> None:
+        """Take the frozen contact of another scene on the same mesh, see `frozen_contact`."""
+        self._frozen = frozen
+
+    def _follow(self, places: MeridianProjections) -> MeridianProjections:
+        """Return places after a small change, free ones also beyond an end of their cells."""
+        r, X = self._places_of_nodes(self._at), places.X
+        x, nodal = self._places_of_points(r)[places.point], r[self._nodes[places.cell]]
+        for _ in range(FOLLOW_ITERATIONS):
+            pull, curvature, _ = slopes(x, self._curves.jets(X, nodal))
+            X = X + np.where(places.free, pull / np.where(places.free, curvature, 1.0), 0.0)
+        return replace(places, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
+
+    def _places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
+        """Return all nodes (nodes, 3), the third component half the thickness less h/2, or 0."""
+        offset = (self._half_at(u) - self._h / 2) * to_faces
+        return np.column_stack([self._r0 + u, offset])
+
+    def _half_at(self, u: Array) -> Array:
+        return self._offsets.half_thickness(u) if self._offsets else self._half
+
+    def _places_of_points(self, r: Array) -> Array:
+        """Return the points, with the third component of the other sign, see `distances`."""
+        nodal = r[self._nodes[self._points.cell]] * COMPONENT_SIGNS[: r.shape[1]]
+        return np.asarray(np.einsum("nk,nki->ni", self._points.shape, nodal))
+
+    def _projections(
+        self, u: Array, face_reach: float, *, to_faces: bool = True
+    ) -> MeridianProjections:
+        """Return the places that points face at a displacement, one on each side at most.
+
+        Parameters
+        ----------
+        face_reach
+            Largest distance of faces, or of mid-surfaces, over R.
+        """
+        r = self._places_of_nodes(u, to_faces=to_faces)
+        x, nodal = self._places_of_points(r), r[self._nodes]
+        largest_offset = polynomial_bound(nodal[..., 2], self._curves.lebesgue_constant)
+        reach = face_reach + 2 * largest_offset
+        point, cell = self._candidates(x[:, :2], nodal[..., :2], reach)
+        if not len(point):
+            return no_projections()
+        places = self._curves.project(x, nodal, point, cell)
+        near = places.select(places.distance < face_reach)
+        return self._curves.select_nearest(near, x, nodal, self._material)
+
+    def _are_left_to_edges(self, places: MeridianProjections) -> Flags:
+        """Return which places do not count, since the point of a free end is there too.
+
+        They are those of points inside a shell that face the end of another one, steeply; see
+        `ClosestPointSearch.are_left_to_edges`. Normals are undeformed ones, so that the energy is a
+        function of the state.
+        """
+        at_end, is_steep = self._end_and_steepness(places)
+        return np.asarray(at_end & is_steep & ~self._points.is_on_edge[places.point])
+
+    def _end_and_steepness(self, places: MeridianProjections) -> tuple[Flags, Flags]:
+        """Return which places are at a free end, and in a cell that is steep to the point's."""
+        end = (places.X == 1.0).astype(np.int64)
+        at_end = ~places.free & (self._curves.neighbours[places.cell, end] < 0)
+        normals = self._points.normal[places.point] * self._normals[places.cell]
+        cosine = np.abs(np.sum(normals, axis=1))
+        return np.asarray(at_end), np.asarray(cosine < STEEP_COSINE)
+
+    def _geometry(self, places: MeridianProjections) -> tuple[Array, Array, Array, Longs]:
+        """Return distances, normals, and beta (n, functions of both cells) with its nodes."""
+        own_nodes = self._nodes[self._points.cell[places.point]]
+        nodes = np.concatenate([own_nodes, self._nodes[places.cell]], axis=1)
+        r = self._r0 + self._at
+        N, shape = self._points.shape[places.point], self._curves.table(0, places.X)[0]
+        beta = np.concatenate([N, -shape], axis=1)
+        off = np.einsum("nk,nki->ni", beta, r[nodes])
+        d = np.linalg.norm(off, axis=1)
+        return d, off / d[:, None], beta, nodes
+
+    def _second_derivative(self, m: float) -> tuple[Array, Longs]:
+        """Return second derivatives (n, dofs, dofs) of the energy of each place.
+
+        They are by (U, V, W, H) at the nodes of both cells, over the whole circumference, for waves
+        of m theta.
+        """
+        places = self._active_set()
+        _, first, second = self._penalty(places)
+        d, n, beta, nodes = self._geometry(places)
+        off, (count, functions) = d[:, None] * n, beta.shape
+        half, weight = functions // 2, self._points.weight[places.point] / 2
+        r = self._places_of_nodes(self._at)
+        jets = self._curves.jets(places.X, r[self._nodes[places.cell]])
+        shape, along = self._curves.table(1, places.X)
+        A = slopes(self._places_of_points(r)[places.point], jets)[1]
+        y, tangent = jets[0], jets[1, :, :2]
+        across = tangent - np.sum(tangent * n, axis=1)[:, None] * n
+        rows = np.zeros((4, *beta.shape, 4))
+        normal, way, slide, turn = rows
+        normal[..., IN_PLANE] = way[..., IN_PLANE] = beta[..., None] * n[:, None]
+        normal[..., 3] = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
+        slide[..., IN_PLANE] = -beta[..., None] * across[:, None]
+        slide[:, half:, IN_PLANE] -= along[..., None] * off[:, None]
+        slide[:, half:, 3] -= along * d[:, None]
+        turn[..., 1] = -beta * y[:, :1]
+        turn[:, half:, 0] += m * off[:, :1] * shape
+        turn[:, half:, 1] += off[:, :1] * shape
+        turn[:, half:, 2] += m * off[:, 1:] * shape
+        turn[:, half:, 3] += m * d[:, None] * shape
+        B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
+        by_A, by_B = _inverse_where(places.free, A), _inverse_where(B > 0, B)
+        flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
+        factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
+        H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
+        of_places = tension[:, None, None] * beta[:, :, None] * beta[:, None]
+        for i in range(3):
+            H[:, i::4, i::4] += of_places
+        return H, nodes
+
+
+def _inverse_where(condition: Flags, values: Array) -> Array:
+    """Return 1/values where a condition holds, else 0."""
+    return np.where(condition, 1 / np.where(condition, values, 1.0), 0.0)
+
+
+class MeridianContactState(ContactState):
+    """A contact on a meridian at a state."""
+
+    def weight_slopes(self, tables: Array, places: Array) -> Array:
+        tangent = places[1]
+        along = tangent / np.sum(tangent**2, axis=1)[:, None]
+        by_place = tables[1][..., None] * along[:, None]
+        by_place[..., 0] += tables[0] / places[0, :, :1]
+        return np.asarray(by_place)
+
+
+def meridian_contacts(pairs: Sequence[Pair], model: ModelMeridian) -> list[MeridianContact]:
+    """Return the contacts of pairs on meridians.
+
+    Raises
+    ------
+    MeshError
+        If shells of a pair overlap undeformed.
+    """
+    patches = {WHOLE_SHELL: np.ones(len(model.nodes), dtype=bool), **model.patches}
+    made = list[MeridianContact]()
+    for pair in pairs:
+        sides = patches[pair.names[0]], patches[pair.names[1]]
+        made.append(MeridianContact(pair, model, sides))
+        made[-1].refuse_overlap()
+    return made

@@ -1,0 +1,330 @@
+"""The force of a contact between shells in a step in time: its mean along the straight way between
+two displacements.
+
+Contact sets in and ceases within a step, so that its force at one place of the step would create
+energy. The force of a point, and its derivative, are those of Simpson's rule along the way. Where
+that passes a kink of the penalty, factors give the point's force the work that its energy changes
+by, and its derivative that of this quotient: for one place in a straight motion these are the mean
+pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.free_parameters import FreeParameter
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.parts.contact.contact_section import Pair
+from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
+from magshell_fenicsx.parts.contact.field_derivatives import (
+    ContactFields,
+    ContactState,
+    with_growth,
+)
+from magshell_fenicsx.parts.contact.gap_derivatives import forces_on_nodes
+from magshell_fenicsx.parts.gap import PENETRATION_ROUNDING, penalty
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Value = TypeVar("Value")
+SIMPSON_RULE = ((0.0, 1 / 6), (0.5, 4 / 6), (1.0, 1 / 6))  # positions on the way, and weights
+MAX_FACTOR = 4.0  # of a point's force; for one place in a straight motion it is at most 3
+
+
+@dataclass(frozen=True)
+class StepSample:
+    """A displacement on the way of a step, and how the penalty of each point counts there.
+
+    Attributes
+    ----------
+    u
+        (nodes, 2 or 3) of all nodes.
+    first, second
+        (points,) factors of the derivatives of the penalty; None for 1.
+    slope
+        (points,) in place of `first` in the tangent.
+    """
+
+    u: Array
+    first: Array | None = None
+    second: Array | None = None
+    slope: Array | None = None
+
+    def weigh(
+        self, point: NDArray[np.int64], penalties: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Array]:
+        """Return the penalty of places of points with its derivatives, as they count here."""
+        if self.first is None or self.second is None:
+            return penalties
+        value, first, second = penalties
+        return value, self.first[point] * first, self.second[point] * second
+
+
+@dataclass(frozen=True)
+class SampleRates:
+    """The penalty of a contact's points at a sample of a step; (points,) each.
+
+    Attributes
+    ----------
+    value, rate, curvature
+        The penalty, and its derivatives along the whole way; the second is that of a straight
+        motion.
+    segment
+        A number that changes where the penalty passes a kink.
+    """
+
+    value: Array
+    rate: Array
+    curvature: Array
+    segment: Array
+
+    @classmethod
+    def sum_over_points(
+        cls,
+        count: int,
+        point: NDArray[np.int64],
+        penetration: Array,
+        closing: Array,
+        k: float,
+        soft: float,
+    ) -> "SampleRates":
+        """Sum the penalties of places over their points.
+
+        Parameters
+        ----------
+        count
+            Number of points.
+        point, penetration, closing
+            (n,) of each place: its point, its penetration, and by how much this grows along the
+            whole way.
+        k, soft
+            See `penalty`.
+        """
+        value, first, second = penalty(penetration, k, soft)
+        closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft, closing, 0.0)
+        segment = np.digitize(penetration, (0.0, soft)).astype(float)
+        of_places = value, first * closing, second * closing**2, segment
+        return cls(*(np.bincount(point, each, count).astype(float) for each in of_places))
+
+
+class SampleCache(Generic[Value]):
+    """Values at the samples of the last step."""
+
+    def __init__(self) -> None:
+        self._samples = list[tuple[Sequence[Any], Value]]()
+
+    def get(self, state: Sequence[Any], compute: Callable[[], Value]) -> Value:
+        """Return the value at a state, a sequence of arrays and numbers, computed if it is new."""
+        for i, (cached_state, value) in enumerate(self._samples):
+            if all(map(np.array_equal, cached_state, state)):
+                # the begin of a step is asked for at each iteration: it stays longest
+                self._samples.append(self._samples.pop(i))
+                return value
+        value = compute()
+        copied_state = [np.array(each) for each in state]
+        self._samples = [*self._samples[1 - len(SIMPSON_RULE) :], (copied_state, value)]
+        return value
+
+
+class TimeAveragedContact(Protocol):
+    """A contact whose force may be that of a step.
+
+    Attributes
+    ----------
+    samples
+        Those of the step; empty while the contact has the force of the present state.
+    sample
+        The one at which it is evaluated now.
+    """
+
+    pair: Pair
+    samples: Sequence[StepSample]
+    sample: StepSample | None
+
+    @property
+    def displacement(self) -> Array:
+        """The present displacement (nodes, 2 or 3) of all cells; collective."""
+
+    def penetration(self) -> float:
+        """Return the largest penetration over R; collective."""
+
+    def images_pass_through(self, u: Array, v: Array) -> bool:
+        """Return whether points pass through a surface on the way from u to v; collective."""
+
+    def sample_rates(self, motion: Array) -> SampleRates:
+        """Return the penalty of the points at this sample, with its rates along a motion."""
+
+
+def samples_of_step(
+    contact: TimeAveragedContact, begin: Array, end: Array, part: float
+) -> list[StepSample]:
+    """Return the samples whose sum is the force of a contact in a step.
+
+    That is the mean force, and what generalised alpha dissipates. The tangent is by the
+    displacement at a part of the step.
+
+    Parameters
+    ----------
+    begin, end
+        Displacements at both ends of the step.
+    part
+        Of the step at which the system has its forces.
+    """
+    ends = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
+    rates = list[SampleRates]()
+    for u in ends:
+        contact.sample = StepSample(u)
+        rates.append(contact.sample_rates(end - begin))
+    contact.sample = None
+    positions, weights = np.transpose(SIMPSON_RULE)
+    work = weights @ [each.rate for each in rates]
+    curvature = (positions * weights) @ [each.curvature for each in rates]
+    is_kink = np.any([one.segment != other.segment for one, other in pairwise(rates)], axis=0)
+    energy_change = rates[-1].value - rates[0].value
+    end_slope, off_middle = rates[-1].rate - energy_change, part - 0.5
+    of_force = _factor(energy_change, work, is_kink)
+    of_slope = _factor(end_slope, curvature, is_kink)
+    # of a point that opens the force depends on the end of the way by the length of the way alone
+    is_opening = is_kink & (curvature == 0)
+    of_opening = np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0) / part
+    samples = list[StepSample]()
+    for u, (position, weight) in zip(ends, SIMPSON_RULE, strict=True):
+        dissipative = {0.0: -off_middle, 1.0: off_middle}.get(position, 0.0)
+        slope = position * (weight * of_force + dissipative) / part
+        second = position * (weight * of_slope + dissipative) / part
+        samples.append(
+            StepSample(
+                u,
+                np.asarray(weight * of_force + dissipative),
+                np.asarray(second if position else of_opening),
+                np.asarray(slope),
+            )
+        )
+    return samples
+
+
+def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
+    """Return the factors that make computed numbers the target at kinks; 1 elsewhere."""
+    is_changed = is_kink & (computed != 0)
+    ratio = np.divide(target, computed, out=np.ones_like(computed), where=is_changed)
+    return np.clip(ratio, 0.0, MAX_FACTOR)
+
+
+def at_each_sample(
+    contact: TimeAveragedContact, compute: Callable[[], Value], *, tangent: bool = False
+) -> list[Value]:
+    """Return a value at each sample of the step; without a step, at the present state."""
+    if not contact.samples:
+        return [compute()]
+    values = list[Value]()
+    for sample in contact.samples:
+        contact.sample = replace(sample, first=sample.slope) if tangent else sample
+        values.append(compute())
+    contact.sample = None
+    return values
+
+
+@dataclass
+class StateNumber:
+    """A number that a state sets."""
+
+    value: float
+
+
+class ContactTerm:
+    """The base of the contact terms of a pair, on surfaces and on meridians.
+
+    A subclass gives forces and `_entries` at one sample, and fixes its active set in `freeze`.
+
+    Attributes
+    ----------
+    stiffness
+        k of the penalty, over E h/R^2.
+    samples, sample
+        See `TimeAveragedContact`.
+    held
+        The frozen contact that stands for all states; None without, see `hold`.
+    """
+
+    amplitude = None
+    column = ""
+
+    def __init__(self, pair: Pair, fields: ContactFields, offsets: FaceOffsets | None) -> None:
+        self.pair, self.name = pair, f"contact{pair.suffix}"
+        self._fields, self._offsets = fields, offsets
+        self._at: Array = np.zeros((0, 0))  # the displacement of the active set
+        self.group = self.name
+        self.stiffness = StateNumber(pair.stiffness)
+        self.samples: Sequence[StepSample] = ()
+        self.sample: StepSample | None = None
+        self.held: Any = None
+        self._frozen: Any = None
+
+    def hold(self, frozen: Any) -> None:
+        """Take what `freeze` gave at one state for all states, or release it with None."""
+        self.held = self._frozen = None
+        if frozen is not None:
+            self.expand_about(frozen)
+            self.held = frozen
+
+    def expand_about(self, frozen: Any) -> None:
+        """Take the frozen contact of another scene on the same mesh, see `frozen_contact`."""
+        raise NotImplementedError
+
+    @property
+    def history(self) -> dict[str, tuple[StateNumber, float]]:
+        """Its numbers in the history of a state, with defaults; see `FiniteElementSystem`."""
+        return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
+
+    def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor dPi/du; collective."""
+        forces = at_each_sample(self, lambda: self._on_nodes(self._forces()))  # type: ignore[arg-type]
+        self._add(b, factor * np.sum(forces, axis=0))
+
+    def compile_residual(self) -> None:
+        """Do nothing: the term has no forms."""
+
+    compile_tangent = compile_residual
+
+    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
+        """Add nothing: what assembles the other terms adds `entries`."""
+
+    def entries(self) -> Entries:
+        """Return the entries of the tangent, see `NonlocalTerm`."""
+        samples = at_each_sample(self, self._entries, tangent=True)  # type: ignore[arg-type]
+        rows, columns, values = zip(*samples, strict=True)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+    def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
+        """Return the parameters on which the offsets of faces depend, with their derivatives."""
+        amplitude = self._offsets.amplitude if self._offsets else None
+        return {
+            name: with_growth(p, self._state, self._add)
+            for name, p in parameters.items()
+            if p.constant is amplitude
+        }
+
+    def _on_nodes(self, forces: Array) -> Array:
+        # `_at` has been the displacement of the forces since they were computed
+        return forces_on_nodes(self._offsets, self._at, forces)
+
+    def _forces(self) -> Array:
+        """Return the derivative (nodes, dim) of this rank's energy by the places of all nodes.
+
+        (nodes, dim + 1) with that by the offsets H where they vary.
+        """
+        raise NotImplementedError
+
+    def _entries(self) -> Entries:
+        raise NotImplementedError
+
+    def _state(self) -> ContactState:
+        raise NotImplementedError
+
+    def _add(self, b: Array, forces: Array) -> None:
+        """Add forces (nodes, 2 or 3) of this rank's points; collective."""
+        raise NotImplementedError
