@@ -90,8 +90,8 @@ def _derivatives(f: Expr, components: int) -> list[list[Expr]]:
     """Components of f, f' and f''."""
     Df = ufl.grad(f)
     DDf = ufl.grad(Df)
-    every = range(components)
-    return [[f[i] for i in every], [Df[i, 0] for i in every], [DDf[i, 0, 0] for i in every]]
+    indices = range(components)
+    return [[f[i] for i in indices], [Df[i, 0] for i in indices], [DDf[i, 0, 0] for i in indices]]
 
 
 def _vector(*components: Expr) -> Expr:
@@ -230,20 +230,23 @@ class IntegrationDomain:
         """Of some edges of the boundary."""
         return self.measures_on([facets])[0]
 
-    def measures_on(self, parts: Sequence[Facets]) -> list[ufl.Measure]:
+    def measures_on(self, facet_groups: Sequence[Facets]) -> list[ufl.Measure]:
         """Of some parts of the boundary that do not overlap, each of one measure: a form may have
         one alone.
         """
-        facets = np.concatenate(parts)
+        facets = np.concatenate(facet_groups)
         numbers, order = (
-            np.repeat(np.arange(1, len(parts) + 1), [len(each) for each in parts]),
+            np.repeat(
+                np.arange(1, len(facet_groups) + 1),
+                [len(facets_of_group) for facets_of_group in facet_groups],
+            ),
             np.argsort(facets),
         )
         tags = mesh.meshtags(
             self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32)
         )
         ds = ufl.Measure("ds", domain=self.mesh, subdomain_data=tags, metadata=self._along_edges)
-        return [ds(number) for number in range(1, len(parts) + 1)]
+        return [ds(number) for number in range(1, len(facet_groups) + 1)]
 
     @property
     def _along_edges(self) -> dict[str, int]:
@@ -262,8 +265,8 @@ class IntegrationDomain:
         """The jets of the drawn placement and of the displacement from there."""
         if self.initial_placement is None:
             return self.j0, u
-        drawn = self.jet(self.initial_placement)
-        return drawn, self.j0 + u - drawn
+        initial = self.jet(self.initial_placement)
+        return initial, self.j0 + u - initial
 
     def measure(self, density: Density) -> ufl.Measure:
         """Of the cells or edges where a density lives; a form takes a single one for the same
@@ -273,7 +276,7 @@ class IntegrationDomain:
             return self.dS()
         return self.dx(density.quadrature) if density.facets is None else self.ds(density.facets)
 
-    def value(self, density: Density, u: Jet, *, drawn: bool = False) -> Expr:
+    def value(self, density: Density, u: Jet, *, from_initial: bool = False) -> Expr:
         """Of a density; `initial_placement`: of what counts from the drawn placement."""
         r0 = self.j0
         if density.sides == 2:
@@ -286,7 +289,7 @@ class IntegrationDomain:
         if density.facets is not None:
             return density.function(r0, u, self.covector, self.widths[1], *density.parameters)
         return density.function(
-            *(self.jets_from_initial(u) if drawn else (r0, u)), *density.parameters
+            *(self.jets_from_initial(u) if from_initial else (r0, u)), *density.parameters
         )
 
     def integral(self, density: Density, u: Jet) -> ufl.Form:
@@ -299,60 +302,69 @@ class IntegrationDomain:
         density: Density,
         amplitude: str | None = None,
         *,
-        drawn: bool = False,
-        **others: Any,
+        from_initial: bool = False,
+        **attributes: Any,
     ) -> Energy:
-        """That of a density; `initial_placement` as of `value`, `others` are attributes of `Energy`."""
-        virtual, over = density.work, self.measure(density)
+        """That of a density; `initial_placement` as of `value`, `attributes` are attributes of `Energy`."""
+        virtual, measure = density.work, self.measure(density)
 
-        def of(u: Jet) -> ufl.Form:
-            return self.value(density, u, drawn=drawn) * over
+        def form_of(u: Jet) -> ufl.Form:
+            return self.value(density, u, from_initial=from_initial) * measure
 
         def work(u: Jet, v: Jet) -> ufl.Form:
             assert virtual
-            return virtual(self.j0, u, v, *density.parameters) * over
+            return virtual(self.j0, u, v, *density.parameters) * measure
 
         return Energy(
             name,
-            of,
+            form_of,
             amplitude,
             work=work if virtual else None,
             density=density,
-            from_initial=drawn,
-            **others,
+            from_initial=from_initial,
+            **attributes,
         )
 
 
-def surface_domain(r0: fem.Function, drawn: fem.Function | None = None) -> IntegrationDomain:
+def surface_domain(
+    r0: fem.Function, initial_placement: fem.Function | None = None
+) -> IntegrationDomain:
     """The mid-surface, a mesh of triangles."""
-    domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
-    between = ufl.avg(ufl.CellVolume(domain)) / ufl.avg(ufl.FacetArea(domain))
+    mesh_of_surface, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
+    interior_width = ufl.avg(ufl.CellVolume(mesh_of_surface)) / ufl.avg(
+        ufl.FacetArea(mesh_of_surface)
+    )
     return IntegrationDomain(
         r0,
-        lambda f: kin.jet(f, domain),
-        kin.facet_covector(domain),
-        (between, ufl.CellVolume(domain) / ufl.FacetArea(domain)),
+        lambda f: kin.jet(f, mesh_of_surface),
+        kin.facet_covector(mesh_of_surface),
+        (interior_width, ufl.CellVolume(mesh_of_surface) / ufl.FacetArea(mesh_of_surface)),
         rule=cell_quadrature(degree),
         edge_rule=edge_quadrature(degree),
         contact_rule=3 * degree,  # the pressure at the rim of a contact is narrower than an element
         tables=_tables_on_surface,
         variant=basix.LagrangeVariant.gll_warped,
-        initial_placement=drawn,
+        initial_placement=initial_placement,
     )
 
 
-def meridian_domain(r0: fem.Function, drawn: fem.Function | None = None) -> IntegrationDomain:
+def meridian_domain(
+    r0: fem.Function, initial_placement: fem.Function | None = None
+) -> IntegrationDomain:
     """The meridian, a mesh of intervals."""
-    domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
-    along = revolved_jet(r0).r1
+    mesh_of_meridian, degree = (
+        r0.function_space.mesh,
+        r0.function_space.element.basix_element.degree,
+    )
+    tangent = revolved_jet(r0).r1
     width = (
-        ufl.CellVolume(domain) / 2 * ufl.sqrt(ufl.dot(along, along))
+        ufl.CellVolume(mesh_of_meridian) / 2 * ufl.sqrt(ufl.dot(tangent, tangent))
     )  # triangles have half their height
     return IntegrationDomain(
         r0,
         revolved_jet,
         ufl.as_vector(
-            [ufl.FacetNormal(domain)[0], 0]
+            [ufl.FacetNormal(mesh_of_meridian)[0], 0]
         ),  # the length of an edge is then that per radian
         (ufl.avg(width), width),
         rule=2 * degree
@@ -362,18 +374,18 @@ def meridian_domain(r0: fem.Function, drawn: fem.Function | None = None) -> Inte
         tables=_tables_on_meridian,
         variant=basix.LagrangeVariant.gl_isaac,  # inside: on the axis the coordinates are singular
         revolution_factor=2 * np.pi,
-        initial_placement=drawn,
+        initial_placement=initial_placement,
     )
 
 
-def _tables_on_surface(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
-    table, nodes = ShapeTable.tabulate(V.element.basix_element, places), V.dofmap.list
+def _tables_on_surface(V: fem.FunctionSpace, points: Array) -> Callable[[Array], Array]:
+    table, nodes = ShapeTable.tabulate(V.element.basix_element, points), V.dofmap.list
     return lambda nodal: np.asarray(np.moveaxis(table.jets(nodal.reshape(-1, 3)[nodes]), 2, 0))
 
 
-def _tables_on_meridian(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
+def _tables_on_meridian(V: fem.FunctionSpace, points: Array) -> Callable[[Array], Array]:
     """Jets at azimuth zero, as `revolved_jet`, by X in [0, 1]; nodal values are (U, W)."""
-    shapes, nodes = V.element.basix_element.tabulate(2, places)[..., 0], V.dofmap.list
+    shapes, nodes = V.element.basix_element.tabulate(2, points)[..., 0], V.dofmap.list
 
     def jets_of(nodal: Array) -> Array:
         derivatives = np.einsum("dpn,cni->dcpi", shapes, nodal.reshape(-1, 2)[nodes])

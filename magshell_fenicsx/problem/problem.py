@@ -424,7 +424,7 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         refinement=problem.mesh.refinement,
         axis=has_pole,
         largest=min(MAX_MERIDIAN_CELL_SIZE * sqrt(h), meridian.largest),
-        pressed=contact_cells,
+        contact_size=contact_cells,
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
 

@@ -126,7 +126,7 @@ class _ModeWriter:
             try:
                 allows_rigid_motion = self.result.scene_of(number).allows_rigid_motion
                 lowest = shell.lowest(
-                    whole_shell.state(state), section.modes, loose=allows_rigid_motion
+                    whole_shell.state(state), section.modes, allows_rigid_motion=allows_rigid_motion
                 )
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
                 by_point[number] = lowest[: max(section.modes, unstable)]
@@ -288,7 +288,7 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         state = stiffened_equilibrium(scene, state)
         try:
             modes = shell_modes.vibrations(
-                whole_shell.state(state), section.count, loose=scene.allows_rigid_motion
+                whole_shell.state(state), section.count, allows_rigid_motion=scene.allows_rigid_motion
             )
             result.frequencies[number] = modes
             if scene.model.contacts:

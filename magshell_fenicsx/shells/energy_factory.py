@@ -110,14 +110,14 @@ class EnergyFactory:
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
-        whole, u = self.domain.revolution_factor, self.domain.jet(self.u)
-        form, work = whole * energy.form_of(u), None
+        factor, u = self.domain.revolution_factor, self.domain.jet(self.u)
+        form, work = factor * energy.form_of(u), None
         if energy.work:
-            work = whole * energy.work(u, self.domain.jet(ufl.TestFunction(self.u.function_space)))
+            work = factor * energy.work(u, self.domain.jet(ufl.TestFunction(self.u.function_space)))
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
-            given = energy.name, *density, form, self.u, self.log, energy.amplitude
-            term = kind(*given, linear=energy.linear, work=work)
+            arguments = energy.name, *density, form, self.u, self.log, energy.amplitude
+            term = kind(*arguments, linear=energy.linear, work=work)
             term.group, term.column = energy.group or energy.name, energy.column
             return term
 
@@ -145,9 +145,9 @@ class EnergyFactory:
         return self.domain.energy("bending", density, column="bending")
 
     def interior_edges(self) -> Energy:
-        of = edges.fold if self.has_folds else edges.interior
+        edge_energy = edges.fold if self.has_folds else edges.interior
         density = self._elastic_density(
-            Density(of, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
+            Density(edge_energy, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
         )
         if self.creases:
             zero = self._constant(0.0)
@@ -178,11 +178,13 @@ class EnergyFactory:
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
         """A moment per length about the edge's first tangent; in E h R."""
-        past = self._constant(np.array([1.0, 0.0]))
-        density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
+        reference_turn = self._constant(np.array([1.0, 0.0]))
+        density = Density(edges.turning, (self._constant(intensity), reference_turn), facets=facets)
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
         total = self.domain.revolution_factor * self._over_ranks(length)
-        return self.domain.energy(name, density, amplitude, counted=(past, intensity * total))
+        return self.domain.energy(
+            name, density, amplitude, counted=(reference_turn, intensity * total)
+        )
 
     def dead_energies(
         self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
@@ -229,13 +231,13 @@ class EnergyFactory:
         ]
 
     def soft_magnetic(
-        self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None
+        self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> Energy:
         """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
-        sheet, scale = Sheet(field), self._constant(soft.scale)
-        law, *given = self._of_sheet(sheet, soft, applied)
+        sheet, scale = Sheet(field), self._constant(soft_magnet.scale)
+        law, *parameters = self._of_sheet(sheet, soft_magnet, applied)
         parts = FIRST_DERIVATIVES if field.uniform else VALUE_AND_FIRST
-        density = Density(per_area(sheet.energy_per_area), (law, scale, *given), parts=parts)
+        density = Density(per_area(sheet.energy_per_area), (law, scale, *parameters), parts=parts)
         return self.domain.energy(
             TERM, self._with_thickness(density), group="magnetic", column="magnetic"
         )
@@ -247,22 +249,22 @@ class EnergyFactory:
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
-        law, *given = self._of_sheet(sheet, field.soft, applied)
+        law, *parameters = self._of_sheet(sheet, field.soft, applied)
         by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
-            by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *given))
+            by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *parameters))
         return {
             f"induced {name}": self._over_area(self._with_thickness(density))
             for name, density in by_name.items()
         }
 
     def _of_sheet(
-        self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None
+        self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> list[Parameter]:
         """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of
         the field.
         """
-        chi = soft.susceptibility
+        chi = soft_magnet.susceptibility
         law = (
             pattern_field(
                 chi, self.domain.r0, name="susceptibility", key="magnetic.susceptibility", size=1
@@ -273,7 +275,7 @@ class EnergyFactory:
         amplitudes = [
             self.free_constants.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes
         ]
-        if soft.saturation is not None:
+        if soft_magnet.saturation is not None:
             if not self.saturated:  # energy and observed forms share it
                 self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
             law = self.saturated[0]
@@ -293,15 +295,15 @@ class EnergyFactory:
     ) -> PointField:
         """What is known of a material that saturates, at the points of cells."""
         domain, followed = self.domain, (self.domain.r0, self.u)
-        known = PointField(domain.mesh, domain.rule, 2 * SIZE)
-        jets = domain.tables(domain.r0.function_space, known.points)
+        saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
+        jets = domain.tables(domain.r0.function_space, saturation.points)
 
-        def placed() -> list[Array]:
+        def places_and_normals() -> list[Array]:
             r0, u = (jets(f.x.array)[:3] for f in followed)
             areas = [np.cross(r[1], r[2]) for r in (r0 + u, r0)]
             return [r0[0], u[0], *(m / np.linalg.norm(m, axis=-1, keepdims=True) for m in areas)]
 
-        return sheet.saturated(chi, amplitudes, applied, known, followed, placed)
+        return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
@@ -321,14 +323,16 @@ class EnergyFactory:
         terms = [
             domain.energy(
                 name + suffix,
-                self._magnetised(field, of, Br, self._constant(Ba)),
+                self._magnetised(field, density_function, Br, self._constant(Ba)),
                 amplitude,
                 linear=name in LINEAR,
                 group=name,
                 column="magnetic",
             )
             for amplitude, suffix, Ba in directions
-            for name, of in magnetic_densities(field.law, field.energy, thins=thins).items()
+            for name, density_function in magnetic_densities(
+                field.law, field.energy, thins=thins
+            ).items()
         ]
         if field.gradient is not None:
             density = self._magnetised(
@@ -344,14 +348,14 @@ class EnergyFactory:
     def _magnetised(
         self,
         field: Magnetisation,
-        of: Callable[..., Expr],
+        density_function: Callable[..., Expr],
         *parameters: Parameter,
         parts: tuple[str, ...] = FIRST_DERIVATIVES,
     ) -> Density:
         """A density of the remanence with the thickness and, if that thins with F, the natural
         shape.
         """
-        density = Density(per_area(of), parameters, parts=parts)
+        density = Density(per_area(density_function), parameters, parts=parts)
         thins = self.material.law.thins_somewhere and field.law == "deformation"
         return self._with_thickness(self._thinning(density) if thins else density)
 
@@ -360,18 +364,22 @@ class EnergyFactory:
         has none.
         """
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        of, following = (
+        swept, follower_work = (
             self._on_pressed(f) for f in (densities.swept_volume, densities.follower_pressure_work)
         )
         parameters = (unit,) if self.pressed is None else (unit, self.pressed)
         density = Density(
-            of, parameters, parts=VALUE_AND_FIRST, work=None if potential else following
+            swept, parameters, parts=VALUE_AND_FIRST, work=None if potential else follower_work
         )
-        return self.domain.energy("pressure", density, "pressure", drawn=True)
+        return self.domain.energy("pressure", density, "pressure", from_initial=True)
 
-    def _on_pressed(self, of: Callable[..., Expr]) -> Callable[..., Expr]:
+    def _on_pressed(self, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density of a pressure where that acts, whose last parameter is then `pressed`."""
-        return of if self.pressed is None else lambda *given: given[-1][0] * of(*given[:-1])
+        return (
+            density_function
+            if self.pressed is None
+            else lambda *given: given[-1][0] * density_function(*given[:-1])
+        )
 
     def swept_volume(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part when its points move straight to their places, where it
@@ -388,9 +396,13 @@ class EnergyFactory:
             densities.volume, *([self._constant(origin)] if origin.any() else [])
         )
 
-    def _volume_integral(self, of: Callable[..., Expr], *parameters: Expr) -> ufl.Form:
+    def _volume_integral(
+        self, density_function: Callable[..., Expr], *parameters: Expr
+    ) -> ufl.Form:
         jets = self.domain.jets_from_initial(self.domain.jet(self.u))
-        return self.domain.revolution_factor * of(*jets, *parameters) * self.domain.dx()
+        return (
+            self.domain.revolution_factor * density_function(*jets, *parameters) * self.domain.dx()
+        )
 
     def user_energy(
         self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
@@ -399,11 +411,20 @@ class EnergyFactory:
         a term's edge.
         """
         assert term.density
-        still = tuple(
+        reference_parts = tuple(
             part for part in term.placement_parts if part not in term.parts
         )  # asked for of r0 alone
-        of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
-        density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)
+        density_function, parts = (
+            _along(term, term.at_point(term.density)),
+            (*term.parts, *reference_parts),
+        )
+        density = Density(
+            density_function,
+            self._parameters(term),
+            parts=parts,
+            linear=reference_parts,
+            facets=facets,
+        )
         density = self._mass_weighted(density) if term.of_volume else density
         return self.domain.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
@@ -411,8 +432,10 @@ class EnergyFactory:
         """What it observes of the modelled part."""
         parameters = self._parameters(term)
         by_column = {
-            column: Density(_along(term, term.at_point(of)), parameters, facets=facets)
-            for column, of in term.observed.items()
+            column: Density(
+                _along(term, term.at_point(observed_density)), parameters, facets=facets
+            )
+            for column, observed_density in term.observed.items()
         }
         if term.of_volume:
             by_column = {
@@ -437,14 +460,19 @@ class EnergyFactory:
         pressing = Pressing(
             contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
-        of, parts = (thinned_energy, VALUE_AND_FIRST) if thins else (contact_energy, ("r",))
-        density = Density(per_area(of), pressing.parameters, parts, quadrature=rule)
+        contact_density, parts = (
+            (thinned_energy, VALUE_AND_FIRST) if thins else (contact_energy, ("r",))
+        )
+        density = Density(per_area(contact_density), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
-        seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
+        density_functions: dict[str, Callable[..., Expr]] = {
+            "pressure": contact_pressure,
+            "radius": of_radius,
+        }
         by_name = {
-            name: Density(per_area(of), pressing.parameters, quadrature=rule)
-            for name, of in seen.items()
+            name: Density(per_area(contact_density), pressing.parameters, quadrature=rule)
+            for name, contact_density in density_functions.items()
         }
         integrals = {name: self._over_area(density) for name, density in by_name.items()}
         return domain.energy(f"contact {contact.body}", density), pressing, integrals
@@ -469,27 +497,28 @@ class EnergyFactory:
 
     def _thinning(self, density: Density) -> Density:
         """A density of what thins, on the natural shape, and where the law of the shell says so."""
-        law, own = self.material.law, self.cell_materials
+        law, cell_materials = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
-        if own is None or not isinstance(law, LawByShell):
+        if cell_materials is None or not isinstance(law, LawByShell):
             return density
 
-        def of(*arguments: Expr, **keywords: Any) -> Expr:
-            *given, numbers = arguments
+        def thinned(*arguments: Expr, **keywords: Any) -> Expr:
+            *arguments_left, numbers = arguments
             return density.function(
-                *given,
+                *arguments_left,
                 thins=law.with_material(numbers[0], numbers[1], numbers[3]).thins,
                 **keywords,
             )
 
-        return replace(density, function=of, parameters=(*density.parameters, own))
+        return replace(density, function=thinned, parameters=(*density.parameters, cell_materials))
 
     @property
     def law_of_cells(self) -> Law:
         """That of each cell of this rank, for arrays (cells, n) of places in them."""
-        own = self.cell_materials
+        materials = self.cell_materials
         return self.material.law_in(
-            own and own.x.array.reshape(-1, 4)[own.function_space.dofmap.list[:, 0]]
+            materials
+            and materials.x.array.reshape(-1, 4)[materials.function_space.dofmap.list[:, 0]]
         )
 
     def _mass_weighted(self, density: Density) -> Density:
@@ -519,15 +548,15 @@ class EnergyFactory:
         return self._constant(self.sigma)
 
 
-def _along(term: OwnTerm, of: Callable[..., Expr]) -> Callable[..., Expr]:
+def _along(term: OwnTerm, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density of a term per area of the coordinates or, on an edge, per length of its parameter;
     see `Density.function`.
     """
     if term.on is None:
-        return per_area(of)
+        return per_area(density_function)
 
     def on_edge(r0: Jet, u: Jet, m: Expr, width: Expr, *parameters: Expr) -> Expr:
         edge = Edge.of(r0, m)
-        return of(r0, u, edge, *parameters) * edge.stretch
+        return density_function(r0, u, edge, *parameters) * edge.stretch
 
     return on_edge

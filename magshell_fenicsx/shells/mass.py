@@ -103,7 +103,7 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
     return f * kin.area_ratio(model.domain.j0) * dx
 
 
-def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
+def mass_matrix(product: fem.Form, constraints: list[fem.DirichletBC]) -> PETSc.Mat:
     """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
 
     So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
@@ -112,7 +112,7 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
     M.setOption(
         PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True
     )  # the tangent has no entries of held ones
-    compat.add_matrix(M, product, held)
+    compat.add_matrix(M, product, constraints)
     M.assemble()
     return M
 
@@ -127,9 +127,9 @@ class SupportInertia:
     ----------
     mass
         Of all nodes, supports too.
-    at
+    amplitudes_at
         Amplitudes and their rates at a time, at a kink before or after it.
-    carried
+    first_velocity
         The velocity of the supports before the begin; None: they were at rest.
 
     Attributes
@@ -142,30 +142,30 @@ class SupportInertia:
         self,
         system: FiniteElementSystem,
         mass: PETSc.Mat,
-        at: Callable[[float, bool], tuple[Amplitudes, Rates]],
-        carried: Vector | None = None,
+        amplitudes_at: Callable[[float, bool], tuple[Amplitudes, Rates]],
+        first_velocity: Vector | None = None,
     ) -> None:
         assert system.moving
         self._system, self._moving, self._mass, self._at, self._carried = (
             system,
             system.moving,
             mass,
-            at,
-            carried,
+            amplitudes_at,
+            first_velocity,
         )
         self.names = system.moving.names
         self._x, self._y = mass.createVecs()
 
-    def velocity(self, t: float, before: bool) -> Vector:
+    def velocity(self, t: float, is_before: bool) -> Vector:
         """Of nodes that move, zero elsewhere."""
-        if t <= 0 and before:
+        if t <= 0 and is_before:
             return np.zeros(self._system.size) if self._carried is None else self._carried
-        mu, rates = self._at(t, before)
+        mu, rates = self._at(t, is_before)
         return self._sum(rate * self._moving.rate(mu, name) for name, (rate, _) in rates.items())
 
-    def acceleration(self, t: float, before: bool) -> Vector:
+    def acceleration(self, t: float, is_before: bool) -> Vector:
         """Likewise."""
-        mu, rates = self._at(t, before)
+        mu, rates = self._at(t, is_before)
         direct = self._sum(bend * self._moving.rate(mu, name) for name, (_, bend) in rates.items())
         pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
         return direct + self._sum(product * self._moving.bend(mu, a, b) for a, b, product in pairs)
@@ -185,5 +185,5 @@ class SupportInertia:
         return self._system.zero_at_supports(x)
 
     def _sum(self, parts: Iterable[Vector]) -> Vector:
-        whole = np.sum([np.zeros(len(self._system.u.x.array)), *parts], axis=0)
-        return np.array(whole[: self._system.size])
+        total = np.sum([np.zeros(len(self._system.u.x.array)), *parts], axis=0)
+        return np.array(total[: self._system.size])

@@ -174,8 +174,8 @@ class MeridianModel(ThinModel):
         )
         patches, count = meridian.patches, len(meridian.order)
         for name in ("magnetic", "remanence"):
-            if given := getattr(loads, name):
-                loads = self.loads = replace(loads, **{name: given.on(patches, count)})
+            if magnetisation := getattr(loads, name):
+                loads = self.loads = replace(loads, **{name: magnetisation.on(patches, count)})
         self.sigma = default_penalty(degree) if sigma is None else sigma
         shapes = {
             name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()
@@ -185,25 +185,29 @@ class MeridianModel(ThinModel):
         self.cell_materials: fem.Function | None = None
         if material.shells:
             self.cell_materials = material_field(material.shells, meridian.mesh, patches)
-        pressed = on_cells(loads.pressed, meridian) if loads.pressed else None
-        free, shape = dict[str, fem.Constant](), None
+        pressed_cells = on_cells(loads.pressed, meridian) if loads.pressed else None
+        free_constants, shape = dict[str, fem.Constant](), None
         if loads.natural:
-            loads = self.loads = replace(loads, natural=(grown := loads.natural.on(patches, count)))
-            shape = Shape.of(natural_field(grown, cell_geometry(self.r0), V), grown, free)
+            loads = self.loads = replace(
+                loads, natural=(natural := loads.natural.on(patches, count))
+            )
+            shape = Shape.of(
+                natural_field(natural, cell_geometry(self.r0), V), natural, free_constants
+            )
         domain = meridian_domain(self.r0, self.growing and self.growing.initial_placement)
-        of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
-        folded = meridian.largest_fold(self.r0) > FOLD_ANGLE
+        of_shell = material, self.sigma, self.kernels, self.thickness, shape, free_constants
+        is_folded = meridian.largest_fold(self.r0) > FOLD_ANGLE
         creases = Creases.of(loads.joints, meridian) if loads.joints else None
         self.factory = factory = EnergyFactory(
             domain,
             self.u,
             *of_shell,
-            folded,
-            pressed=pressed,
+            is_folded,
+            pressed=pressed_cells,
             creases=creases,
             cell_materials=self.cell_materials,
         )
-        around = Around(meridian, domain)
+        measures = Around(meridian, domain)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         self.supports = {}
@@ -227,12 +231,12 @@ class MeridianModel(ThinModel):
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += self.user_and_body_energies(meridian.ends)
         for name, force in loads.forces.items():
-            self.energies.append(pole_force(name, force, self.force_unit, around, self.kernels))
+            self.energies.append(pole_force(name, force, self.force_unit, measures, self.kernels))
         self.load_size, self.load_sizes = {}, {}
         for name, dead in loads.dead.items():
             if forces(dead):
                 energy, self.load_size[name], self.load_sizes[name] = dead_loads(
-                    name, dead, around, self.kernels
+                    name, dead, measures, self.kernels
                 )
                 self.energies.append(energy)
             self.energies += factory.dead_energies(name, dead, meridian.ends)
@@ -245,7 +249,10 @@ class MeridianModel(ThinModel):
         swept = loads.pressure or closed
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
-        pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
+        pattern, constraints = (
+            next(term for term in terms if term.name == INTERIOR),
+            self.held.held(V),
+        )
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, terms, self.u, self.kernels)
         }
@@ -255,32 +262,42 @@ class MeridianModel(ThinModel):
             parameters |= self.growing.parameters(terms, parameters)
         moves = moving(self.r0, self.supports, loads, self._edge_pressure() if closed else None)
         stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        rule = factory.domain.contact_rule
         self.shell_contacts = []
         if loads.pairs:
-            from magshell_fenicsx.parts.contact.meridian_contact import shell_contacts
+            from magshell_fenicsx.parts.contact.meridian_contact import (
+                ModelMeridian,
+                meridian_contacts,
+            )
 
-            curves = self.r0, self.u, meridian.patches, self.material.h, rule
-            faces = self.thickness, factory.law_of_cells.thins, factory.natural
-            self.shell_contacts = shell_contacts(loads.pairs, *curves, *faces)
-        for each in self.shell_contacts:
-            stiffnesses |= each.history
-            parameters |= each.entered(parameters)
+            model = ModelMeridian(
+                self.r0,
+                self.u,
+                meridian.patches,
+                self.material.h,
+                factory.domain.contact_rule,
+                self.thickness,
+                factory.law_of_cells.thins,
+                factory.natural,
+            )
+            self.shell_contacts = meridian_contacts(loads.pairs, model)
+        for contact in self.shell_contacts:
+            stiffnesses |= contact.history
+            parameters |= contact.entered(parameters)
         self.t_junction_terms: list[MeridianTJunction] = []
-        if any(of is None for of in meridian.joints):
+        if any(joint_cells is None for joint_cells in meridian.joints):
             from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
 
             self.t_junction_terms = meridian_t_junction_terms(self)
-        begun = self.kernels.request_form("volume energy", underived(volume))
+        volume_request = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
             [*terms, *self.shell_contacts, *self.t_junction_terms],
-            held,
+            constraints,
             pattern,
             self.material.h,
             variables=SystemVariables(parameters, moves, stiffnesses),
         )
-        self._volume = begun()
+        self._volume = volume_request()
         self._probe_by_point = {
             name: Probe.at_parameter(*place, self.r0) for name, place in meridian.points.items()
         }
@@ -290,41 +307,51 @@ class MeridianModel(ThinModel):
         """All values that its terms take from the problem, by term, as views; None if a term takes
         others too.
         """
-        touched = self.contacts or self.loads.pairs
+        has_contacts = self.contacts or self.loads.pairs
         follows = (
-            self.growing or touched or self.fields or self.factory.saturated or self.loads.moves
+            self.growing
+            or has_contacts
+            or self.fields
+            or self.factory.saturated
+            or self.loads.moves
         )
         if follows or any(e.density is None or e.reference_turn for e in self.energies):
             return None
-        free = {id(constant) for constant in self.factory.free_constants.values()}  # amplitudes
+        free_constants = {
+            id(constant) for constant in self.factory.free_constants.values()
+        }  # amplitudes
         values = {"placement": [self.r0.x.array]}
         for e in self.energies:
             assert e.density
-            parameters = [p for p in e.density.parameters if id(p) not in free]
+            parameters = [p for p in e.density.parameters if id(p) not in free_constants]
             values[e.name] = [
                 p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters
             ]
         return values
 
     def with_numbers(
-        self, of: "MeridianModel", numbers: SettableNumber, value: float
+        self, model: "MeridianModel", numbers: SettableNumber, value: float
     ) -> "MeridianModel":
         """The same model with the numbers of another one, which all evaluations put in place by
         that value.
         """
         other = copy(self)
         other.system = self.system.with_number("numbers of the case", numbers, value)
-        other.meridian, other.material = of.meridian, of.material
+        other.meridian, other.material = model.meridian, model.material
         other.symmetry_breaking_modes = SymmetryBreakingWaves(
-            self.waves.for_system(other.system, largest_wave_number(of.meridian, of.material.h))
+            self.waves.for_system(
+                other.system, largest_wave_number(model.meridian, model.material.h)
+            )
         )
         return other
 
     @cached_property
     def symmetry_breaking_modes(self) -> SymmetryBreakingWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        of = self.system, self.energies, self.meridian, self.domain, self.held, self.kernels
-        return SymmetryBreakingWaves(Waves(*of, [*self.shell_contacts, *self.t_junction_terms]))
+        arguments = self.system, self.energies, self.meridian, self.domain, self.held, self.kernels
+        return SymmetryBreakingWaves(
+            Waves(*arguments, [*self.shell_contacts, *self.t_junction_terms])
+        )
 
     @property
     def waves(self) -> Waves:
@@ -335,10 +362,10 @@ class MeridianModel(ThinModel):
         """What further deviations add to the placement."""
         return self.meridian.growth(self.V, deviations)
 
-    def at_nodes(self, of: Embedding) -> Array:
+    def at_nodes(self, function: Embedding) -> Array:
         """What a function of charts is at the nodes of each cell, (cells, nodes, ...)."""
         s = self.V.tabulate_dof_coordinates()[:, 0]
-        return np.asarray(of(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
+        return np.asarray(function(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
 
     def chart(self) -> Array:
         """Coordinates (n, 1) of the nodes along the meridian."""
@@ -354,23 +381,23 @@ class MeridianModel(ThinModel):
         motions = self.held.rigid_motions(self.r0)
 
         def unresisted_waves(waves: Array, m: int) -> Array:
-            held = partial(_with_zeros, self.held.unknowns_of_waves(self.r0, m))
-            return unresisted(waves, held, lambda: self.waves.tangent(state, m), comm)
+            with_zeros = partial(_with_zeros, self.held.unknowns_of_waves(self.r0, m))
+            return unresisted(waves, with_zeros, lambda: self.waves.tangent(state, m), comm)
 
         tangent = partial(self.system.tangent, state.u, state.mu)
-        along = unresisted(motions.along, self.system.zero_at_supports, tangent, comm)
+        axial = unresisted(motions.along, self.system.zero_at_supports, tangent, comm)
         return RigidMotions(
-            along, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1)
+            axial, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1)
         )
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """Return a rigid motion that is left free, as a message; empty if there is none."""
-        free = self.rigid_motions(amplitudes)
-        if len(free.along):
+        motions = self.rigid_motions(amplitudes)
+        if len(motions.along):
             return NOT_HELD + "move along (0, 0, 1)"
-        if len(free.across):
+        if len(motions.across):
             turns_alone = (
-                len(free.across) == 1 and np.abs(free.across[0][2::3]).max() > AXIAL_TOLERANCE
+                len(motions.across) == 1 and np.abs(motions.across[0][2::3]).max() > AXIAL_TOLERANCE
             )
             return NOT_HELD + ("turn" if turns_alone else "move along (1, 0, 0)")
         return ""

@@ -122,36 +122,36 @@ class ModelBase:
         self,
         volume: fem.Form,
         points: Mapping[str, Array],
-        beside: Callable[[str], NDArray[np.bool_] | None] | None = None,
+        cells_at_point: Callable[[str], NDArray[np.bool_] | None] | None = None,
     ) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places
         (3,).
 
-        `beside` tells the cells of this rank that may have a vertex; None for all.
+        `cells_at_point` tells the cells of this rank that may have a vertex; None for all.
         """
         self._volume = volume
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
         self._probes = {
-            name: point_entries(V, x, np.ones(3), beside and beside(name))[0]
+            name: point_entries(V, x, np.ones(3), cells_at_point and cells_at_point(name))[0]
             for name, x in points.items()
         }
 
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads of an amplitude, except the moments."""
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
-        one, u = fem.Constant(self.V.mesh, 1.0), self.u
+        unity, u = fem.Constant(self.V.mesh, 1.0), self.u
         forms = [
             FormTerm(
                 name,
-                -ufl.dot(along, u) * on,
+                -ufl.dot(direction, u) * measure,
                 u,
                 self.kernels,
                 name,
                 linear=True,
-                over=one * on if total else None,
+                over=unity * measure if total else None,
             )
-            for along, on, total in dead.spread
+            for direction, measure, total in dead.spread
         ]
         return LinearTerm(name, *dead.entries, self.u, name, forms)
 
@@ -201,9 +201,9 @@ class ModelBase:
     def region(self, state: State, approach: str) -> Region:
         """Where a body touches."""
         pressing, forms = self.contacts[approach]
-        at = self.system.at_state(state)
-        pressure, moment = (at.integral(forms[name]) for name in ("pressure", "radius"))
-        return at.evaluate(
+        evaluation = self.system.at_state(state)
+        pressure, moment = (evaluation.integral(forms[name]) for name in ("pressure", "radius"))
+        return evaluation.evaluate(
             lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0)
         )
 
@@ -213,32 +213,29 @@ class ModelBase:
             return None
         pressings = [pressing for pressing, _ in self.contacts.values()]
 
-        def present() -> Array:
-            each = [pressing.cell_pressures() for pressing in pressings]
+        def pressure_of_cells() -> Array:
+            body_pressures = [pressing.cell_pressures() for pressing in pressings]
             return np.asarray(
                 sum(
                     (
-                        *each,
-                        *(
-                            touching.cell_pressures_and_gaps()[0]
-                            for touching in self.shell_contacts
-                        ),
+                        *body_pressures,
+                        *(contact.cell_pressures_and_gaps()[0] for contact in self.shell_contacts),
                     )
                 )
             )
 
-        return self.system.at_state(state).evaluate(present)
+        return self.system.at_state(state).evaluate(pressure_of_cells)
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
         """Whether the mean in each local cell is the pressure of a contact there, see `Pressing`."""
         pressings = [pressing for pressing, _ in self.contacts.values()]
 
-        def present() -> NDArray[np.bool_]:
-            each = [pressing.evenly_pressed() for pressing in pressings]
-            of_shells = [touching.cell_pressures_and_gaps()[2] for touching in self.shell_contacts]
-            return np.asarray(np.any([*each, *of_shells], axis=0))
+        def flags_of_cells() -> NDArray[np.bool_]:
+            body_flags = [pressing.evenly_pressed() for pressing in pressings]
+            shell_flags = [contact.cell_pressures_and_gaps()[2] for contact in self.shell_contacts]
+            return np.asarray(np.any([*body_flags, *shell_flags], axis=0))
 
-        return self.system.at_state(state).evaluate(present)
+        return self.system.at_state(state).evaluate(flags_of_cells)
 
     def cell_gaps(self, state: State) -> Array | None:
         """The least gap over R in each local cell between parts of the shell, see `SurfaceContact`; None
@@ -247,7 +244,7 @@ class ModelBase:
         if not self.shell_contacts:
             return None
         gaps = self.system.at_state(state).evaluate(
-            lambda: [touching.cell_pressures_and_gaps()[1] for touching in self.shell_contacts]
+            lambda: [contact.cell_pressures_and_gaps()[1] for contact in self.shell_contacts]
         )
         return np.asarray(np.min(gaps, axis=0))
 
@@ -284,20 +281,22 @@ class ThinModel(ModelBase):
 
     def user_and_body_energies(self, edges: Mapping[str, Facets]) -> list[Energy]:
         """The energies of one's own terms and of bodies; sets what is observed of them."""
-        factory, own = (
+        factory, terms_and_facets = (
             self.factory,
             [(term, edges[term.on] if term.on else None) for term in self.loads.own],
         )
-        energies = [factory.user_energy(term, facets) for term, facets in own if term.density]
+        energies = [
+            factory.user_energy(term, facets) for term, facets in terms_and_facets if term.density
+        ]
         self.observed = self.kernels.compile_all(
-            factory.observed(term, facets) for term, facets in own
+            factory.observed(term, facets) for term, facets in terms_and_facets
         )
         if self.loads.magnetic:
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}
         for contact in self.loads.contacts:
-            pressed, pressing, integrals = factory.contact(contact)
-            energies.append(pressed)
+            energy, pressing, integrals = factory.contact(contact)
+            energies.append(energy)
             self.contacts[contact.amplitude] = pressing, self.kernels.compile_all([integrals])
         return energies
 
@@ -312,8 +311,8 @@ class ThinModel(ModelBase):
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """The integral over the undeformed area of what is modelled."""
-        over = self.domain.over_area()
-        return lambda f: self.domain.revolution_factor * over(f)
+        integral = self.domain.over_area()
+        return lambda f: self.domain.revolution_factor * integral(f)
 
     def cells_of_fields(self) -> CellGeometry:
         """Where fields are given by formulas."""

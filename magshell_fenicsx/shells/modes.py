@@ -120,13 +120,15 @@ class ShellModes:
     model: Model
     _products: dict[str, fem.Form] = field(default_factory=dict)
 
-    def lowest(self, state: State, count: int, *, loose: bool = False) -> list[ShellMode]:
+    def lowest(
+        self, state: State, count: int, *, allows_rigid_motion: bool = False
+    ) -> list[ShellMode]:
         """The lowest modes, ascending: of every family `count`, and all that are negative.
 
         Of a tangent that is not symmetric, those of its symmetric part.
 
         Waves count once, though each has a twin turned by a quarter of its length. If the state is
-        the undeformed one of a `loose` shell, its rigid motions are among them, with an eigenvalue
+        the undeformed one of a `allows_rigid_motion` shell, its rigid motions are among them, with an eigenvalue
         of exactly zero. Compiles a mass matrix when it is first called, and the waves' kernels.
 
         Raises
@@ -134,9 +136,13 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
-        return self._lowest(_families(self.model, rest=state if loose else None), state, count)
+        return self._lowest(
+            _families(self.model, rest=state if allows_rigid_motion else None), state, count
+        )
 
-    def vibrations(self, state: State, count: int, *, loose: bool = False) -> list[ShellMode]:
+    def vibrations(
+        self, state: State, count: int, *, allows_rigid_motion: bool = False
+    ) -> list[ShellMode]:
         """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are
         omega^2 rho R^2/E.
 
@@ -149,7 +155,9 @@ class ShellModes:
             See `continuation.modes.lowest_modes`.
         """
         lowest = self._lowest(
-            _families(self.model, vibrating=True, rest=state if loose else None), state, count
+            _families(self.model, vibrating=True, rest=state if allows_rigid_motion else None),
+            state,
+            count,
         )
         return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
 
@@ -209,7 +217,7 @@ def _families(
     factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
     mass = f"{name}mass", displacement_product(model, factor)
 
-    def of(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
+    def family_of_system(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
         return _Family(
             label,
             lambda state: system.tangent(state.u, state.mu),
@@ -220,10 +228,12 @@ def _families(
         )
 
     if isinstance(model, MeridianModel):
-        free = model.rigid_motions(rest.mu) if rest else None
-        along, across = (len(free.along), len(free.across)) if free else (0, 0)
-        around: list[Vector] = [*free.around] if free else []
-        yield of("", model.system, along)
+        free_motions = model.rigid_motions(rest.mu) if rest else None
+        axial_count, transverse_count = (
+            (len(free_motions.along), len(free_motions.across)) if free_motions else (0, 0)
+        )
+        torsions: list[Vector] = [*free_motions.around] if free_motions else []
+        yield family_of_system("", model.system, axial_count)
         waves = model.symmetry_breaking_modes.waves
         wave_mass = f"{name}wave mass", wave_product(model, factor)
         if vibrating:
@@ -233,11 +243,11 @@ def _families(
                 waves.constraints(0),
                 wave_mass,
                 contains=_turns,
-                rigid=len(around) + along,  # its space has the motion along e3 too
-                motions=around,
+                rigid=len(torsions) + axial_count,  # its space has the motion along e3 too
+                motions=torsions,
             )
         for m in range(1, waves.largest + 1):
-            rigid = across if m == 1 else 0
+            rigid = transverse_count if m == 1 else 0
             yield _Family(
                 f"m = {m}",
                 partial(waves.tangent, m=m),
@@ -247,13 +257,13 @@ def _families(
             )
         return
 
-    def free_of(system: FiniteElementSystem) -> int:
+    def free_motion_count(system: FiniteElementSystem) -> int:
         return rigid_motions(system, model.r0, rest.mu) if rest else 0
 
-    yield of("", model.system, free_of(model.system))
+    yield family_of_system("", model.system, free_motion_count(model.system))
     if isinstance(model.symmetry_breaking_modes, AntisymmetricModes):
-        other = model.symmetry_breaking_modes.system
-        yield of("antisymmetric", other, free_of(other))
+        antisymmetric = model.symmetry_breaking_modes.system
+        yield family_of_system("antisymmetric", antisymmetric, free_motion_count(antisymmetric))
 
 
 def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:

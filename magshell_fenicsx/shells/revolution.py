@@ -39,9 +39,9 @@ class Revolution:
         self._model, V = model, model.V
         self.order = order = model.meridian.order
         vertices = V.dofmap.list[order][:, :2]
-        apart = vertices[1:, 0] != vertices[:-1, 1]
-        apart[np.asarray(kinks, dtype=np.int64) - 1] = True
-        begin = np.arange(len(vertices)) + np.cumsum([0, *apart])
+        is_apart = vertices[1:, 0] != vertices[:-1, 1]
+        is_apart[np.asarray(kinks, dtype=np.int64) - 1] = True
+        begin = np.arange(len(vertices)) + np.cumsum([0, *is_apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
         self._at_ends[0, self.ends], self._at_ends[1, self.ends] = (
@@ -95,9 +95,9 @@ class Revolution:
 
     def at_nodes(self, circles: Array) -> Array:
         """Values (n, ...) at the nodes, of those (circles, sectors, ...) on all circles."""
-        kept = np.ones(circles.shape[:2], dtype=bool)
-        kept[self._poles, 1:] = False
-        return np.asarray(circles[kept])
+        is_node = np.ones(circles.shape[:2], dtype=bool)
+        is_node[self._poles, 1:] = False
+        return np.asarray(circles[is_node])
 
     def _derivatives(self, f: fem.Function, points: Array) -> Array:
         """(3, cells, q, components) values, first and second derivatives at reference points (q,
@@ -121,12 +121,12 @@ class Revolution:
         weight
             (cells, 2) of a cell's value in the mean over the two that meet.
         """
-        at = self._means(ends, weight)
-        circles = np.repeat(at[:, None], len(self._basis), axis=1)
-        if at.ndim == 2:
+        means = self._means(ends, weight)
+        circles = np.repeat(means[:, None], len(self._basis), axis=1)
+        if means.ndim == 2:
             circles = (circles[:, :, None] @ self._basis)[:, :, 0]
             circles[self._poles] *= [0.0, 0.0, 1.0]
-        elif at.ndim == 3:
+        elif means.ndim == 3:
             circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
         return self.at_nodes(circles)
 
@@ -145,10 +145,10 @@ class Revolution:
 
     def _swept(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the poles and on the circles."""
-        along = nodal[self.vertices(self._model.V)]
-        along = np.where(self._poles[:, None], along * [0.0, 1.0], along)[:, None]
+        components = nodal[self.vertices(self._model.V)]
+        components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]
         return self.at_nodes(
-            along[:, :, :1] * self._basis[:, 0] + along[:, :, 1:] * self._basis[:, 2]
+            components[:, :, :1] * self._basis[:, 0] + components[:, :, 1:] * self._basis[:, 2]
         )
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
@@ -157,9 +157,9 @@ class Revolution:
         sector = np.arange(sectors)
         ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
         (a, c), (b, d) = (
-            np.moveaxis(each[self.ends], 1, 0) for each in (ring, np.roll(ring, -1, axis=1))
+            np.moveaxis(numbers[self.ends], 1, 0) for numbers in (ring, np.roll(ring, -1, axis=1))
         )
-        begins, ends = (~self._poles[each] for each in self.ends.T)
+        begins, ends = (~self._poles[numbers] for numbers in self.ends.T)
         bands = [(ends, (a, c, d)), (begins, (a, d, b))]
         return np.concatenate(
             [np.stack(corners, axis=-1)[which].reshape(-1, 3) for which, corners in bands]

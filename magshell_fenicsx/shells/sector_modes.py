@@ -74,10 +74,10 @@ class SectorModes:
     def unfold(self, u: Vector) -> Vector:
         """A displacement of the sector as that of the half; collective."""
         half, system = self.half_model, self._model.system
-        whole = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
+        sector_values = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
             half.system.zero_at_supports(
-                np.einsum("nij,nj->ni", self._turns, whole[self._numbers]).ravel()
+                np.einsum("nij,nj->ni", self._turns, sector_values[self._numbers]).ravel()
             )
         )
 
@@ -87,16 +87,16 @@ class SectorModes:
         """
         half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))
-        own = self._own.negative_pivots
+        sector_pivots = self._own.negative_pivots
         self._others.factor(half.system.tangent(state_of_half.u, state_of_half.mu))
-        symmetric = self._others.negative_pivots - own
+        symmetric = self._others.negative_pivots - sector_pivots
         modes = half.symmetry_breaking_modes
         assert isinstance(modes, AntisymmetricModes)
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
-        t = self._turning(state_of_half)
+        turning = self._turning(state_of_half)
         if (
-            t is not None and dot(half.system.comm, t, factors.solve(t)) < 0
+            turning is not None and dot(half.system.comm, turning, factors.solve(turning)) < 0
         ):  # of the tangent on the complement of t
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]
@@ -121,9 +121,9 @@ class SectorModes:
         dofs, element = V.dofmap.list, V.element.basix_element
         table = element.tabulate(1, element.points)[1:, :, :, 0]
         a, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
-        around = np.cross([0.0, 0.0, 1.0], r0[dofs])
+        rotation = np.cross([0.0, 0.0, 1.0], r0[dofs])
         metric = np.einsum("nqdi,nqei->nqde", a, a)
-        c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, around)[..., None])[..., 0]
+        c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, rotation)[..., None])[..., 0]
         by_angle, total, count = (
             np.einsum("nqd,nqdi->nqi", c, du),
             np.zeros_like(u),

@@ -419,7 +419,7 @@ class ShellModel(ThinModel):
             cells = self.moving.cells
             moving_cells = (
                 cells,
-                hessian_integrals(self.r0, self.degree, terms, self.kernels, chosen=cells),
+                hessian_integrals(self.r0, self.degree, terms, self.kernels, cell_mask=cells),
             )
         tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
         density_terms = [term for term in terms if isinstance(term, ShellTerm)]
@@ -444,18 +444,22 @@ class ShellModel(ThinModel):
             SystemVariables(parameters, self.moving, histories),
         )
 
-    def _point_residual(self, terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
+    def _point_residual(
+        self, terms: Sequence[PointTerm], *, one_by_one: bool = False
+    ) -> FastResidual:
         """Return the residual of terms from their densities at points."""
-        return FastResidual(self.r0, self.u, self.degree, terms, self.kernels, apart=apart)
+        return FastResidual(
+            self.r0, self.u, self.degree, terms, self.kernels, one_by_one=one_by_one
+        )
 
     def _free_parameters(
         self, terms: Sequence[Term], density_terms: Sequence[ShellTerm], residual: FastResidual
     ) -> dict[str, FreeParameter]:
         """Return the parameters that vary, by name."""
         factory = self.factory
-        one_by_one = partial(self._point_residual, apart=True)
+        residuals_one_by_one = partial(self._point_residual, one_by_one=True)
         parameters: dict[str, FreeParameter] = {
-            **point_parameters(factory.free_constants, density_terms, one_by_one)
+            **point_parameters(factory.free_constants, density_terms, residuals_one_by_one)
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         for contact in self.shell_contacts:
@@ -487,12 +491,12 @@ class ShellModel(ThinModel):
         if isinstance(self.mirror, Sector):
             return SectorModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._mirrored_facets, self.mirror.normal)
-        held = self._constraints + [
-            support_along(self.V, 1, self._mirrored_facets, along)
-            for along in self.mirror.in_plane_vectors
+        constraints = self._constraints + [
+            support_along(self.V, 1, self._mirrored_facets, direction)
+            for direction in self.mirror.in_plane_vectors
         ]
         sites = self._hessians + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
-        fast = FastTangent(self.u, sites, held)
+        fast = FastTangent(self.u, sites, constraints)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]
         system = self.system
@@ -500,7 +504,7 @@ class ShellModel(ThinModel):
             FiniteElementSystem(
                 self.u,
                 terms,
-                held,
+                constraints,
                 self._pattern_term,
                 system.length,
                 fast,
@@ -524,11 +528,11 @@ class ShellModel(ThinModel):
         """What further deviations add to the placement."""
         return self.midsurface.growth(self.V, deviations)
 
-    def at_nodes(self, of: Embedding) -> NDArray[np.float64]:
+    def at_nodes(self, function: Embedding) -> NDArray[np.float64]:
         """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes,
         ...).
         """
-        return self.midsurface.evaluate(self.V.element.basix_element.points, of)
+        return self.midsurface.evaluate(self.V.element.basix_element.points, function)
 
     def chart(self) -> NDArray[np.float64]:
         """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""
@@ -548,13 +552,13 @@ class ShellModel(ThinModel):
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
-        beside = self.midsurface.cells_of_point(force.point)
+        cells_at_point = self.midsurface.cells_of_point(force.point)
         if force.patch:
             entries = patch_entries(
-                self.r0, x, force.patch, inward, self.degree, self.kernels, beside
+                self.r0, x, force.patch, inward, self.degree, self.kernels, cells_at_point
             )
         else:
-            entries = point_entries(self.V, x, inward, beside)
+            entries = point_entries(self.V, x, inward, cells_at_point)
         return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)
 
 

@@ -124,17 +124,17 @@ class SolidModel(ModelBase):
             loads, own=tuple(term.with_functions(of_place) for term in loads.own)
         )
         hinged = tuple(
-            n
-            for n, c in conditions.items()
-            if n in body.faces and c not in ("free", "clamped", *MIRRORS)
+            name
+            for name, condition in conditions.items()
+            if name in body.faces and condition not in ("free", "clamped", *MIRRORS)
         )
-        free, growing = (
+        free_constants, density_growth = (
             dict[str, fem.Constant](),
             dict[str, Callable[[SolidDensity], SolidDensity]](),
         )
         if loads.natural:
-            shape = body_shape(loads.natural, body, V, free)
-            growing["grown"] = lambda density: grown_in_body(density, shape)
+            shape = body_shape(loads.natural, body, V, free_constants)
+            density_growth["grown"] = lambda density: grown_in_body(density, shape)
         self.factory = factory = TermFactory(
             body,
             self.u,
@@ -142,10 +142,10 @@ class SolidModel(ModelBase):
             material.h,
             self.kernels,
             hinged,
-            free_constants=free,
+            free_constants=free_constants,
             fields=[],
             saturated=[],
-            **growing,
+            **density_growth,
         )
         self._pattern, *areal = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
@@ -168,23 +168,25 @@ class SolidModel(ModelBase):
         for name, force in loads.forces.items():
             patch = outer_patch(body, V, force.point, force.patch, self.kernels)
             self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))
-        on = BodyMeasures(body, V, self.kernels) if loads.dead else None
+        measures = BodyMeasures(body, V, self.kernels) if loads.dead else None
         for name, dead in loads.dead.items():
-            assert on
+            assert measures
             self._terms.append(
-                self.dead_load_term(name, assemble_dead_loads(dead, V, on, self.kernels))
+                self.dead_load_term(name, assemble_dead_loads(dead, V, measures, self.kernels))
             )
             self._terms += [
                 factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
                 for i, m in enumerate(moments(dead))
             ]
             self._terms += [factory.user_energy(term, name) for term in potentials(dead)]
-        self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
+        self._faces = [
+            body.faces[name] for name, condition in conditions.items() if condition == "symmetry"
+        ]
         self.mirror = mirror
         self._sites = body_hessian_integrals(body, self.r0, self._terms, self.kernels)
         at_edges = None
         if closed:
-            in_planes = {name for name, c in conditions.items() if c in MIRRORS}
+            in_planes = {name for name, condition in conditions.items() if condition in MIRRORS}
             curves = {
                 name: self._rim(ends[name], MIDSURFACE_HEIGHT if name in hinged else 1.0)
                 for name in ends
@@ -233,10 +235,10 @@ class SolidModel(ModelBase):
         """Where the pressed surface ends on the faces of an end, at a height over the thickness."""
         links = self.body.mesh.topology.connectivity(2, 3)
         low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
-        inside = (low < height - ROUNDING) & (height < high + ROUNDING)
-        part = (height - low[inside]) / (high - low)[inside]
+        has_height = (low < height - ROUNDING) & (height < high + ROUNDING)
+        part = (height - low[has_height]) / (high - low)[has_height]
         return EdgeCurve.from_facets(
-            self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0)
+            self.V, facets[has_height], level_sides(float(part[0]) if len(part) else 1.0)
         )
 
     @property
@@ -245,19 +247,19 @@ class SolidModel(ModelBase):
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [
-            support_along(self.V, 2, facets, along)
+            support_along(self.V, 2, facets, direction)
             for facets in self._faces
-            for along in directions
+            for direction in directions
         ]
 
-    def _system(self, held: list[Constraint]) -> FiniteElementSystem:
-        near, factory, moving = None, self.factory, self._moving
-        if moving:
-            near = (
-                moving.cells,
-                body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, moving.cells),
+    def _system(self, constraints: list[Constraint]) -> FiniteElementSystem:
+        moving_cells, factory, motion = None, self.factory, self._moving
+        if motion:
+            moving_cells = (
+                motion.cells,
+                body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, motion.cells),
             )
-        fast = FastTangent(self.u, self._sites, held, near)
+        fast = FastTangent(self.u, self._sites, constraints, moving_cells)
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, self._terms, self.u, self.kernels)
         }
@@ -266,11 +268,11 @@ class SolidModel(ModelBase):
         return FiniteElementSystem(
             self.u,
             self._terms,
-            held,
+            constraints,
             self._pattern,
             self.material.h,
             fast,
-            variables=SystemVariables(parameters, moving),
+            variables=SystemVariables(parameters, motion),
         )
 
 
@@ -282,11 +284,11 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
     MeshError
         If the body has no such patch.
     """
-    own = field.on(body.patches, len(body.layer_bounds))
+    by_cell = field.on(body.patches, len(body.layer_bounds))
     return (
-        replace(own, remanent=_layered(field.layers, body))
+        replace(by_cell, remanent=_layered(field.layers, body))
         if field.layers and not field.patches
-        else own
+        else by_cell
     )
 
 
@@ -302,10 +304,10 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
     """A density that takes a `growth`, of that shape."""
 
-    def of(*arguments: Expr) -> Expr:
+    def grown(*arguments: Expr) -> Expr:
         count = len(arguments) - len(shape.parameters)
         return density.function(
             *arguments[:count], growth=growth_in_body(shape, *arguments[count:])
         )
 
-    return replace(density, function=of, parameters=(*density.parameters, *shape.parameters))
+    return replace(density, function=grown, parameters=(*density.parameters, *shape.parameters))

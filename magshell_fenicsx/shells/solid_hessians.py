@@ -71,11 +71,11 @@ class BodyHessianIntegral:
         parts = [cells[i : i + size] for i in range(0, len(cells), size)]
         self._batches = [EntityBatch((part,), rule, np.empty((len(part), 0))) for part in parts]
         self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
-        where = terms[0].density.where
+        place = terms[0].density.where
         self._geometry = [
-            _geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches
+            _geometry(self._jets(batch, X.x.array), place, facet) for batch in self._batches
         ]
-        self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * JET_PARTS)
+        self._g, self._u = self._points.field(SIZES[place]), self._points.field(3 * JET_PARTS)
         self._hessians = {}
         self._pairs: dict[str, BlockPairs] = {}
         self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
@@ -87,18 +87,20 @@ class BodyHessianIntegral:
             self._hessians[term.name] = point_hessian(
                 term.name, W, z, JET_PARTS, pairs, log, at_zero=z is not self._u
             )
-        wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.within_side})
-        self._coupled = BlockPairs(tuple(wanted))
+        pairs_of_terms = sorted(
+            {pair for pairs in self._pairs.values() for pair in pairs.within_side}
+        )
+        self._coupled = BlockPairs(tuple(pairs_of_terms))
         self._contraction = Contraction(rule, self._coupled)
 
     def add(
         self,
         u: Array,
         factors: Mapping[str, float],
-        same: Array,
+        element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices to `same`; see `models.shell.element_hessians.HessianIntegral.add`."""
+        """Add the terms' element matrices to `element_matrices`; see `models.shell.element_hessians.HessianIntegral.add`."""
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:
@@ -115,7 +117,7 @@ class BodyHessianIntegral:
                     factors[name],
                     self._pairs[name],
                 )
-            same[batch.cells[0]] += self._contraction.within_side(blocks, 0)
+            element_matrices[batch.cells[0]] += self._contraction.within_side(blocks, 0)
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
         """(cells, points, 4, 3) of a field."""
@@ -127,7 +129,7 @@ class BodyHessianIntegral:
         """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
-        of = density.work or density.function
+        function = density.work or density.function
         self._varying[term.name] = [
             (target, on_batches(field, self._batches)) for target, field in varying
         ]
@@ -135,21 +137,23 @@ class BodyHessianIntegral:
         def vector(f: fem.Function, start: int) -> Any:
             return ufl.as_vector([f[start + c] for c in range(3)])
 
-        def second(W: Any) -> Any:
+        def hessian_density(W: Any) -> Any:
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
         if density.where == "outer":
-            return second(
-                of(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
+            return hessian_density(
+                function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
         by_reference = ufl.as_matrix(
             [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
         frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.where == "end" else []
-        W = of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters)
-        return second(W) * g[MEASURE]
+        W = function(
+            vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters
+        )
+        return hessian_density(W) * g[MEASURE]
 
 
 def body_hessian_integrals(
@@ -157,7 +161,7 @@ def body_hessian_integrals(
     X: fem.Function,
     terms: Sequence[Term],
     log: KernelLog,
-    chosen: NDArray[np.bool_] | None = None,
+    cell_mask: NDArray[np.bool_] | None = None,
 ) -> list[BodyHessianIntegral]:
     """The sites of the terms that have a tangent, one for each quadrature, on all or some local
     cells. Collective.
@@ -168,21 +172,21 @@ def body_hessian_integrals(
     for degree in sorted({t.density.degree for t in nonlinear if t.density.where == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
-        counted = cells if chosen is None else cells[chosen[cells]]
+        counted_cells = cells if cell_mask is None else cells[cell_mask[cells]]
         of_degree = [
             t for t in nonlinear if t.density.where == "body" and t.density.degree == degree
         ]
-        sites.append(BodyHessianIntegral(X, counted, _rule(V, points, w), of_degree, log))
+        sites.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
         if term.density.where == "body":
             continue
-        around, numbers = _cells_at(body, term.density.facets)
+        cells_at_facets, numbers = _cells_at(body, term.density.facets)
         points, w = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
             rule = _rule(V, _on_facet(points, facet), w)
-            at_facet = around[numbers == facet]
-            counted = at_facet if chosen is None else at_facet[chosen[at_facet]]
-            sites.append(BodyHessianIntegral(X, counted, rule, [term], log, facet))
+            at_facet = cells_at_facets[numbers == facet]
+            counted_cells = at_facet if cell_mask is None else at_facet[cell_mask[at_facet]]
+            sites.append(BodyHessianIntegral(X, counted_cells, rule, [term], log, facet))
     return sites
 
 
@@ -214,11 +218,11 @@ def _cells_at(
     return np.asarray(cells[owned], dtype=np.int32), numbers[owned]
 
 
-def _geometry(jets: Array, where: str, facet: int | None) -> Array:
+def _geometry(jets: Array, place: str, facet: int | None) -> Array:
     """(points, SIZES[where]) from the placement's jets; dX/dxi and n and t by rows."""
     flat = jets.reshape(-1, JET_PARTS, 3)
-    if where == "outer":
-        return flat.reshape(-1, SIZES[where])
+    if place == "outer":
+        return flat.reshape(-1, SIZES[place])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives
     inverse, size = np.linalg.inv(G), np.linalg.det(G)
     if facet is None:

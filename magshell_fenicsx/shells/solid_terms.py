@@ -116,7 +116,7 @@ class TermFactory:
     def distortions(self) -> list[SolidTerm]:
         """What does not depend on a change of volume; of a neo-Hookean body one term."""
         shear, share = self.material.shear, self.material.share
-        of = {
+        densities_and_shares = {
             "distortion": (body_densities.distortion, 1 - share),
             "areal distortion": (body_densities.areal_distortion, share),
         }
@@ -126,7 +126,7 @@ class TermFactory:
                 self.grown(SolidDensity(density, self._constants(part * shear, self.h))),
                 group="distortion",
             )
-            for name, (density, part) in of.items()
+            for name, (density, part) in densities_and_shares.items()
             if part or name == "distortion"
         ]
 
@@ -148,28 +148,30 @@ class TermFactory:
             ),
         )
 
-    def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
+    def magnetic(self, field: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m; and what is soft."""
         applied = None
-        if of.in_space:
+        if field.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
-            applied = AppliedField(of.in_space, X, self.u, QUADRATURE_DEGREE, of.driven)
+            applied = AppliedField(field.in_space, X, self.u, QUADRATURE_DEGREE, field.driven)
             self.fields.append(applied)
-        if of.soft is None:
-            return self.remanent(of, applied)
+        if field.soft is None:
+            return self.remanent(field, applied)
         return [
-            *([] if of.soft.alone else self.remanent(of, applied)),
-            self.soft_magnetic(of, of.soft, applied),
+            *([] if field.soft.alone else self.remanent(field, applied)),
+            self.soft_magnetic(field, field.soft, applied),
         ]
 
     def soft_magnetic(
-        self, field: Magnetisation, soft: SoftMagnet, applied: AppliedField | None
+        self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> SolidTerm:
         """What the field makes of a soft body, see `EnergyFactory.soft_magnetic`."""
-        sheet, (scale, h) = Sheet(field), self._constants(soft.scale, self.h)
-        law, n0, *given = self._of_sheet(sheet, soft, applied)
-        density = SolidDensity(sheet.energy_in_solid, (law, scale, n0, h, *given), VALUE + GRADIENT)
+        sheet, (scale, h) = Sheet(field), self._constants(soft_magnet.scale, self.h)
+        law, n0, *parameters = self._of_sheet(sheet, soft_magnet, applied)
+        density = SolidDensity(
+            sheet.energy_in_solid, (law, scale, n0, h, *parameters), VALUE + GRADIENT
+        )
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
@@ -179,21 +181,21 @@ class TermFactory:
         if field.soft is None:
             return {}
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
-        law, n0, *given = self._of_sheet(sheet, field.soft, applied)
+        law, n0, *parameters = self._of_sheet(sheet, field.soft, applied)
         densities = {"volume": SolidDensity(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
             densities[axis] = SolidDensity(
-                sheet.induced_in_solid, (law, *self._constants(e), n0, *given)
+                sheet.induced_in_solid, (law, *self._constants(e), n0, *parameters)
             )
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
     def _of_sheet(
-        self, sheet: Sheet, soft: SoftMagnet, applied: AppliedField | None
+        self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
         """The susceptibility, or what is known of what saturates; normals of layers, amplitudes,
         parts of the field.
         """
-        chi, V = soft.susceptibility, self.u.function_space
+        chi, V = soft_magnet.susceptibility, self.u.function_space
         law = (
             field_in_body(chi, V, name="susceptibility", key="magnetic.susceptibility", size=1)
             if callable(chi)
@@ -205,7 +207,7 @@ class TermFactory:
             for name in sheet.amplitudes
         ]
         polynomials = [applied.polynomial] if applied else []
-        if soft.saturation is not None:
+        if soft_magnet.saturation is not None:
             if not self.saturated:  # energy and observed forms share it
                 self.saturated.append(self._saturated(sheet, law, n0, amplitudes, applied))
             law = self.saturated[0]
@@ -221,44 +223,50 @@ class TermFactory:
     ) -> PointField:
         """What is known of a material that saturates, at the points of cells."""
         V = self.u.function_space
-        known, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
+        saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
-        table, followed = V.element.basix_element.tabulate(1, known.points)[..., 0], (X, self.u)
-        before = at_quadrature(n0, known.points)
+        table, followed = (
+            V.element.basix_element.tabulate(1, saturation.points)[..., 0],
+            (X, self.u),
+        )
+        normals = at_quadrature(n0, saturation.points)
 
-        def placed() -> list[Array]:
+        def places_and_normals() -> list[Array]:
             x0, u = (
                 np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list])
                 for f in followed
             )
             G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (x0, u))
             F = np.eye(3) + H @ np.linalg.inv(G)
-            n = np.linalg.solve(np.swapaxes(F, -1, -2), before[..., None])[
+            n = np.linalg.solve(np.swapaxes(F, -1, -2), normals[..., None])[
                 ..., 0
             ]  # cof F n0, but for its length
-            return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), before]
+            return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), normals]
 
-        return sheet.saturated(chi, amplitudes, applied, known, followed, placed)
+        return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
-    def remanent(self, of: Magnetisation, field: AppliedField | None) -> list[SolidTerm]:
+    def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern, law = of.remanent, body_densities if of.law == "deformation" else rotation_law
+        pattern, law = (
+            field.remanent,
+            body_densities if field.law == "deformation" else rotation_law,
+        )
         Br = (
             field_in_body(pattern, self.u.function_space)
             if callable(pattern)
             else self._constants(pattern)[0]
         )
-        if field:
+        if applied:
             density = SolidDensity(
                 law.magnetic_in_space,
-                (Br, field.polynomial, *self._constants(self.h)),
+                (Br, applied.polynomial, *self._constants(self.h)),
                 VALUE + GRADIENT,
             )
             return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
-        directions = [("lambda_m", "", of.applied)]
+        directions = [("lambda_m", "", field.applied)]
         directions += [
             (name, name.replace("lambda_", " "), Ba)
-            for name, Ba in zip(TRANSVERSE_AMPLITUDES, of.across, strict=False)
+            for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False)
         ]
         terms = []
         for amplitude, suffix, Ba in directions:
@@ -272,9 +280,11 @@ class TermFactory:
                 column="magnetic",
             )
             terms.append(of_field)
-        if of.gradient is not None:
+        if field.gradient is not None:
             density = SolidDensity(
-                law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT
+                law.magnetic_gradient,
+                (Br, *self._constants(field.gradient, self.h)),
+                VALUE + GRADIENT,
             )
             terms.append(self._bulk("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
@@ -320,28 +330,29 @@ class TermFactory:
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face, or of the body."""
         if term.of_volume:
-            inside = {
-                column: self._volume_density(term, of) for column, of in term.observed.items()
+            densities = {
+                column: self._volume_density(term, density_function)
+                for column, density_function in term.observed.items()
             }
-            return {column: self._over_body(density) for column, density in inside.items()}
+            return {column: self._over_body(density) for column, density in densities.items()}
         return {
-            column: self._on_faces([self._face_density(term, of)])
-            for column, of in term.observed.items()
+            column: self._on_faces([self._face_density(term, density_function)])
+            for column, density_function in term.observed.items()
         }
 
-    def _volume_density(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
+    def _volume_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
         """A density of the volume, which depends on places alone."""
         flat, count, at_point = (
             [ufl.zero(3)] * len(ALL_DERIVATIVES),
             len(term.parameters),
-            term.at_point(of),
+            term.at_point(density_function),
         )
 
-        def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
+        def per_volume(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
             return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
 
         constants = constants_of(term, self.u.function_space.mesh, self.free_constants)
-        return SolidDensity(at, (*constants, *self._constants(self.h)), VALUE)
+        return SolidDensity(per_volume, (*constants, *self._constants(self.h)), VALUE)
 
     def _over_body(self, density: SolidDensity) -> ufl.Form:
         dx = ufl.Measure(
@@ -350,14 +361,14 @@ class TermFactory:
         X, H = ufl.SpatialCoordinate(self.body.mesh), ufl.grad(self.u)
         return density.function(X, self.u, H, *density.parameters) * dx
 
-    def _face_density(self, term: OwnTerm, of: Callable[..., Expr]) -> SolidDensity:
+    def _face_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
         flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
         def on_face(
             X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr
         ) -> Expr:
-            return per_area(term.at_point(of))(
+            return per_area(term.at_point(density_function))(
                 Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters
             )
 
@@ -375,10 +386,10 @@ class TermFactory:
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
         """A moment per length in E h R about the first tangent of an edge."""
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
-        weight, past = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
+        weight, reference_turn = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
         body = self.body
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
-        parameters = (weight, *self._constants(intensity), past)
+        parameters = (weight, *self._constants(intensity), reference_turn)
         density = SolidDensity(
             body_densities.turning, parameters, where="end", facets=self.body.faces[edge]
         )
@@ -387,7 +398,7 @@ class TermFactory:
             "end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1)
         )
         term.set_reference_turn(
-            past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
+            reference_turn, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
         )
         return term
 
@@ -397,16 +408,16 @@ class TermFactory:
         """p times the change of the volume under the outer face, down to the middle line where an
         end is hinged.
         """
-        moved, faces = origin is None, self.body.faces
+        moves_straight, faces = origin is None, self.body.faces
         parameters = self._constants(
             unit, *([origin] if origin is not None and origin.any() else [])
         )
-        of, on_end = (
+        face_density, end_density = (
             (body_densities.swept_volume, body_densities.swept_volume_on_end)
-            if moved
+            if moves_straight
             else (body_densities.pressure, body_densities.sealing)
         )
-        work, end_work = (
+        face_work, end_work = (
             (None, None)
             if potential
             else (
@@ -416,7 +427,13 @@ class TermFactory:
         )
         of_faces = {
             "pressure": SolidDensity(
-                of, parameters, ON_FACE, QUADRATURE_DEGREE, "outer", faces[OUTER_FACE], work=work
+                face_density,
+                parameters,
+                ON_FACE,
+                QUADRATURE_DEGREE,
+                "outer",
+                faces[OUTER_FACE],
+                work=face_work,
             )
         }
         if self.hinged:
@@ -428,11 +445,11 @@ class TermFactory:
                 "upper": (low < MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE)
                 & (high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE),
             }
-            for name, inside in parts.items():
-                if self.body.mesh.comm.allreduce(int(inside.sum())):
-                    facets_of_part, upper = facets[inside], name == "upper"
+            for name, is_in_part in parts.items():
+                if self.body.mesh.comm.allreduce(int(is_in_part.sum())):
+                    facets_of_part, upper = facets[is_in_part], name == "upper"
                     of_faces[f"pressure {name}"] = SolidDensity(
-                        on_end,
+                        end_density,
                         parameters,
                         VALUE + GRADIENT,
                         QUADRATURE_DEGREE,
@@ -464,23 +481,25 @@ class TermFactory:
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []
         for tag, density in enumerate(densities, 1):
-            of = density.function if v is None else density.work
-            assert of
+            function = density.function if v is None else density.work
+            assert function
             parameters = density.parameters if v is None else (v, *density.parameters)
             if density.where == "outer":
                 area = ufl.cross(J[:, 0], J[:, 1])
-                given = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
-                forms.append(of(*given, *parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag))
+                arguments = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
+                forms.append(
+                    function(*arguments, *parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag)
+                )
                 continue
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
-            per_area = of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)
+            per_area = function(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)
             points, weights = density.rule
-            rule = {"quadrature_rule": "custom"} | {
+            metadata = {"quadrature_rule": "custom"} | {
                 "quadrature_points": tuple(tuple(x) for x in points),
                 "quadrature_weights": tuple(weights),
             }
-            forms.append(per_area * (ds(tag, metadata=rule) if density.upper else ds(tag)))
+            forms.append(per_area * (ds(tag, metadata=metadata) if density.upper else ds(tag)))
         return sum(forms[1:], forms[0])
 
     def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:

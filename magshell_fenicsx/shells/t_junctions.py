@@ -36,7 +36,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError, place_text
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.parts.contact.projection import Cells, places_near
+from magshell_fenicsx.parts.contact.projection import Cells, nearest_places
 from magshell_fenicsx.parts.joints import Joint
 from magshell_fenicsx.platform import compat
 
@@ -70,7 +70,7 @@ class TieTerm:
         (n, k) global numbers of those on which each point depends.
     gap, tangents
         (n, 3, k) and (n, 12, k): what makes of these u - u', and both tangents of both shells.
-    along
+    edge_directions
         (n, 2) the edge's direction in the coordinates of its cell.
     stiffness
         (n, 2) of both ties.
@@ -87,7 +87,7 @@ class TieTerm:
         unknowns: Longs,
         gap: Array,
         tangents: Array,
-        along: Array,
+        edge_directions: Array,
         stiffness: Array,
         log: KernelLog,
     ) -> None:
@@ -123,7 +123,7 @@ class TieTerm:
         }
         self._placed = self._apply(tangents, global_values(r0))
         values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]
-        values[:, :2], values[:, 4] = along, stiffness[:, 1]
+        values[:, :2], values[:, 4] = edge_directions, stiffness[:, 1]
         values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
     # as a term
@@ -136,8 +136,8 @@ class TieTerm:
 
     def energy(self) -> float:
         u = global_values(self._u)
-        tied = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
-        return tied + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
+        tie_energy = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
+        return tie_energy + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
 
     def add_residual(self, b: Array, factor: float) -> None:
         u = global_values(self._u)
@@ -202,9 +202,9 @@ class SurfaceTJunction(TieTerm):
 
     Parameters
     ----------
-    foot
+    facets
         Local facets of the edge.
-    on
+    is_other_shell
         Whether each cell of this rank, ghosts included, belongs to the other shell.
     stiffness
         (cells of this rank, 2) E h and E h^3 of each over those of the first shell.
@@ -221,39 +221,43 @@ class SurfaceTJunction(TieTerm):
         key: str,
         r0: fem.Function,
         u: fem.Function,
-        foot: NDArray[np.int32],
-        on: NDArray[np.bool_],
+        facets: NDArray[np.int32],
+        is_other_shell: NDArray[np.bool_],
         stiffness: Array,
         material: Material,
         log: KernelLog,
     ) -> None:
         surfaces = MidSurfaces.gather(r0)
-        at = surfaces.edge_on_shell(foot, on)
-        at.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
+        edge = surfaces.edge_on_shell(facets, is_other_shell)
+        edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
         nodes = surfaces.cells.nodes
-        both = np.concatenate([nodes[at.cell], nodes[at.other_cell]], axis=1)
+        nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
         of_cells = surfaces.cells.gather_values(stiffness)
-        half, axes, count = nodes.shape[1], np.eye(3), 3 * both.shape[1]  # a rank may have no point
-        on_other = surfaces.shapes(at.Y)
-        D = np.zeros((len(at.x), 4, both.shape[1]))
-        D[:, :2, :half], D[:, 2:, half:] = (
-            N[1:].transpose(1, 0, 2) for N in (at.on_edge, on_other)
+        edge_function_count, axes, count = (
+            nodes.shape[1],
+            np.eye(3),
+            3 * nodes_of_pairs.shape[1],
+        )  # a rank may have no point
+        on_other = surfaces.shapes(edge.Y)
+        D = np.zeros((len(edge.x), 4, nodes_of_pairs.shape[1]))
+        D[:, :2, :edge_function_count], D[:, 2:, edge_function_count:] = (
+            N[1:].transpose(1, 0, 2) for N in (edge.on_edge, on_other)
         )
-        beta = np.concatenate([at.on_edge[0], -on_other[0]], axis=1)
+        beta = np.concatenate([edge.on_edge[0], -on_other[0]], axis=1)
         super().__init__(
             joint,
             r0,
             u,
-            (3 * both[:, :, None] + np.arange(3)).reshape(len(at.x), count),
-            np.einsum("nk,cd->nckd", beta, axes).reshape(len(at.x), 3, count),
-            np.einsum("nik,cd->nickd", D, axes).reshape(len(at.x), TANGENT_COMPONENTS, count),
-            at.along,
+            (3 * nodes_of_pairs[:, :, None] + np.arange(3)).reshape(len(edge.x), count),
+            np.einsum("nk,cd->nckd", beta, axes).reshape(len(edge.x), 3, count),
+            np.einsum("nik,cd->nickd", D, axes).reshape(len(edge.x), TANGENT_COMPONENTS, count),
+            edge.along,
             _tie_stiffness(
                 joint,
                 material,
-                np.maximum(of_cells[at.cell], of_cells[at.other_cell]),
-                at.length,
-                at.weight,
+                np.maximum(of_cells[edge.cell], of_cells[edge.other_cell]),
+                edge.length,
+                edge.weight,
             ),
             log,
         )
@@ -303,9 +307,9 @@ class EdgeOnShell:
         """
         _refuse_apart(comm, self.apart, self.x, h, key, joint)
         if min(comm.allgather(self.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
-            foot, other = joint.edges
+            edge, other = joint.edges
             raise MeshError(
-                f"{key}: the shell of the edge {foot} lies in the mid-surface of {other}, where both take the same "
+                f"{key}: the shell of the edge {edge} lies in the mid-surface of {other}, where both take the same "
                 "place: turn it out, or join edges of both"
             )
 
@@ -339,33 +343,39 @@ class MidSurfaces:
         """Return (3, n, functions): shape functions at places and their derivatives."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
-    def edge_on_shell(self, facets: NDArray[np.int32], on: NDArray[np.bool_]) -> EdgeOnShell:
+    def edge_on_shell(
+        self, facets: NDArray[np.int32], is_other_shell: NDArray[np.bool_]
+    ) -> EdgeOnShell:
         """Return the foot of an edge on another shell; collective.
 
         Parameters
         ----------
         facets
             Local ones of the edge.
-        on
+        is_other_shell
             Which local cells are of the other shell.
         """
         first, nodes = self.cells.own_range.start, self.cells.nodes
         cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
-        along = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
+        edge_directions = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
         cell = np.repeat(first + cells, len(s))
         on_edge = self.shapes(X.reshape(-1, 2))
         x = np.einsum("nk,nki->ni", on_edge[0], self.r0[nodes[cell]])
-        tangent = np.einsum("na,ank,nki->ni", along, on_edge[1:], self.r0[nodes[cell]])
+        tangent = np.einsum("na,ank,nki->ni", edge_directions, on_edge[1:], self.r0[nodes[cell]])
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
-        shell = np.flatnonzero(self.cells.gather_values(on))
-        other, Y, apart = self.nearest_places(x, shell)
-        beside = self.r0[nodes[first + cells]]
-        far = self.nearest_places(beside.reshape(-1, 3), shell)[2].reshape(beside.shape[:2])
-        clearance = float(far.max(axis=1, initial=0.0).min(initial=np.inf))
-        return EdgeOnShell(cell, on_edge, x, along, weight, length, other, Y, apart, clearance)
+        shell = np.flatnonzero(self.cells.gather_values(is_other_shell))
+        other, Y, distances = self.nearest_places(x, shell)
+        places_of_cells = self.r0[nodes[first + cells]]
+        distances_of_cells = self.nearest_places(places_of_cells.reshape(-1, 3), shell)[2].reshape(
+            places_of_cells.shape[:2]
+        )
+        clearance = float(distances_of_cells.max(axis=1, initial=0.0).min(initial=np.inf))
+        return EdgeOnShell(
+            cell, on_edge, x, edge_directions, weight, length, other, Y, distances, clearance
+        )
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance,
@@ -373,7 +383,7 @@ class MidSurfaces:
         """
         from scipy.spatial import cKDTree  # takes long to import
 
-        nearest, Y, apart = (
+        nearest, Y, distances = (
             np.zeros(len(x), dtype=np.int64),
             np.zeros((len(x), 2)),
             np.full(len(x), np.inf),
@@ -381,27 +391,41 @@ class MidSurfaces:
         nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-        near = (
+        cells_near = (
             cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
         )
-        point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in near])
-        which = np.concatenate([np.asarray(numbers, dtype=np.int64) for numbers in (*near, [])])
+        point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in cells_near])
+        candidate_cells = np.concatenate(
+            [np.asarray(numbers, dtype=np.int64) for numbers in (*cells_near, [])]
+        )
         if not len(point):
-            return nearest, Y, apart
+            return nearest, Y, distances
         surface = Cells(
             self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64)
         )
-        each = which, np.arange(len(which)), np.ones(len(which), dtype=np.int64), point
-        pair, at = places_near(surface, self.r0, x, each, np.inf)
-        point, which, foot, distance = at.point, which[pair], at.X, at.distance
-        order = np.lexsort((cells[which], np.round(distance, 12), point))  # of equal ones the first
+        candidates = (
+            candidate_cells,
+            np.arange(len(candidate_cells)),
+            np.ones(len(candidate_cells), dtype=np.int64),
+            point,
+        )
+        pair, projections = nearest_places(surface, self.r0, x, candidates, np.inf)
+        point, candidate_cells, reference_places, distance = (
+            projections.point,
+            candidate_cells[pair],
+            projections.X,
+            projections.distance,
+        )
+        order = np.lexsort(
+            (cells[candidate_cells], np.round(distance, 12), point)
+        )  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        nearest[point[best]], Y[point[best]], apart[point[best]] = (
-            cells[which[best]],
-            foot[best],
+        nearest[point[best]], Y[point[best]], distances[point[best]] = (
+            cells[candidate_cells[best]],
+            reference_places[best],
             distance[best],
         )
-        return nearest, Y, apart
+        return nearest, Y, distances
 
 
 class MeridianTJunction(TieTerm):
@@ -456,15 +480,15 @@ class MeridianTJunction(TieTerm):
     def _numbers(self, size: int) -> Longs:
         return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
 
-    def _maps(self, of: Array) -> tuple[Array, Array]:
-        """`gap` and `tangents`; `of` (2, 3, c) makes of a node's numbers its vector, and the
+    def _maps(self, components: Array) -> tuple[Array, Array]:
+        """`gap` and `tangents`; `components` (2, 3, c) makes of a node's numbers its vector, and the
         derivative around e3.
         """
-        value, around = of
+        value, derivative = components
         places, tangents = [], []
-        for N, along in self._shapes:
+        for N, slopes in self._shapes:
             places.append(np.kron(N, value))
-            tangents.append(np.vstack([np.kron(along, value), np.kron(N, around)]))
+            tangents.append(np.vstack([np.kron(slopes, value), np.kron(N, derivative)]))
         return np.hstack([places[0], -places[1]])[None], block_diag(*tangents)[None]
 
 
@@ -479,18 +503,18 @@ def _parallels(
     """Return the cells at both parameters of a junction, with their shape functions there and
     slopes, all in one row."""
     ends, shapes = _ends_of_cells(V), []
-    inside = [
+    is_inside = [
         (ends.min(axis=1) < s + PARAMETER_TOLERANCE) & (s - PARAMETER_TOLERANCE < ends.max(axis=1))
         for s in tied
     ]
     cells = [
-        np.flatnonzero(of) for of in inside
+        np.flatnonzero(cells_at) for cells_at in is_inside
     ]  # a place on a vertex is tied to by the mean of two cells
-    for s, of in zip(tied, cells, strict=True):
-        lengths = (ends[of, 1] - ends[of, 0])[:, None]
-        N, slopes = V.element.basix_element.tabulate(1, (s - ends[of, :1]) / lengths)[..., 0] / len(
-            of
-        )
+    for s, cells_at in zip(tied, cells, strict=True):
+        lengths = (ends[cells_at, 1] - ends[cells_at, 0])[:, None]
+        N, slopes = V.element.basix_element.tabulate(1, (s - ends[cells_at, :1]) / lengths)[
+            ..., 0
+        ] / len(cells_at)
         shapes.append((N.ravel(), (slopes / lengths).ravel()))
     return cells, shapes
 
@@ -508,10 +532,11 @@ def _refuse_parallels_apart(
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
     cells, shapes = _parallels(V, tied)
     (rho, z), other = (
-        N @ nodal[V.dofmap.list[of].ravel()] for (N, _), of in zip(shapes, cells, strict=True)
+        N @ nodal[V.dofmap.list[cells_at].ravel()]
+        for (N, _), cells_at in zip(shapes, cells, strict=True)
     )
-    apart = np.array([np.hypot(*(other - [rho, z]))])
-    _refuse_apart(V.mesh.comm, apart, np.array([[rho, 0.0, z]]), h, key, joint)
+    distances = np.array([np.hypot(*(other - [rho, z]))])
+    _refuse_apart(V.mesh.comm, distances, np.array([[rho, 0.0, z]]), h, key, joint)
     return float(rho)
 
 
@@ -525,8 +550,10 @@ def refuse_misplaced_parallels(
     MeshError
         With the edge.
     """
-    for i, (joint, s, of) in enumerate(zip(joints, meridian.tied, meridian.joints, strict=True)):
-        if of is None:
+    for i, (joint, s, joint_cells) in enumerate(
+        zip(joints, meridian.tied, meridian.joints, strict=True)
+    ):
+        if joint_cells is None:
             _refuse_parallels_apart(r0, s, h, f"joints.{i}.edges", joint)
 
 
@@ -541,23 +568,33 @@ def _tie_stiffness(
     """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
     of that length.
     """
-    turned = (
+    turning_stiffness = (
         TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
         if joint.rigid
         else joint.stiffness
     )
-    return np.column_stack([weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turned])
+    return np.column_stack(
+        [weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turning_stiffness]
+    )
 
 
-def _refuse_apart(comm: MPI.Comm, apart: Array, x: Array, h: float, key: str, joint: Joint) -> None:
-    worst = int(apart.argmax()) if len(apart) else -1
-    of_rank = (float(apart[worst]), x[worst]) if len(apart) else (0.0, np.zeros(3))
-    far, place = max(comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0])
-    if far > MAX_DISTANCE_IN_THICKNESSES * h:
-        foot, other = joint.edges
-        by = f"by {far:.4g} R" if np.isfinite(far) else "by more than a cell"
+def _refuse_apart(
+    comm: MPI.Comm, distances: Array, x: Array, h: float, key: str, joint: Joint
+) -> None:
+    worst = int(distances.argmax()) if len(distances) else -1
+    of_rank = (float(distances[worst]), x[worst]) if len(distances) else (0.0, np.zeros(3))
+    largest_distance, place = max(
+        comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0]
+    )
+    if largest_distance > MAX_DISTANCE_IN_THICKNESSES * h:
+        edge, other = joint.edges
+        distance_text = (
+            f"by {largest_distance:.4g} R"
+            if np.isfinite(largest_distance)
+            else "by more than a cell"
+        )
         raise MeshError(
-            f"{key}: the edge {foot} is not on the mid-surface of {other}, {by} at {place_text(place)}, over R: "
+            f"{key}: the edge {edge} is not on the mid-surface of {other}, {distance_text} at {place_text(place)}, over R: "
             "move one of the shells"
         )
 
@@ -581,9 +618,9 @@ def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> 
     return np.array(cells, dtype=np.int64), np.array(ends).reshape(-1, 2, 2)
 
 
-def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> Expr:
+def _angle(tangents: fem.Function, moved: fem.Function, edge_direction: fem.Function) -> Expr:
     """Sine and cosine of the angle between both normals about the edge, whose direction is the
-    first two of `along`.
+    first two of `edge_direction`.
     """
     a1, a2, b1, b2 = (
         ufl.as_vector([tangents[3 * i + c] + moved[3 * i + c] for c in range(3)]) for i in range(4)
@@ -592,7 +629,11 @@ def _angle(tangents: fem.Function, moved: fem.Function, along: fem.Function) -> 
     def unit(v: Expr) -> Expr:
         return v / ufl.sqrt(ufl.dot(v, v))
 
-    n, m, t = unit(ufl.cross(a1, a2)), unit(ufl.cross(b1, b2)), unit(along[0] * a1 + along[1] * a2)
+    n, m, t = (
+        unit(ufl.cross(a1, a2)),
+        unit(ufl.cross(b1, b2)),
+        unit(edge_direction[0] * a1 + edge_direction[1] * a2),
+    )
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
@@ -604,14 +645,14 @@ def _t_junction_joints(
     pairs = enumerate(zip(joints, surface.joints, strict=True))
     tied = [
         (joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
-        for i, (joint, of) in pairs
-        if of is None
+        for i, (joint, joint_cells) in pairs
+        if joint_cells is None
     ]
     return [
         *tied,
         *(
-            (Joint((name, "the sheet"), rigid=True), "shell.file", on)
-            for name, on in surface.t_junctions.items()
+            (Joint((name, "the sheet"), rigid=True), "shell.file", is_other_shell)
+            for name, is_other_shell in surface.t_junctions.items()
         ),
     ]
 
@@ -628,9 +669,9 @@ def refuse_misplaced_edges(
     """
     tied = _t_junction_joints(joints, surface)
     surfaces = MidSurfaces.gather(r0) if tied else None
-    for joint, key, on in tied:
+    for joint, key, is_other_shell in tied:
         assert surfaces
-        surfaces.edge_on_shell(surface.edges[joint.edges[0]], on).refuse_misplaced(
+        surfaces.edge_on_shell(surface.edges[joint.edges[0]], is_other_shell).refuse_misplaced(
             r0.function_space.mesh.comm, h, key, joint
         )
 
@@ -644,9 +685,17 @@ def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
     edges, factors, log = surface.edges, _stiffness_factors(model), model.kernels
     return [
         SurfaceTJunction(
-            joint, key, model.r0, model.u, edges[joint.edges[0]], on, factors, model.material, log
+            joint,
+            key,
+            model.r0,
+            model.u,
+            edges[joint.edges[0]],
+            is_other_shell,
+            factors,
+            model.material,
+            log,
         )
-        for joint, key, on in tied
+        for joint, key, is_other_shell in tied
     ]
 
 
@@ -658,8 +707,8 @@ def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]
         MeridianTJunction(
             joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log
         )
-        for i, (joint, s, of) in tied
-        if of is None
+        for i, (joint, s, joint_cells) in tied
+        if joint_cells is None
     ]
 
 

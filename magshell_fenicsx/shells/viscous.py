@@ -127,9 +127,9 @@ class Viscosity:
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
-        at = u0 + part * (u1 - u0)
+        displacement = u0 + part * (u1 - u0)
         stress = (
-            self.creep_time * self._strain_rate(at, v)
+            self.creep_time * self._strain_rate(displacement, v)
             if self.creep_time
             else np.zeros((*self._places.shape, STRAIN_SIZE))
         )
@@ -138,7 +138,9 @@ class Viscosity:
                 self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True
             ):
                 stress += branch.modulus * (part * end + (1 - part) * q)
-        self._force = self._forces(stress, u0, at, self.stiffness(dt, 2 / dt) if dt else 0.0)
+        self._force = self._forces(
+            stress, u0, displacement, self.stiffness(dt, 2 / dt) if dt else 0.0
+        )
         return self._force
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
@@ -188,10 +190,10 @@ class Viscosity:
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Of a stress at nodes, and of edges that open from u0 to u1."""
-        given, system = self._prescribed, self._model.system
+        prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
-        given.stiffness.value = stiffness
-        for field, displacement in ((given.before, u0), (given.after, u1)):
+        prescribed.stiffness.value = stiffness
+        for field, displacement in ((prescribed.before, u0), (prescribed.after, u1)):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
         return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
@@ -257,10 +259,10 @@ class _AddedViscousTangent:
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _StrainRates(model), ufl.TestFunction(model.V)
-        self._since, whole = rates.since, model.factory.domain.revolution_factor
+        self._since, factor = rates.since, model.factory.domain.revolution_factor
         self._forms = [
             model.kernels.compile(
-                f"viscous tangent {i}", whole * self._stiffness * ufl.derivative(work, model.u, v)
+                f"viscous tangent {i}", factor * self._stiffness * ufl.derivative(work, model.u, v)
             )
             for i, work in enumerate(_works(model, rates))
         ]
@@ -321,13 +323,15 @@ class _PrescribedStress:
         """The strain and the change of curvature that make the stress, on a side of an edge; ""
         within a cell.
         """
-        at = self.field(side) if side else self.field
-        return covariant(j, at, 0), covariant(j, at, 6)
+        stress = self.field(side) if side else self.field
+        return covariant(j, stress, 0), covariant(j, stress, 6)
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
-        after, before = (jump(domain.j0 + domain.jet(field)) for field in (self.after, self.before))
-        return self.stiffness * (after - before)
+        jump_after, jump_before = (
+            jump(domain.j0 + domain.jet(field)) for field in (self.after, self.before)
+        )
+        return self.stiffness * (jump_after - jump_before)
 
 
 class _StrainRates:
@@ -389,27 +393,37 @@ def _works(
 
     def law(j: Jet, side: str = "") -> Law:
         """That of the shell at small strains, which a viscous stress follows too."""
-        of_shell, own = densities.law_at(model.material.law.linear, j), factory.cell_materials
+        of_shell, law_hereerials = (
+            densities.law_at(model.material.law.linear, j),
+            factory.cell_materials,
+        )
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
         return (
             of_shell
-            if own is None
-            else of_shell.with_material(*((own(side) if side else own)[i] for i in (0, 1, 3)))
+            if law_hereerials is None
+            else of_shell.with_material(
+                *((law_hereerials(side) if side else law_hereerials)[i] for i in (0, 1, 3))
+            )
         )
 
     E, K = _strains(r0, u)
     strain, bend = given.strain(r0, "")
     up = kin.inverse_metric(r0)
-    own = law(r0)
-    stretching, bending = work(own.stress(strain, up), E), work(own.moment(strain, bend, up), K)
-    coupled = work(own.moment(E, 0 * K, up), bend)  # of plies: a viscous bend makes membrane stress
+    law_here = law(r0)
+    stretching, bending = (
+        work(law_here.stress(strain, up), E),
+        work(law_here.moment(strain, bend, up), K),
+    )
+    coupled = work(
+        law_here.moment(E, 0 * K, up), bend
+    )  # of plies: a viscous bend makes membrane stress
     works = [(stretching + bending + coupled) * kin.area_ratio(r0) * domain.dx()]
 
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
     conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
 
-    def across(r: Jet) -> Expr:
+    def jump_of(r: Jet) -> Expr:
         plus, minus = (r.side(s) for s in sides)
         if factory.has_folds:
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
@@ -426,14 +440,14 @@ def _works(
             * model.sigma
             / domain.widths[0]
         )
-    S_J, J = given.stiff_opening(domain, across), across(r0 + u)
+    S_J, J = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * domain.dS()
 
     nu1, nu2, stretch = kin.conormal(r0, m)
     edge = up, (nu1, nu2), 1
-    M, bent = (own.edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
-    stiff = own.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
+    M, bent = (law_here.edge_moment(*strains, *edge) for strains in ((strain, bend), (E, K)))
+    stiff = law_here.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
     for held_edge in factory.held_edges:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
         S_J, J = given.stiff_opening(domain, jump), jump(r0 + u)

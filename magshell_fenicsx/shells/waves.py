@@ -76,9 +76,9 @@ class Waves:
         domain: IntegrationDomain,
         supports: Supports,
         log: KernelLog,
-        touching: "Sequence[MeridianContact | MeridianTJunction]" = (),
+        nonlocal_terms: "Sequence[MeridianContact | MeridianTJunction]" = (),
     ) -> None:
-        self.nonlocal_terms = touching
+        self.nonlocal_terms = nonlocal_terms
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
         self._m = fem.Constant(V.mesh, 1.0)
@@ -118,9 +118,9 @@ class Waves:
         if not self.nonlocal_terms:
             return K
         entries = self._system.at_state(state).evaluate(
-            lambda: [each.entries_of_waves(m) for each in self.nonlocal_terms]
+            lambda: [term.entries_of_waves(m) for term in self.nonlocal_terms]
         )
-        rows, columns, values = (np.concatenate(each) for each in zip(*entries, strict=True))
+        rows, columns, values = (np.concatenate(term) for term in zip(*entries, strict=True))
         fixed = np.zeros(K.getSize()[0], dtype=bool)
         fixed[self._rows(m)] = True
         return with_entries(K, (rows, columns, values), fixed)
@@ -183,11 +183,11 @@ class Waves:
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
         """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive definite."""
-        pieces = self._pieces
+        ranges = self._pieces
         try:
             return {m - 1 for m in self._indefinite(values)}
         finally:
-            self._pieces = pieces  # fit for states of the path
+            self._pieces = ranges  # fit for states of the path
 
     def _entries(
         self, state: State, waves: Sequence[float] | NDArray[np.float64]
@@ -220,9 +220,12 @@ class Waves:
         entries stands there.
         """
         rows, columns = self._sparsity
-        below = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
-        both = np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]])
-        K = coo_array((np.concatenate([np.arange(len(rows)), below]), both)).tocsr()
+        mirrored_entries = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
+        positions = (
+            np.concatenate([rows, columns[mirrored_entries]]),
+            np.concatenate([columns, rows[mirrored_entries]]),
+        )
+        K = coo_array((np.concatenate([np.arange(len(rows)), mirrored_entries]), positions)).tocsr()
         return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
 
     def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
@@ -238,18 +241,21 @@ class Waves:
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
         definite = cache(lambda m: twice.is_positive_definite(rest, self._weights[m]))
         indefinite = set[int]() if once.is_positive_definite(first, np.ones(1)) else {1}
-        halved, self._pieces = [*self._pieces], []  # of others of the same terms too
-        while halved:
-            piece = halved.pop()
-            ends = definite(piece.first) and definite(piece.last)
-            if piece.short:
-                indefinite |= {m for m in range(piece.first, piece.last + 1) if not definite(m)}
+        open_ranges, self._pieces = [*self._pieces], []  # of others of the same terms too
+        while open_ranges:
+            wave_range = open_ranges.pop()
+            ends = definite(wave_range.first) and definite(wave_range.last)
+            if wave_range.short:
+                indefinite |= {
+                    m for m in range(wave_range.first, wave_range.last + 1) if not definite(m)
+                }
             elif not (
-                ends and all(twice.is_positive_definite(rest, weights) for weights in piece.inner)
+                ends
+                and all(twice.is_positive_definite(rest, weights) for weights in wave_range.inner)
             ):
-                halved += piece.halves(self._nodes)
+                open_ranges += wave_range.halves(self._nodes)
                 continue
-            self._pieces.append(piece)
+            self._pieces.append(wave_range)
         return sorted(indefinite)
 
     def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
@@ -263,17 +269,17 @@ class Waves:
         first, columns, places = self._rows_of_matrix
         data = entries[places]
         if name not in self._matrices:
-            made = PETSc.Mat().createAIJ(
+            matrix = PETSc.Mat().createAIJ(
                 (len(first) - 1,) * 2, csr=(first, columns, data), comm=self.V.mesh.comm
             )
-            made.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            made.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-            self._matrices[name] = made
-        filled = self._matrices[name]
-        filled.setValuesCSR(first, columns, data)
-        filled.assemble()
-        filled.zeroRowsColumns(self._rows(m), 1.0)
-        return filled
+            matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            self._matrices[name] = matrix
+        matrix = self._matrices[name]
+        matrix.setValuesCSR(first, columns, data)
+        matrix.assemble()
+        matrix.zeroRowsColumns(self._rows(m), 1.0)
+        return matrix
 
     def _rows(self, m: int) -> NDArray[np.int32]:
         return np.concatenate([bc.dof_indices()[0] for bc in self.constraints(m)])
@@ -324,14 +330,14 @@ class _WaveRange:
 
 
 def _lagrange_weights(
-    nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.int64]
+    nodes: NDArray[np.float64], places: NDArray[np.float64] | NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """What the values at some nodes weigh in their polynomial's values at other places; (places,
     nodes).
     """
     others = [np.delete(nodes, i) for i in range(len(nodes))]
     columns = [
-        np.prod((at[:, None] - rest) / (node - rest), axis=1)
+        np.prod((places[:, None] - rest) / (node - rest), axis=1)
         for node, rest in zip(nodes, others, strict=True)
     ]
     return np.stack(columns, axis=1)
@@ -398,29 +404,32 @@ class BandedMatrices:
     ----------
     rows, columns
         Of each entry of the pattern; one triangle is enough.
-    held
+    constrained_rows
         Rows and columns that are replaced by those of the unit matrix.
     """
 
     def __init__(
-        self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]
+        self,
+        rows: NDArray[np.int64],
+        columns: NDArray[np.int64],
+        constrained_rows: NDArray[np.int32],
     ) -> None:
         n = int(rows.max()) + 1
-        both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
-        pattern = coo_array((np.ones(2 * len(rows)), both), (n, n)).tocsr()
+        positions = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+        pattern = coo_array((np.ones(2 * len(rows)), positions), (n, n)).tocsr()
         order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
         place = np.empty(n, dtype=np.int64)
         place[order] = np.arange(n)
-        free = np.ones(n, dtype=bool)
-        free[held] = False
-        self._free_entries = np.flatnonzero(free[rows] & free[columns])
+        is_free = np.ones(n, dtype=bool)
+        is_free[constrained_rows] = False
+        self._free_entries = np.flatnonzero(is_free[rows] & is_free[columns])
         rows, columns = rows[self._free_entries], columns[self._free_entries]
         i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
         self._shape = (int((i - j).max(initial=0)) + 1, n)
         self._band_positions = (i - j) + j * self._shape[
             0
         ]  # in LAPACK's lower band, column by column
-        self._held_places = place[held]
+        self._held_places = place[constrained_rows]
 
     def bands(self, values: Iterable[Array]) -> Array:
         """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what

@@ -1,4 +1,4 @@
-"""The history of a case: the steps of its programme, one after the other."""
+"""History of a case: the records of the steps of its programme, one step after the other."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -10,27 +10,33 @@ from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
+from magshell_fenicsx.simulate.contact_control import penetration_message
+from magshell_fenicsx.simulate.path_records import Records, RecordStream, amount, follow_path
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import plain
-from magshell_fenicsx.simulate.steps import LOCATED, departure_of, followed_on, held_by, records_of
-from magshell_fenicsx.simulate.touch import penetration_refused
-from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
+from magshell_fenicsx.simulate.stage import load_stage
+from magshell_fenicsx.simulate.steps import (
+    LOCATED,
+    follow_branch_of_step,
+    held_conjugates_of_step,
+    records_of,
+    symmetry_switch_of_step,
+)
 
-RISES = 4  # first steps of an energy that moves the undeformed shell
-# how the remark of a path begins that has its answer
-BEYOND = "beyond the first instability the path stopped: "
+STEPS_OF_RISE = 4  # first steps in which an energy rises that moves the undeformed shell
+# begin of the remark on a path that stops beyond the instability that answers it
+BEYOND_INSTABILITY = "beyond the first instability the path stopped: "
 
 
-def warned(remark: str) -> None:
-    """Say it as a warning."""
+def warn_of(remark: str) -> None:
+    """Give a remark as a warning."""
     warnings.warn(remark, stacklevel=3)
 
 
 def follow(
-    scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warned
+    scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
-    """Compute the history of a scene; yields every accepted point.
+    """Compute the history of a scene; yield every accepted point.
 
     With `until: limit` as its end, a history has its answer at the first instability: what stops it
     beyond that is a remark.
@@ -49,107 +55,48 @@ def follow(
         the shell unstable.
     """
     state, steps = scene.unloaded(), scene.problem.programme
-    own = pulling(scene, state)
-    state = replace(state, mu=state.mu | dict.fromkeys(own, 0.0))
-    try:
-        _refuse_not_numbers(scene, state, "")
-    except Stopped:
-        yield Record(
-            "start",
-            "",
-            Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0),
-            scene=scene,
-            shown=scene.displacement,
-        )
-        raise
-    pivots = (
-        0 if scene.loose or scene.free_in_time else scene.newton.factor_at(state).negative_pivots
-    )
-    start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
-    clock = dict[str, float]()
-    if steps and (first_motion := steps[0].load.motion) and not own:
-        from magshell_fenicsx.simulate.transient import thrown
-
-        clock = thrown(scene, first_motion, state)
-    yield Record("start", "", start, clock=clock, scene=scene, shown=scene.displacement)
-    if pivots:
-        why = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
-        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {why}")
-    for name, value in own.items():
-        rise = Walked(_under(scene, name, value, state))
-        yield from (replace(risen, scene=scene, shown=scene.displacement) for risen in rise)
+    energies = energies_moving_the_shell(scene, state)
+    state = replace(state, mu=state.mu | dict.fromkeys(energies, 0.0))
+    yield from _start(scene, state, has_rise=bool(energies))
+    for name, value in energies.items():
+        rise = RecordStream(_rise(scene, name, value, state))
+        yield from (replace(record, scene=scene, shown=scene.displacement) for record in rise)
         state = rise.end
     for step in steps:
-        where = (
-            f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
-        )
+        run = _StepRun(scene, step, remark)
         scene.progress.beginning(step.number)
-        _refuse_not_numbers(scene, state, where)
-        walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
-        unstable = False
+        _refuse_not_numbers(scene, state, run.place)
         try:
-            for record in walked:
-                last = record.label
-                yield _recorded(scene, step, record, remark, where)
-                unstable = unstable or last in LOCATED
-                if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
-                    first = record
-            if step.load.bound and not unstable:
+            yield from run.path(state)
+            if step.load.bound and not run.is_unstable:
                 remark(
-                    f"{where}there is no instability up to the target, where until: limit ends too"
+                    f"{run.place}there is no instability up to the target, where until: limit ends "
+                    "too"
                 )
-            release = step.load.released_by
-            if release and record and step.until == "bifurcation" and last == "bifurcation":
-                record = departure_of(scene, step, record).record(0)
-                scene = record.scene or scene
-                yield _recorded(scene, step, record, remark, where)
-            elif release and record:
-                if record.label != "fold" or record.mode:
-                    at = record.mode or record.label
-                    raise Stopped(
-                        f"then: snap: the step ends at a {at}, not at a fold of the model itself"
-                    )
-                if record.excluded_pivots:
-                    remark(where + _buckled(scene, record, first))
-            further = None
-            if release and record:
-                from magshell_fenicsx.simulate.transient import released
-
-                further = released(scene, release, record, held_by(scene, step, record.point.state))
-            elif step.load.follows_branch and record and last == "bifurcation":
-                further = followed_on(scene, step, record)
-            if further:
-                walked = Walked(further)
-                for record in walked:
-                    last, scene = record.label, record.scene or scene
-                    yield _recorded(scene, step, record, remark, where)
+            if text := run.remark_on_release():
+                remark(run.place + text)
+            yield from run.beyond()
         except (Stopped, NotANumber) as e:
-            names = scene.model.system.nan_terms
-            strange = (
-                f"; where it was tried last, {' and '.join(names)} was not a number"
-                if names
-                else ""
-            )
-            if not (
-                first and step is steps[-1] and step.until == "limit" and not step.load.released_by
-            ):
-                raise Stopped(f"{where}{e}{strange}") from None
-            remark(f"{BEYOND}{where}{e}{strange}")
+            if not run.has_answer or step is not steps[-1]:
+                raise Stopped(run.reason(e)) from None
+            remark(f"{BEYOND_INSTABILITY}{run.reason(e)}")
             return
-        begin, state = state, walked.end
+        begin, state, scene = state, run.end, run.scene
         if search and step.load.search:
-            from magshell_fenicsx.simulate.search import searched
+            from magshell_fenicsx.simulate.search import search_at_end_of_step
 
-            for record in searched(scene, step, begin, state):
+            for record in search_at_end_of_step(scene, step, begin, state):
                 yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
-        if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
-            raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
+        if step is not steps[-1] and step.until in ("limit", "bifurcation") and run.is_at_event:
+            raise Stopped(
+                f"{run.place}ends at a {run.label}, from which the next step cannot start"
+            )
 
 
 def follow_alone(
-    scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warned
+    scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
-    """The history of a scene for what reads all of it in the scene itself; see `follow`.
+    """Compute the history of a scene for what reads all of it in the scene itself; see `follow`.
 
     Raises
     ------
@@ -159,66 +106,241 @@ def follow_alone(
     for record in follow(scene, search=search, remark=remark):
         if record.scene is not None and record.scene is not scene:
             raise Stopped(
-                "here the path goes on in another model, in which nothing is read for this command: leave out then and "
-                "branches, or take symmetry: none"
+                "here the path goes on in another model, in which nothing is read for this "
+                "command: leave out then and branches, or take symmetry: none"
             )
         yield record
 
 
-def _recorded(
-    scene: Scene, step: ProgrammeStep, record: Record, remark: Callable[[str], None], where: str
-) -> Record:
-    """A record as a history gives it."""
-    at = record.scene or scene
-    if record.said:
-        remark(where + record.said)
-    state, moving = record.point.state, bool((record.clock or {}).get("kinetic"))
-    refused = scene.journal.recorded_values(
-        lambda: RecordedValues({"said": penetration_refused(at, state, moving=moving)})
-    ).values
-    if refused["said"]:
-        raise Stopped(refused["said"])
-    return replace(record, step=step.number, scene=at, shown=at.displacement)
+def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
+    """Yield the record of the undeformed shell.
+
+    Parameters
+    ----------
+    has_rise
+        Whether an energy moves the shell before the first step.
+
+    Raises
+    ------
+    Stopped
+        After the record, if forces are no numbers, or the undeformed shell is unstable.
+    """
+
+    def record(pivots: int, factorisations: int, clock: dict[str, float]) -> Record:
+        still = 0.0 * state.u
+        point = Point(state, 0.0, still, 0.0, pivots, pivots, 0, factorisations)
+        return Record("start", "", point, clock=clock, scene=scene, shown=scene.displacement)
+
+    try:
+        _refuse_not_numbers(scene, state, "")
+    except Stopped:
+        yield record(0, 0, {})
+        raise
+    pivots = 0
+    if not (scene.allows_rigid_motion or scene.free_in_time):
+        pivots = scene.newton.factor_at(state).negative_pivots
+    clock = dict[str, float]()
+    steps = scene.problem.programme
+    if steps and (first_motion := steps[0].load.motion) and not has_rise:
+        from magshell_fenicsx.simulate.transient import initial_clock
+
+        clock = initial_clock(scene, first_motion, state)
+    yield record(pivots, 1, clock)
+    if pivots:
+        why = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
+        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {why}")
 
 
-def pulling(scene: Scene, state: State) -> dict[str, float]:
-    """Amplitude -> value of the energies that move the undeformed shell, such as a surface tension."""
-    system, own = scene.model.system, dict[str, float]()
+class _StepRun:
+    """Run of one step of a programme: its path, and what follows an instability at its end.
+
+    Parameters
+    ----------
+    scene
+        The scene at its begin.
+    remark
+        See `follow`.
+
+    Attributes
+    ----------
+    scene
+        The scene at its present end; another one behind a symmetry switch.
+    end
+        State at the end, after `beyond`.
+    label
+        Label of the last record.
+    is_unstable
+        Whether there was an instability.
+    place
+        Begin of a message that says which step of a list this is; empty for a single load.
+    """
+
+    def __init__(self, scene: Scene, step: ProgrammeStep, remark: Callable[[str], None]) -> None:
+        self.scene, self.end, self.label, self.is_unstable = scene, scene.unloaded(), "", False
+        self.place, problem = "", scene.problem
+        if problem.listed:
+            self.place = f"step {step.number} of {len(problem.programme)} ({step.kind}): "
+        self._step, self._remark = step, remark
+        self._last: Record | None = None
+        self._first_instability: Record | None = None
+
+    @property
+    def is_at_event(self) -> bool:
+        """Whether the last record is an instability."""
+        return self.label in LOCATED
+
+    @property
+    def has_answer(self) -> bool:
+        """Whether the step has the instability that it looks for, whatever stops it beyond."""
+        is_to_limit = self._step.until == "limit" and not self._step.load.released_by
+        return self._first_instability is not None and is_to_limit
+
+    def reason(self, error: Exception) -> str:
+        """Return why the step has stopped, in words."""
+        names = self.scene.model.system.nan_terms
+        nan_text = ""
+        if names:
+            nan_text = f"; where it was tried last, {' and '.join(names)} was not a number"
+        return f"{self.place}{error}{nan_text}"
+
+    def path(self, state: State) -> Iterator[Record]:
+        """Yield the records of the path from a state."""
+        stream = RecordStream(records_of(self.scene, self._step, state))
+        for record in stream:
+            self._last, self.label = record, record.label
+            yield self._completed(record)
+            if not self.is_at_event:
+                continue
+            self.is_unstable = True
+            is_uncertain = bool(self.scene.stability_monitor.unlocated)
+            if not (self._first_instability or record.branch or is_uncertain):
+                self._first_instability = record
+        self.end = stream.end
+
+    def remark_on_release(self) -> str:
+        """Return a remark on a shell that is released after it has buckled; empty for others.
+
+        Raises
+        ------
+        Stopped
+            If a shell is released elsewhere than at a fold or a bifurcation of its path.
+        """
+        fold = self._last
+        if not (self._step.load.released_by and fold) or self._is_released_at_bifurcation:
+            return ""
+        if fold.label != "fold" or fold.mode:
+            raise Stopped(
+                f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the "
+                "model itself"
+            )
+        if not fold.excluded_pivots:
+            return ""
+        return _buckled_text(self.scene, fold, self._first_instability)
+
+    def beyond(self) -> Iterator[Record]:
+        """Yield the records of the branch or the snap that follows an instability at the end."""
+        step, record = self._step, self._last
+        if record is None:
+            return
+        records: Records | None = None
+        if step.load.released_by:
+            if self._is_released_at_bifurcation:
+                record = symmetry_switch_of_step(self.scene, step, record).record(0)
+                self.scene = record.scene or self.scene
+                yield self._completed(record)
+            from magshell_fenicsx.simulate.transient import snap_records
+
+            held = held_conjugates_of_step(self.scene, step, record.point.state)
+            records = snap_records(self.scene, step.load.released_by, record, held)
+        elif step.load.follows_branch and self.label == "bifurcation":
+            records = follow_branch_of_step(self.scene, step, record)
+        if records is None:
+            return
+        stream = RecordStream(records)
+        for record in stream:
+            self.label, self.scene = record.label, record.scene or self.scene
+            yield self._completed(record)
+        self.end = stream.end
+
+    @property
+    def _is_released_at_bifurcation(self) -> bool:
+        return self._step.until == "bifurcation" and self.label == "bifurcation"
+
+    def _completed(self, record: Record) -> Record:
+        """Return a record with what a history knows of it.
+
+        Raises
+        ------
+        Stopped
+            If something penetrates too much there.
+        """
+        scene, state = record.scene or self.scene, record.point.state
+        if record.said:
+            self._remark(self.place + record.said)
+        is_moving = bool((record.clock or {}).get("kinetic"))
+        recorded = scene.journal.recorded_values(
+            lambda: RecordedValues({"said": penetration_message(scene, state, moving=is_moving)})
+        )
+        if message := recorded.values["said"]:
+            raise Stopped(message)
+        return replace(record, step=self._step.number, scene=scene, shown=scene.displacement)
+
+
+def energies_moving_the_shell(scene: Scene, state: State) -> dict[str, float]:
+    """Return amplitude -> value of the energies that move the undeformed shell.
+
+    One is a surface tension.
+    """
+    system, energies = scene.model.system, dict[str, float]()
     for term in scene.problem.loads.own:
         load = system.load(state.u, state.mu, term.name) if term.value else 0.0 * state.u
         if max_abs(scene.comm, load) == 0:
             continue
-        moved = term.value * scene.newton.factor_at(state).solve(load)
-        if max_abs(scene.comm, moved) > ZERO_DISPLACEMENT * system.length:
-            own[term.name] = term.value
-    return own
+        displacement = term.value * scene.newton.factor_at(state).solve(load)
+        if max_abs(scene.comm, displacement) > ZERO_DISPLACEMENT * system.length:
+            energies[term.name] = term.value
+    return energies
 
 
-def _under(scene: Scene, name: str, value: float, state: State) -> Records:
-    """The records of a shell that comes to rest under an energy whose amplitude rises from zero."""
-    stage = plain(scene)
-    path, start = stage.begin(name, "load", state, value / RISES, value)
+def _rise(scene: Scene, name: str, value: float, state: State) -> Records:
+    """Yield the records of a shell that comes to rest under an energy that rises from zero.
+
+    Parameters
+    ----------
+    name, value
+        The amplitude of the energy, and its value at the end.
+    """
+    stage = load_stage(scene)
+    path, start = stage.begin(name, "load", state, value / STEPS_OF_RISE, value)
     try:
-        return (yield from followed(stage, path, start, ContinuationGoal("target", [value])))
+        return (yield from follow_path(stage, path, start, ContinuationGoal("target", [value])))
     except Stopped as e:
         raise Stopped(f"on the way to rest under the energy {name}: {e}") from None
 
 
-def _buckled(scene: Scene, fold: Record, first: Record | None) -> str:
-    """What a snap begins at, where modes that the model excludes are unstable before it."""
+def _buckled_text(scene: Scene, fold: Record, first_instability: Record | None) -> str:
+    """Return words for a snap at whose fold modes that the model excludes are unstable."""
     count = fold.excluded_pivots
     since = "from the start of the step on"
-    if first and first.mode not in OWN_MODES:
-        value = amount(scene, first.amplitude, first.point.state.mu[first.amplitude])
-        since = f"the first of them ({first.mode}) since {value}"
+    if first_instability and first_instability.mode not in OWN_MODES:
+        name = first_instability.amplitude
+        value = amount(scene, name, first_instability.point.state.mu[name])
+        since = f"the first of them ({first_instability.mode}) since {value}"
     return (
-        f"the snap starts from a shell that has buckled before: at its fold {count} mode{'s' * (count != 1)} that the "
-        f"model excludes {'are' if count != 1 else 'is'} unstable, {since}; symmetry: none follows them"
+        "the snap starts from a shell that has buckled before: at its fold "
+        f"{count} mode{'s' * (count != 1)} that the "
+        f"model excludes {'are' if count != 1 else 'is'} unstable, {since}; symmetry: none follows "
+        "them"
     )
 
 
-def _refuse_not_numbers(scene: Scene, state: State, where: str) -> None:
-    """See that the forces at a state are numbers: no step could be small enough.
+def _refuse_not_numbers(scene: Scene, state: State, place: str) -> None:
+    """Check that the forces at a state are numbers: no step could be small enough.
+
+    Parameters
+    ----------
+    place
+        Begin of the message.
 
     Raises
     ------
@@ -230,5 +352,6 @@ def _refuse_not_numbers(scene: Scene, state: State, where: str) -> None:
     system.residual(state.u, state.mu)
     if system.nan_terms:
         raise Stopped(
-            f"{where}{' and '.join(system.nan_terms)} is not a number at its begin, in value or derivative"
+            f"{place}{' and '.join(system.nan_terms)} is not a number at its begin, in value or "
+            "derivative"
         )

@@ -90,22 +90,22 @@ class Meridian:
 
     def facets_at(self, point: str) -> NDArray[np.int32]:
         """The point of the axis at a named place, or next to it."""
-        away = np.abs(self._parameters_of(self.axis) - self.points[point][0])
-        return np.asarray(self.axis[away == away.min(initial=inf)][:1])
+        distances = np.abs(self._parameters_of(self.axis) - self.points[point][0])
+        return np.asarray(self.axis[distances == distances.min(initial=inf)][:1])
 
     @property
     def bodies(self) -> list[NDArray[np.bool_]]:
         """The cells of each shell, or of those that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
-        for both in self.tied:
+        for tied_parameters in self.tied:
             begin, end = (
                 self._cell_ends[:, :1] - PARAMETER_TOLERANCE,
                 self._cell_ends[:, 1:] + PARAMETER_TOLERANCE,
             )
-            at = ((begin < both) & (both < end)).any(axis=1)
-            parts = [of for of in bodies if (of & at).any()]
-            bodies = [of for of in bodies if all(of is not part for part in parts)] + [
-                np.any(parts, axis=0)
+            touched_cells = ((begin < tied_parameters) & (tied_parameters < end)).any(axis=1)
+            connected = [of for of in bodies if (of & touched_cells).any()]
+            bodies = [of for of in bodies if all(of is not part for part in connected)] + [
+                np.any(connected, axis=0)
             ]
         return bodies
 
@@ -114,10 +114,12 @@ class Meridian:
         """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a
         T-junction.
         """
-        near = [np.abs(self._cell_ends - one) < PARAMETER_TOLERANCE for one, _ in self.tied]
+        end_matches = [
+            np.abs(self._cell_ends - first) < PARAMETER_TOLERANCE for first, _ in self.tied
+        ]
         return [
-            1.0 * at[:, 1] - 1.0 * at[:, 0] if one == other else None
-            for at, (one, other) in zip(near, self.tied, strict=True)
+            1.0 * match[:, 1] - 1.0 * match[:, 0] if first == second else None
+            for match, (first, second) in zip(end_matches, self.tied, strict=True)
         ]
 
     @property
@@ -171,8 +173,8 @@ def make_meridian(
     names: Names = (None, "rim"),
     points: Mapping[str, tuple[float, float]] | None = None,
     curvature: float = 1.0,
-    pieces: Sequence[tuple[str, tuple[float, float]]] = (),
-    held: Collection[str] = (),
+    shell_intervals: Sequence[tuple[str, tuple[float, float]]] = (),
+    supported_ends: Collection[str] = (),
     tied: Sequence[tuple[float, float]] = (),
 ) -> Meridian:
     """Mesh the meridian.
@@ -186,21 +188,21 @@ def make_meridian(
     points
         See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place,
         and where that is held the highest on the axis.
-    pieces
+    shell_intervals
         Name and ends of each of several shells, between which are no cells.
-    held
+    supported_ends
         Ends that supports hold.
     tied
         See `Meridian`.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
-    parts = [ends for _, ends in pieces] or [(float(vertices[0]), float(vertices[-1]))]
+    parts = [ends for _, ends in shell_intervals] or [(float(vertices[0]), float(vertices[-1]))]
     first = np.searchsorted([begin for begin, _ in parts], vertices[:-1] + PARAMETER_TOLERANCE)
-    inside = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - PARAMETER_TOLERANCE
+    is_cell = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - PARAMETER_TOLERANCE
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
         MPI.COMM_SELF,
-        cells=np.column_stack([numbers[:-1], numbers[1:]])[inside],
+        cells=np.column_stack([numbers[:-1], numbers[1:]])[is_cell],
         x=vertices[:, None].astype(np.float64),
         e=element,
     )
@@ -215,21 +217,25 @@ def make_meridian(
     poles = [facet for name, facet in zip(names, facets, strict=True) if not name]
     axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
-    if points is None or (pieces and "pole" not in points):
-        places = embedding(np.column_stack([vertices, 0 * vertices]))
-        still = [end for name, end in zip(names, np.ravel(parts), strict=True) if name in held]
-        free = (
-            np.abs(np.subtract.outer(vertices, still)).min(axis=1, initial=inf)
+    if points is None or (shell_intervals and "pole" not in points):
+        positions = embedding(np.column_stack([vertices, 0 * vertices]))
+        supported = [
+            end for name, end in zip(names, np.ravel(parts), strict=True) if name in supported_ends
+        ]
+        is_unsupported = (
+            np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
             > PARAMETER_TOLERANCE
         )
-        highest = np.argmax(places[:, 2])
-        if not free[highest] and free.any():
-            on_axis = free & (np.abs(places[:, 0]) < PARAMETER_TOLERANCE)
-            highest = np.argmax(np.where(on_axis if on_axis.any() else free, places[:, 2], -inf))
-        s = float(vertices[highest]) if pieces else 0.0
+        highest = np.argmax(positions[:, 2])
+        if not is_unsupported[highest] and is_unsupported.any():
+            on_axis = is_unsupported & (np.abs(positions[:, 0]) < PARAMETER_TOLERANCE)
+            highest = np.argmax(
+                np.where(on_axis if on_axis.any() else is_unsupported, positions[:, 2], -inf)
+            )
+        s = float(vertices[highest]) if shell_intervals else 0.0
         points = {**(points or {}), "pole": (s, 0.0)}
     middles = domain.geometry.x[compat.geometry_dofs(domain), 0].mean(axis=1)
-    patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in pieces}
+    patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in shell_intervals}
     return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
 
 
@@ -241,7 +247,7 @@ def graded_vertices(
     refinement: float = 1.0,
     axis: bool = True,
     largest: float = inf,
-    pressed: tuple[float, float] | None = None,
+    contact_size: tuple[float, float] | None = None,
     everywhere: float | None = None,
 ) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0
@@ -258,7 +264,7 @@ def graded_vertices(
         Thickness over R, or the smaller size of the cells on the axis.
     largest
         Of the cells, whatever the thickness.
-    pressed
+    contact_size
         Cells of a size up to a distance from the start, where bodies press.
     everywhere
         The size of all cells, over the refinement, in place of all these.
@@ -280,9 +286,9 @@ def graded_vertices(
         if everywhere is not None:
             return np.full_like(s, everywhere / refinement)
         sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
-        if pressed:
+        if contact_size:
             sizes = np.minimum(
-                sizes, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0])
+                sizes, contact_size[1] / refinement + growth * np.maximum(0.0, s - contact_size[0])
             )
         return sizes
 
@@ -295,18 +301,20 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
     """Vertices at the corners and, between them, with cells proportional to the size that is asked
     for.
     """
-    pieces = []
+    segments = []
     for a, b in pairwise(corners):
         s = np.linspace(a, b, 20001)
         with np.errstate(over="ignore", divide="ignore"):
-            counted = np.concatenate([[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))])
-        if not counted[-1] < MAX_CELLS:
+            cell_numbers = np.concatenate(
+                [[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))]
+            )
+        if not cell_numbers[-1] < MAX_CELLS:
             raise MeshError(
-                f"mesh: the meridian would have {counted[-1]:.2g} cells, allowed {MAX_CELLS:g}: take a larger "
+                f"mesh: the meridian would have {cell_numbers[-1]:.2g} cells, allowed {MAX_CELLS:g}: take a larger "
                 "mesh.size, a lower mesh.refinement, or larger bodies"
             )
-        cells = int(np.ceil(counted[-1]))
-        piece = np.interp(np.linspace(0, counted[-1], cells + 1), counted, s)
-        piece[[0, -1]] = a, b
-        pieces.append(piece[:-1])
-    return np.concatenate([*pieces, corners[-1:]])
+        cells = int(np.ceil(cell_numbers[-1]))
+        segment = np.interp(np.linspace(0, cell_numbers[-1], cells + 1), cell_numbers, s)
+        segment[[0, -1]] = a, b
+        segments.append(segment[:-1])
+    return np.concatenate([*segments, corners[-1:]])

@@ -58,21 +58,21 @@ class WaveHessians:
         log: KernelLog,
     ) -> None:
         self._nodes = u.function_space.dofmap.list.astype(np.int64)
-        places = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
+        energies_by_support = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
-            places.setdefault(_support_of(e), []).append(e)
+            energies_by_support.setdefault(_support_of(e), []).append(e)
         self._sites = [
-            _WaveBatch(domain, u, batch, at_place, log)
-            for at_place in places.values()
-            for batch in _batches(domain, at_place[0].density)
+            _WaveBatch(domain, u, batch, energies_here, log)
+            for energies_here in energies_by_support.values()
+            for batch in _batches(domain, energies_here[0].density)
         ]
         nodes = [site.nodes(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
         pairs = [rows * count + columns for rows, columns in nodes]
-        kept = [
+        upper_numbers = [
             number[rows <= columns] for number, (rows, columns) in zip(pairs, nodes, strict=True)
         ]
-        numbers = np.unique(np.concatenate(kept))
+        numbers = np.unique(np.concatenate(upper_numbers))
         self.rows, self.columns = numbers // count, numbers % count
         self._sums = [
             _sum_of_blocks(np.searchsorted(numbers, number), rows <= columns, len(numbers))
@@ -150,19 +150,19 @@ class _WaveBatch:
             for target, values in self._varying[number]:
                 fill(target, values.renew()[0])
         upper = np.zeros((len(waves), *self._scales.shape))
-        for which, m in enumerate(waves):
+        for wave_index, m in enumerate(waves):
             self._m.value = m
             for number in present:
                 factor = np.pi * factors[self._energies[number].amplitude]
-                upper[which] += factor * self._points.evaluate(
+                upper[wave_index] += factor * self._points.evaluate(
                     self._kernels[number], self._batch.size
                 )
         upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
         stiff = upper.any(axis=(0, 2))  # a body touches few cells: the matrices of others are zero
-        whole = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
+        blocks = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
         ordered = upper[:, stiff][..., self._order].reshape(-1, len(self._products))
-        whole[:, stiff] = (ordered @ self._products).reshape(len(waves), -1, *whole.shape[2:])
-        return whole
+        blocks[:, stiff] = (ordered @ self._products).reshape(len(waves), -1, *blocks.shape[2:])
+        return blocks
 
     def _place(self) -> None:
         fill(self._at_r0, self._derivatives(self._domain.r0))
@@ -172,8 +172,8 @@ class _WaveBatch:
     @cached_property
     def _kernels(self) -> list[PointKernel]:
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
-        both = [wave_jets_of(each, self._m) for each in waves]
-        u, r0, drawn = (
+        jets_of_waves = [wave_jets_of(side_jets, self._m) for side_jets in waves]
+        u, r0, initial_jets = (
             [revolved_jet_of(self._of_sides(field, PLANE, side)) for side in self._sides]
             for field in (self._at_u, self._at_r0, self._at_initial)
         )
@@ -181,15 +181,17 @@ class _WaveBatch:
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert e.density
             start, shift = (
-                (drawn, [a - b for a, b in zip(r0, drawn, strict=True)])
+                (initial_jets, [a - b for a, b in zip(r0, initial_jets, strict=True)])
                 if self._is_drawn(e)
                 else (r0, None)
             )
-            moved = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
+            displacements = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
             W = ufl.zero()
             for part in range(2):  # the cosine's and the sine's
-                v = [each[part] for each in both]
-                W = W + _perturbed_density(e.density, start, moved, v, self._edge(r0), parameters)
+                v = [side_jets[part] for side_jets in jets_of_waves]
+                W = W + _perturbed_density(
+                    e.density, start, displacements, v, self._edge(r0), parameters
+                )
             kernels.append(full_hessian(f"{e.name} waves", W, self._wave, self._log))
         return kernels
 
@@ -225,7 +227,9 @@ class _WaveBatch:
                 self._batch.cells, self._reference, self._by_length, strict=True
             )
         ]
-        return np.stack([each.reshape(-1, DERIVATIVES, PLANE) for each in sides], axis=1)
+        return np.stack(
+            [side_values.reshape(-1, DERIVATIVES, PLANE) for side_values in sides], axis=1
+        )
 
     @cached_property
     def _reference(self) -> list[Array]:
@@ -248,14 +252,16 @@ class _WaveBatch:
         """(points of an entity and pairs of derivatives, pairs of functions), with the functions of
         all sides.
         """
-        each, derivatives, functions = self._reference[0].shape
+        points_per_entity, derivatives, functions = self._reference[0].shape
         count = len(self._sides)
-        of_sides = np.zeros((each, count, derivatives, count, functions))
+        of_sides = np.zeros((points_per_entity, count, derivatives, count, functions))
         for side, table in enumerate(self._reference):
             of_sides[:, side, :, side] = table
-        jets = of_sides.reshape(each, count * derivatives, count * functions)
+        jets = of_sides.reshape(points_per_entity, count * derivatives, count * functions)
         return np.asarray(
-            np.einsum("qin,qjm->qijnm", jets, jets).reshape(each * jets.shape[1] ** 2, -1)
+            np.einsum("qin,qjm->qijnm", jets, jets).reshape(
+                points_per_entity * jets.shape[1] ** 2, -1
+            )
         )
 
     @cached_property
@@ -297,17 +303,17 @@ def _perturbed_density(
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
     """A density with the Hessian in v, at v = 0, of that at u + v; see `Energy.perturbed_form`."""
-    more = [a + b for a, b in zip(u, v, strict=True)]
+    u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:
-        return density.value_at([r0, more], edge, parameters)
-    less = [a - b for a, b in zip(u, v, strict=True)]
+        return density.value_at([r0, u_plus_v], edge, parameters)
+    u_minus_v = [a - b for a, b in zip(u, v, strict=True)]
     return (
-        density.value_at([r0, more, v], edge, parameters)
-        - density.value_at([r0, less, v], edge, parameters)
+        density.value_at([r0, u_plus_v, v], edge, parameters)
+        - density.value_at([r0, u_minus_v, v], edge, parameters)
     ) / 4
 
 
-def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_array:
+def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) -> csr_array:
     """The sparse matrix (entries of all pairs of nodes, entries of a site's blocks) by which the
     blocks are added up.
 
@@ -315,7 +321,7 @@ def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_ar
     ----------
     numbers
         (entities, functions, functions) of the pairs of nodes.
-    kept
+    in_triangle
         (entities, functions, functions) whether a pair is in the triangle that is assembled.
     count
         Number of all pairs.
@@ -325,13 +331,13 @@ def _sum_of_blocks(numbers: Ints, kept: NDArray[np.bool_], count: int) -> csr_ar
     )
     rows, columns = list[Ints](), list[Ints]()
     for k, (c, d) in enumerate(_UPPER):
-        rows.append(9 * numbers[kept] + WAVE * c + d)
-        columns.append(entries[:, k][kept])
+        rows.append(9 * numbers[in_triangle] + WAVE * c + d)
+        columns.append(entries[:, k][in_triangle])
         if c < d:
-            rows.append(9 * numbers[kept] + WAVE * d + c)
-            columns.append(entries[:, k].transpose(0, 2, 1)[kept])
-    places = np.concatenate(rows), np.concatenate(columns)
-    return coo_array((np.ones(len(places[0])), places), (9 * count, entries.size)).tocsr()
+            rows.append(9 * numbers[in_triangle] + WAVE * d + c)
+            columns.append(entries[:, k].transpose(0, 2, 1)[in_triangle])
+    positions = np.concatenate(rows), np.concatenate(columns)
+    return coo_array((np.ones(len(positions[0])), positions), (9 * count, entries.size)).tocsr()
 
 
 def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
@@ -352,9 +358,9 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
         X, weights = basix.make_quadrature(
             basix.CellType.interval, density.quadrature or domain.rule
         )
-        every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
+        all_cells = np.arange(topology.index_map(1).size_local, dtype=np.int32)
         yield EntityBatch(
-            (every,), EntityRule((X,), (), weights), np.zeros((len(every) * len(X), 2))
+            (all_cells,), EntityRule((X,), (), weights), np.zeros((len(all_cells) * len(X), 2))
         )
         return
     topology.create_connectivity(0, 1)
@@ -362,15 +368,15 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
     inner = (
         np.flatnonzero(np.diff(links.offsets) == 2) if density.facets is None else density.facets
     )
-    around = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(
+    cells_at_vertex = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(
         len(inner), -1
     )
-    local = (corners[around] != np.asarray(inner)[:, None, None]).argmin(
+    local = (corners[cells_at_vertex] != np.asarray(inner)[:, None, None]).argmin(
         axis=2
     )  # the vertex's number in each cell
     for kind in np.unique(local, axis=0):
-        those = (local == kind).all(axis=1)
-        cells = tuple(np.ascontiguousarray(side) for side in around[those].T)
+        of_kind = (local == kind).all(axis=1)
+        cells = tuple(np.ascontiguousarray(side) for side in cells_at_vertex[of_kind].T)
         outward = [
             np.sign(lengths[side]) * (1 if end else -1)
             for side, end in zip(cells, kind, strict=True)
@@ -390,7 +396,7 @@ def _lengths(V: fem.FunctionSpace) -> Array:
 
 def _triangle(size: int) -> Ints:
     """(size, size) places in the rows of an upper triangle."""
-    places = np.zeros((size, size), dtype=np.int64)
+    positions = np.zeros((size, size), dtype=np.int64)
     rows, columns = np.triu_indices(size)
-    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
-    return places
+    positions[rows, columns] = positions[columns, rows] = np.arange(len(rows))
+    return positions

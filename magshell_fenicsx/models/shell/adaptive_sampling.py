@@ -56,15 +56,15 @@ class SubCells:
 
     def in_each_cell(self, cells: Numbers) -> "SubCells":
         """The same in each of some cells."""
-        times = len(cells)
+        count = len(cells)
         numbers = np.repeat(cells, len(self.cell))
-        return SubCells(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
+        return SubCells(numbers, np.tile(self.corner, (count, 1)), np.tile(self.sides, (count, 1)))
 
     @classmethod
-    def concatenate(cls, several: "Sequence[SubCells]") -> "SubCells":
+    def concatenate(cls, groups: "Sequence[SubCells]") -> "SubCells":
         return cls(
             *(
-                np.concatenate([getattr(one, name) for one in several])
+                np.concatenate([getattr(group, name) for group in groups])
                 for name in ("cell", "corner", "sides")
             )
         )
@@ -76,13 +76,13 @@ class SubCells:
     def divided(self) -> "SubCells":
         """The parts of the first, those of the second, and so on."""
         children = CHILDREN[self.corner.shape[1]]
-        at, by = (np.array(v, dtype=float) for v in zip(*children, strict=True))
+        corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
-        corner = self.corner[:, None] + self.sides[:, None] * at
+        corner = self.corner[:, None] + self.sides[:, None] * corners
         return SubCells(
             np.repeat(self.cell, len(children)),
             corner.reshape(-1, d),
-            (self.sides[:, None] * by).reshape(-1, d),
+            (self.sides[:, None] * scales).reshape(-1, d),
         )
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
@@ -111,12 +111,13 @@ class Lattice:
     def make(cls, kind: basix.CellType, count: int) -> "Lattice":
         """With `count` parts of each side."""
         corners = basix.geometry(kind)
-        every = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
-        X = np.concatenate([corners, every])
-        apart = X[None, len(corners) :] - X[len(corners) :, None]
+        interior = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
+        X = np.concatenate([corners, interior])
+        differences = X[None, len(corners) :] - X[len(corners) :, None]
         steps = np.eye(X.shape[1]) / count
         pairs = [
-            np.argwhere(np.abs(apart - step).max(axis=-1) < 1e-9) + len(corners) for step in steps
+            np.argwhere(np.abs(differences - step).max(axis=-1) < 1e-9) + len(corners)
+            for step in steps
         ]
         return cls(X, len(corners), pairs, count)
 
@@ -155,8 +156,8 @@ class RefinedParts:
 
 def refine_where_hidden(
     formulas: FormulaGroup,
-    first: SubCells,
-    look: PlacesOfParts,
+    first_parts: SubCells,
+    places_of: PlacesOfParts,
     lattice: Lattice,
     owned: int,
     comm: MPI.Comm = MPI.COMM_SELF,
@@ -170,47 +171,51 @@ def refine_where_hidden(
     owned
         The cells with smaller numbers count in sums.
     """
-    parts, seen = first, _sample(formulas, first, look, lattice)
-    looked = 0
+    parts, samples = first_parts, _sample(formulas, first_parts, places_of, lattice)
+    part_count = 0
     while True:
-        own = parts.cell < owned
-        looked = max(looked, comm.allreduce(int(own.sum())))
-        area = seen.area * own
-        mean = comm.allreduce(area @ seen.values.mean(axis=1)) / comm.allreduce(float(area.sum()))
-        f = seen.values - mean
+        is_own = parts.cell < owned
+        part_count = max(part_count, comm.allreduce(int(is_own.sum())))
+        area = samples.area * is_own
+        mean = comm.allreduce(area @ samples.values.mean(axis=1)) / comm.allreduce(
+            float(area.sum())
+        )
+        f = samples.values - mean
         size = np.linalg.norm(f, axis=-1)
         variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
-        largest = comm.allreduce(float(np.abs(seen.values).max(initial=0.0)), MPI.MAX)
-        matters = (seen.between > VALUE_TOLERANCE * largest) & (seen.size > MIN_SIZE)
-        unseen = np.where(matters, seen.area * seen.between, 0.0)
-        most = comm.allreduce(float(unseen[own].max(initial=0.0)), MPI.MAX)
-        left = comm.allreduce(float(unseen[own].sum()))
-        slight = MAX_OPEN_INTEGRAL * comm.allreduce(
-            float(area @ np.linalg.norm(seen.values, axis=-1).mean(axis=1))
+        largest = comm.allreduce(float(np.abs(samples.values).max(initial=0.0)), MPI.MAX)
+        matters = (samples.between > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
+        hidden_integrals = np.where(matters, samples.area * samples.between, 0.0)
+        largest_hidden = comm.allreduce(float(hidden_integrals[is_own].max(initial=0.0)), MPI.MAX)
+        hidden_integral = comm.allreduce(float(hidden_integrals[is_own].sum()))
+        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(
+            float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
         )
-        alike = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(own.sum())), 1)
-        again = (unseen > alike) & (unseen >= DIVIDED_SHARE * min(most, np.finfo(float).max))
+        threshold = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(is_own.sum())), 1)
+        to_divide = (hidden_integrals > threshold) & (
+            hidden_integrals >= DIVIDED_SHARE * min(largest_hidden, np.finfo(float).max)
+        )
         if (
-            left <= max(MAX_OPEN_VARIATION * variation, slight)
-            or looked > MAX_PARTS
-            or not comm.allreduce(int((again & own).sum()))
+            hidden_integral <= max(MAX_OPEN_VARIATION * variation, negligible)
+            or part_count > MAX_PARTS
+            or not comm.allreduce(int((to_divide & is_own).sum()))
         ):
             break
-        smaller = parts[again].divided()
-        parts = SubCells.concatenate([parts[~again], smaller])
-        seen = _Samples.concatenate(
-            [seen.select(~again), _sample(formulas, smaller, look, lattice)]
+        smaller = parts[to_divide].divided()
+        parts = SubCells.concatenate([parts[~to_divide], smaller])
+        samples = _Samples.concatenate(
+            [samples.select(~to_divide), _sample(formulas, smaller, places_of, lattice)]
         )
-    away = (size**2).mean(axis=1)
-    share = left / max(variation, np.finfo(float).tiny)
+    variances = (size**2).mean(axis=1)
+    share = hidden_integral / max(variation, np.finfo(float).tiny)
     return RefinedParts(
         parts,
-        seen.area,
-        seen.centre,
-        seen.size,
-        away,
+        samples.area,
+        samples.centre,
+        samples.size,
+        variances,
         variation,
-        share if looked > MAX_PARTS else 0.0,
+        share if part_count > MAX_PARTS else 0.0,
     )
 
 
@@ -226,36 +231,36 @@ class _Samples:
     between: Array
     values: Array
 
-    def select(self, which: NDArray[np.bool_]) -> "_Samples":
-        return _Samples(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+    def select(self, selection: NDArray[np.bool_]) -> "_Samples":
+        return _Samples(*(getattr(self, name)[selection] for name in self.__dataclass_fields__))
 
     @classmethod
-    def concatenate(cls, several: "Sequence[_Samples]") -> "_Samples":
+    def concatenate(cls, groups: "Sequence[_Samples]") -> "_Samples":
         return cls(
             *(
-                np.concatenate([getattr(one, name) for one in several])
+                np.concatenate([getattr(samples, name) for samples in groups])
                 for name in cls.__dataclass_fields__
             )
         )
 
 
 def _sample(
-    formulas: FormulaGroup, parts: SubCells, look: PlacesOfParts, lattice: Lattice
+    formulas: FormulaGroup, parts: SubCells, places_of: PlacesOfParts, lattice: Lattice
 ) -> _Samples:
     """A look at each part, with the box of its places and of what bulges between them."""
-    x, area = look(parts)
+    x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
     bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[
         :, None
     ]
     bulge = np.where(bulge > VALUE_TOLERANCE, bulge, 0.0)
-    least, most, bent = formulas.bounds(low - bulge, high + bulge)
+    lower, upper, bent = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
-    most, least = (np.clip(v, -MAX_VALUE, MAX_VALUE) for v in (most, least))
-    between = np.minimum(
-        np.maximum(most - least - STEP_SHARE * np.ptp(f, axis=1), 0.0), bent / lattice.count
+    upper, lower = (np.clip(v, -MAX_VALUE, MAX_VALUE) for v in (upper, lower))
+    hidden = np.minimum(
+        np.maximum(upper - lower - STEP_SHARE * np.ptp(f, axis=1), 0.0), bent / lattice.count
     )
-    between = np.where(bent <= SLOPE_RATIO * lattice.bent(f), 0.0, between).sum(axis=1)
-    return _Samples(area, x.mean(axis=1), (high - low).max(axis=1), between, f)
+    hidden = np.where(bent <= SLOPE_RATIO * lattice.bent(f), 0.0, hidden).sum(axis=1)
+    return _Samples(area, x.mean(axis=1), (high - low).max(axis=1), hidden, f)

@@ -40,18 +40,24 @@ class ControlPoints:
 
     def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
         """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
-        at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.is_axisymmetric else x
+        places = (
+            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.is_axisymmetric else x
+        )
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
-        looked = min(FIRST_NEIGHBOURS, count)
+        neighbour_count = min(FIRST_NEIGHBOURS, count)
         while True:
-            distance, number = (v.reshape(len(at), looked) for v in tree.query(at, looked))
+            distance, number = (
+                v.reshape(len(places), neighbour_count) for v in tree.query(places, neighbour_count)
+            )
             w = np.exp((distance[:, :1] ** 2 - distance**2) / self.width**2)
-            if looked == count or w[:, -1].max(initial=0.0) < MIN_RELATIVE_WEIGHT:
+            if neighbour_count == count or w[:, -1].max(initial=0.0) < MIN_RELATIVE_WEIGHT:
                 break
-            looked = min(2 * looked, count)
+            neighbour_count = min(2 * neighbour_count, count)
         w /= w.sum(axis=1, keepdims=True)
-        rows = np.repeat(np.arange(len(at)), looked)
-        return scipy.sparse.csr_matrix((w.ravel(), (rows, number.ravel())), shape=(len(at), count))
+        rows = np.repeat(np.arange(len(places)), neighbour_count)
+        return scipy.sparse.csr_matrix(
+            (w.ravel(), (rows, number.ravel())), shape=(len(places), count)
+        )
 
 
 @dataclass(frozen=True)

@@ -76,8 +76,8 @@ def normal_moment(
         edge = kin.inverse_metric(r0), (nu1, nu2), 1
         return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
-    raised = ufl.dot(natural.up, covector)
-    edge = natural.up, (raised[0], raised[1]), ufl.dot(raised, covector)
+    covector_up = ufl.dot(natural.up, covector)
+    edge = natural.up, (covector_up[0], covector_up[1]), ufl.dot(covector_up, covector)
     E, K, law = E - natural.strain, K - natural.bend, law.thicker(natural.thickness)
     return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, *edge)
 
@@ -158,8 +158,8 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """
     up1, up2 = kin.dual_basis(r0)
     q = rotation(r0, u)
-    turned = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
-    return -turned * ufl.dot(kin.normal(r0), Br)
+    rotated = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
+    return -rotated * ufl.dot(kin.normal(r0), Br)
 
 
 def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

@@ -51,9 +51,9 @@ def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
     """Sine and cosine of the angle between the normals about the edge; its sign is that of
     `fold_jump`.
     """
-    along = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
+    edge_tangent = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
     n_plus, n_minus = kin.normal(plus), kin.normal(minus)
-    return -ufl.dot(ufl.cross(n_plus, n_minus), along), ufl.dot(n_plus, n_minus)
+    return -ufl.dot(ufl.cross(n_plus, n_minus), edge_tangent), ufl.dot(n_plus, n_minus)
 
 
 def two_sided(
@@ -127,34 +127,34 @@ def fold(
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
-    stretched = 1
+    stretch_across = 1
     if natural:
         nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
-        stretched = (
+        stretch_across = (
             sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
         )
         bent = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (
-            2 * stretched
+            2 * stretch_across
         )
         angle = bent * ufl.atan2(sine0, cosine0)
         sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
-    J = stretched * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
+    J = stretch_across * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
-def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
+def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, reference_turn: Expr) -> Expr:
     """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the
     normal.
 
     The tangent runs with the surface on its left, so that a positive angle turns the normal
-    outward. The angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine
+    outward. The angle is that of the normal's part normal to the tangent; `reference_turn` (2,) holds cosine
     and sine of the turn that it is counted from, so that it may grow beyond pi.
     """
-    along = r0.r2 * m[0] - r0.r1 * m[1]
-    length = ufl.sqrt(ufl.dot(along, along))
-    t0, n0, n = along / length, kin.normal(r0), kin.normal(r0 + u)
+    edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
+    length = ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))
+    t0, n0, n = edge_tangent / length, kin.normal(r0), kin.normal(r0 + u)
     sine, cosine = ufl.dot(ufl.cross(n0, n), t0), ufl.dot(n0, n)
-    return -intensity * kin.angle_from(sine, cosine, past) * length
+    return -intensity * kin.angle_from(sine, cosine, reference_turn) * length
 
 
 def clamped(

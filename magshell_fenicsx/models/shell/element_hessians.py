@@ -97,7 +97,7 @@ class HessianIntegral:
         self,
         u: Array,
         factors: Mapping[str, float],
-        same: Array,
+        element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
         """Add the terms' element matrices.
@@ -108,7 +108,7 @@ class HessianIntegral:
             (dofs,) with ghosts.
         factors
             By term; others are left out.
-        same
+        element_matrices
             (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
         couple
             Takes the number of each batch of interior edges and what couples the cells there.
@@ -132,13 +132,16 @@ class HessianIntegral:
             if self._replaced and self._prestress:
                 blocks.add(self._prestress.evaluate(number), 1.0, self._prestress.pairs)
             for side, cells in enumerate(batch.cells):
-                same[cells] += contraction.within_side(blocks, side)
+                element_matrices[cells] += contraction.within_side(blocks, side)
             if self._sides == 2:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
 
     def replace_strain(
-        self, u: Array, by: Sequence[tuple[float, Array]], besides: NDArray[np.bool_] | None = None
+        self,
+        u: Array,
+        weighted_displacements: Sequence[tuple[float, Array]],
+        excepted_cells: NDArray[np.bool_] | None = None,
     ) -> None:
         """Take the weighted sum of other displacements' membrane strains in place of that of u, in
         the next `add`.
@@ -151,10 +154,13 @@ class HessianIntegral:
         for number, (batch, r0) in enumerate(
             zip(self.batches, self._placements.renew(), strict=True)
         ):
-            strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
+            strains = [
+                w * _strain(r0, self._jets(batch, v))
+                for w, v in (*weighted_displacements, (-1.0, u))
+            ]
             strain = np.sum(strains, axis=0)
-            if besides is not None:
-                strain[np.repeat(besides[batch.cells[0]], len(batch.rule.weights))] = 0.0
+            if excepted_cells is not None:
+                strain[np.repeat(excepted_cells[batch.cells[0]], len(batch.rule.weights))] = 0.0
             self._prestress.vary(number, strain)
         self._prestress.renew()
         self._replaced = True
@@ -162,11 +168,11 @@ class HessianIntegral:
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
         """(points, sides, 6, 3) of a field."""
         nodes = field.reshape(-1, 3)
-        both = [
+        jets_of_sides = [
             t.jets(nodes[self._dofs[cells]])
             for t, cells in zip(batch.rule.tables, batch.cells, strict=True)
         ]
-        return np.stack(both, axis=2)
+        return np.stack(jets_of_sides, axis=2)
 
 
 class Kernel:
@@ -239,8 +245,8 @@ def _pairs(density: Density) -> BlockPairs:
     def coupled(pairs: Iterable[IndexPair]) -> tuple[IndexPair, ...]:
         return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
 
-    same = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
-    return BlockPairs(same, coupled(product(parts, parts)) if density.sides == 2 else ())
+    within_side = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
+    return BlockPairs(within_side, coupled(product(parts, parts)) if density.sides == 2 else ())
 
 
 def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:

@@ -97,12 +97,14 @@ class Density:
             after the other.
         """
         arguments = [*jets, *(edge[:1] if edge else ())]
-        sided = [tuple(each) if self.sides == 2 else each[0] for each in arguments]
+        sided = [
+            tuple(side_values) if self.sides == 2 else side_values[0] for side_values in arguments
+        ]
         fields = [
             _halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters
         ]
-        of = self.work if self.work and len(jets) == 3 else self.function
-        return of(*sided, *(edge[1:] if edge else ()), *fields)
+        density = self.work if self.work and len(jets) == 3 else self.function
+        return density(*sided, *(edge[1:] if edge else ()), *fields)
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
@@ -117,10 +119,10 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density per undeformed area, per area of the coordinates."""
 
-    def of(r0: Jet, *rest: Any, **options: Any) -> Expr:
+    def density_per_coordinates(r0: Jet, *rest: Any, **options: Any) -> Expr:
         return density(r0, *rest, **options) * kin.area_ratio(r0)
 
-    return of
+    return density_per_coordinates
 
 
 def cell_quadrature(degree: int) -> int:
@@ -208,7 +210,7 @@ def constants_of(
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
-    def made(
+    def constant_or_field(
         p: float | NDArray[np.float64] | Free | UserField | FormulaParameter | Coefficient,
     ) -> fem.Constant | fem.Function:
         if isinstance(p, Free):
@@ -226,4 +228,4 @@ def constants_of(
         assert not isinstance(p, FormulaParameter)  # a model has made a function of it
         return constant(p)
 
-    return tuple(made(p) for p in term.parameters)
+    return tuple(constant_or_field(p) for p in term.parameters)

@@ -53,7 +53,7 @@ class ElementIntegral(Protocol):
         self,
         u: Array,
         factors: Mapping[str, float],
-        same: Array,
+        element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
         """Add element matrices, see `HessianIntegral.add`."""
@@ -68,7 +68,7 @@ class FastTangent:
         The displacement that the terms were written with.
     sites
         Where they live; others may live there too.
-    held
+    constraints
         Of which components of u are zero; other directions are the system's.
     moving
         Local cells with nodes that move, and the terms' sites on these cells and their edges alone.
@@ -78,10 +78,10 @@ class FastTangent:
         self,
         u: fem.Function,
         sites: Sequence[ElementIntegral],
-        held: Sequence[Constraint],
+        constraints: Sequence[Constraint],
         moving: tuple[NDArray[np.bool_], Sequence[ElementIntegral]] | None = None,
     ) -> None:
-        V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
+        V, clamped = u.function_space, [c for c in constraints if isinstance(c, fem.DirichletBC)]
         self._u, self._sites, self._nodes = u, sites, V.dofmap.list
         self._moving = moving[0] if moving else None
         self._moving_sites = moving[1] if moving else ()
@@ -116,16 +116,16 @@ class FastTangent:
         nodes move.
         """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
-        same = np.zeros(self._element_matrices.shape)
+        element_matrices = np.zeros(self._element_matrices.shape)
         for site in self._moving_sites:
 
             def couple(batch: int, K: Array, site: ElementIntegral = site) -> None:
                 first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)
                 add_coupling_products(product, K, first, second, x)
 
-            site.add(self._u.x.array, factors, same, couple)
+            site.add(self._u.x.array, factors, element_matrices, couple)
         add_cell_products(
-            product, same[self._moving], self._nodes[self._moving], x
+            product, element_matrices[self._moving], self._nodes[self._moving], x
         )  # others have no node that moves
         return product.ravel()
 
@@ -139,12 +139,12 @@ def hessian_integrals(
     terms: Iterable[Term],
     log: KernelLog,
     prestress: Density | None = None,
-    chosen: CellMask = None,
+    cell_mask: CellMask = None,
 ) -> list[HessianIntegral]:
     """The sites of some terms: all cells and all interior edges together, boundary edges term by
     term. Collective.
 
-    `chosen` are the local cells that count, with their edges; None for all.
+    `cell_mask` are the local cells that count, with their edges; None for all.
     """
     V = r0.function_space
     nonlinear = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
@@ -153,16 +153,16 @@ def hessian_integrals(
     sites = []
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
         of_rule = [t for t in cells if t.density.quadrature == rule]
-        batches = cell_batches(V, rule or cell_quadrature(degree), chosen)
+        batches = cell_batches(V, rule or cell_quadrature(degree), cell_mask)
         sites.append(HessianIntegral(r0, batches, 1, of_rule, log, None if rule else prestress))
     if interior:
         sites.append(
             HessianIntegral(
-                r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log
+                r0, interior_batches(V, edge_quadrature(degree), cell_mask), 2, interior, log
             )
         )
     for term in nonlinear:
         if term.density.facets is not None:
-            batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, chosen)
+            batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, cell_mask)
             sites.append(HessianIntegral(r0, batches, 1, [term], log))
     return sites

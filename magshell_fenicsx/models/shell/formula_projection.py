@@ -85,7 +85,7 @@ class CellGeometry:
         nodal, d = self.nodal[cells], self.dimension
         table = self.element.tabulate(1, X.reshape(-1, d))[..., 0]
         table = table.reshape(1 + d, *X.shape[:-1], nodal.shape[1])
-        x, *slopes = (np.matmul(each, nodal) for each in table)
+        x, *slopes = (np.matmul(derivative_table, nodal) for derivative_table in table)
         if d == 1:
             if x.shape[-1] == 3:
                 return x, np.zeros_like(x), np.linalg.norm(slopes[0], axis=-1)
@@ -161,62 +161,80 @@ def project_formula(
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.evaluate(X)
     f = values(x, normals)
-    off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
+    interpolation_error = np.linalg.norm(
+        np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1
+    )
     magnitude, area = np.linalg.norm(f, axis=-1), area * w
     square_of = (area * magnitude**2).sum(axis=1)
     sums = cells.sum_over_ranks(
-        np.stack([*((area * v).sum(axis=1) for v in (magnitude, off)), square_of], axis=-1)
+        np.stack(
+            [*((area * v).sum(axis=1) for v in (magnitude, interpolation_error)), square_of],
+            axis=-1,
+        )
     )
     size, differs, square = map(float, sums)
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
-    narrow = (
+    detail = (
         _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
         if formulas
         else _HiddenDetail.none(len(scale))
     )
-    hidden = scale * narrow.hidden
-    more = float(cells.sum_over_ranks(hidden))
-    size += more
+    hidden_by_cell = scale * detail.hidden
+    hidden_integral = float(cells.sum_over_ranks(hidden_by_cell))
+    size += hidden_integral
     if not (
-        differs + more > INTERPOLATION_TOLERANCE * size
-        or more > INTERPOLATION_TOLERANCE * narrow.variation
+        differs + hidden_integral > INTERPOLATION_TOLERANCE * size
+        or hidden_integral > INTERPOLATION_TOLERANCE * detail.variation
     ):
-        return ProjectedFormula(nodal, smooth=True, size=size, open=narrow.open)
+        return ProjectedFormula(nodal, smooth=True, size=size, open=detail.open)
     largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
-    chosen = np.flatnonzero(
-        (off @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum()) | (hidden > PART_TOLERANCE * size)
+    projected_cells = np.flatnonzero(
+        (interpolation_error @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum())
+        | (hidden_by_cell > PART_TOLERANCE * size)
     )
-    ahead = narrow.parts_of(chosen, parts)
+    first_parts = detail.parts_of(projected_cells, parts)
     space = basix.create_element(
         basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
     )
     integrals = _moments(
-        values, cells, chosen, scale, ahead, PART_TOLERANCE * size, space, nodal.shape[-1]
+        values,
+        cells,
+        projected_cells,
+        scale,
+        first_parts,
+        PART_TOLERANCE * size,
+        space,
+        nodal.shape[-1],
     )
-    moments, sizes[chosen], squares, missed = integrals
+    moments, sizes[projected_cells], squares, missed = integrals
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
-    unshown, lost = np.zeros(len(scale)), squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
-    unshown[chosen] = scale[chosen] * np.maximum(lost, 0.0)
-    size, rest = float(cells.sum_over_ranks(sizes)), float(cells.sum_over_ranks(unshown))
+    residual_squares, lost_squares = (
+        np.zeros(len(scale)),
+        squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2),
+    )
+    residual_squares[projected_cells] = scale[projected_cells] * np.maximum(lost_squares, 0.0)
+    size, rest = float(cells.sum_over_ranks(sizes)), float(cells.sum_over_ranks(residual_squares))
     side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
     widest = cells.comm.allreduce(
-        float(side[unshown > VISIBLE_SHARE * rest].max(initial=0.0)), MPI.MAX
+        float(side[residual_squares > VISIBLE_SHARE * rest].max(initial=0.0)), MPI.MAX
     )
     at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
     if bounded:
         mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
         at_nodes = _bounded(
-            at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[chosen]
+            at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[projected_cells]
         )
     new = nodal.copy()
-    new[chosen] = at_nodes
-    nothing = np.finfo(float).tiny  # a formula that is zero but on a line
-    square_of[chosen] = scale[chosen] * squares
-    share = float(np.sqrt(rest / max(square, float(cells.sum_over_ranks(square_of)), nothing)))
+    new[projected_cells] = at_nodes
+    smallest_positive = np.finfo(float).tiny  # a formula that is zero but on a line
+    square_of[projected_cells] = scale[projected_cells] * squares
+    share = float(
+        np.sqrt(rest / max(square, float(cells.sum_over_ranks(square_of)), smallest_positive))
+    )
     return ProjectedFormula(
-        new, False, size, missed / max(size, nothing), share, widest, narrow.open
+        new, False, size, missed / max(size, smallest_positive), share, widest, detail.open
     )
 
 
@@ -260,28 +278,28 @@ class _HiddenDetail:
 
     @classmethod
     def none(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_HiddenDetail":
-        none = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
-        return cls(np.zeros(cells), variation, none, np.zeros(cells, bool), open_)
+        no_parts = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
+        return cls(np.zeros(cells), variation, no_parts, np.zeros(cells, bool), open_)
 
-    def parts_of(self, chosen: Numbers, alike: SubCells) -> SubCells:
+    def parts_of(self, cells: Numbers, uniform_parts: SubCells) -> SubCells:
         """Of some cells: those that are alike, but of the divided ones the leaves, none larger."""
-        deep = self.deep[chosen]
+        deep = self.deep[cells]
         if not deep.any():
-            return alike.in_each_cell(chosen)
+            return uniform_parts.in_each_cell(cells)
         parts, largest = (
-            self.leaves[np.isin(self.leaves.cell, chosen)],
-            1.001 * np.abs(alike.sides[0, 0]),
+            self.leaves[np.isin(self.leaves.cell, cells)],
+            1.001 * np.abs(uniform_parts.sides[0, 0]),
         )
-        small, wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
-        while wide.any():
-            small.append(parts[~wide])
-            parts = parts[wide].divided()
-            wide = np.abs(parts.sides[:, 0]) > largest
-        return SubCells.concatenate([alike.in_each_cell(chosen[~deep]), *small, parts])
+        small_parts, too_wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
+        while too_wide.any():
+            small_parts.append(parts[~too_wide])
+            parts = parts[too_wide].divided()
+            too_wide = np.abs(parts.sides[:, 0]) > largest
+        return SubCells.concatenate([uniform_parts.in_each_cell(cells[~deep]), *small_parts, parts])
 
 
 def _find_hidden_detail(
-    values: Values, formulas: FormulaGroup, cells: CellGeometry, coarse: Array
+    values: Values, formulas: FormulaGroup, cells: CellGeometry, sampled_integrals: Array
 ) -> _HiddenDetail:
     """Integrals (cells, components) compared with those over leaves, see `adaptive_sampling.leaves`;
     collective.
@@ -292,37 +310,39 @@ def _find_hidden_detail(
         basix.make_quadrature(kind, RULE_DEGREE[d]),
     )
 
-    def look(parts: SubCells) -> tuple[Array, Array]:
+    def places_of(parts: SubCells) -> tuple[Array, Array]:
         X, w = parts.rule(
             lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places))
         )
         x, _, area = cells.evaluate(X, parts.cell)
         return x, (area * w).sum(axis=1)
 
-    first = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).in_each_cell(
+    whole_cells = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).in_each_cell(
         np.arange(len(cells.nodal))
     )
-    seen = refine_where_hidden(formulas, first, look, lattice, cells.owned, cells.comm)
+    refined = refine_where_hidden(
+        formulas, whole_cells, places_of, lattice, cells.owned, cells.comm
+    )
     deep = np.zeros(len(cells.nodal), bool)
-    divided = np.abs(seen.parts.sides[:, 0]) < 1
-    deep[seen.parts.cell[divided]] = True
-    fine, parts = np.where(deep[:, None], 0.0, coarse), seen.parts[divided]
-    for some in parts.batches():
-        X, w = some.rule(points, weights)
-        x, normals, _ = cells.evaluate(X, some.cell)
-        np.add.at(fine, some.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
-    hidden = np.linalg.norm(fine - coarse, axis=1)
-    if not cells.sum_over_ranks(hidden) > 0:
-        return _HiddenDetail.none(len(hidden), seen.variation, seen.open)
-    return _HiddenDetail(hidden, seen.variation, parts, deep, seen.open)
+    divided = np.abs(refined.parts.sides[:, 0]) < 1
+    deep[refined.parts.cell[divided]] = True
+    integrals, parts = np.where(deep[:, None], 0.0, sampled_integrals), refined.parts[divided]
+    for batch in parts.batches():
+        X, w = batch.rule(points, weights)
+        x, normals, _ = cells.evaluate(X, batch.cell)
+        np.add.at(integrals, batch.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
+    differences = np.linalg.norm(integrals - sampled_integrals, axis=1)
+    if not cells.sum_over_ranks(differences) > 0:
+        return _HiddenDetail.none(len(differences), refined.variation, refined.open)
+    return _HiddenDetail(differences, refined.variation, parts, deep, refined.open)
 
 
 def _moments(
     values: Values,
     cells: CellGeometry,
-    chosen: Numbers,
+    projected_cells: Numbers,
     scale: Array,
-    ahead: SubCells,
+    first_parts: SubCells,
     threshold: float,
     space: Element,
     components: int,
@@ -334,70 +354,80 @@ def _moments(
     """
     points, weights = basix.make_quadrature(space.cell_type, RULE_DEGREE[cells.dimension])
     number = np.zeros(len(cells.nodal), np.int64)
-    number[chosen] = np.arange(len(chosen))
+    number[projected_cells] = np.arange(len(projected_cells))
 
-    def evaluated(some: SubCells) -> tuple[Array, Array, Array, Array]:
-        X, w = some.rule(points, weights)
-        x, normals, area = cells.evaluate(X, some.cell)
+    def evaluated(batch: SubCells) -> tuple[Array, Array, Array, Array]:
+        X, w = batch.rule(points, weights)
+        x, normals, area = cells.evaluate(X, batch.cell)
         return X, w, area * w, values(x, normals)
 
     def integrals(w: Array, f: Array) -> Array:
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
-    by_cell = np.zeros((len(chosen), space.dim, components))
-    sizes, squares, errors, each = (
-        np.zeros(len(chosen)),
-        np.zeros(len(chosen)),
+    by_cell = np.zeros((len(projected_cells), space.dim, components))
+    sizes, squares, errors, children = (
+        np.zeros(len(projected_cells)),
+        np.zeros(len(projected_cells)),
         0.0,
         len(CHILDREN[cells.dimension]),
     )
-    whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.batches())]
+    coarse_integrals = [integrals(w, f) for _, w, _, f in map(evaluated, first_parts.batches())]
     for depth in range(MAX_DIVISIONS + 1):
-        last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(ahead.cell)) > MAX_PARTS
-        rest, left = list[SubCells](), list[Array]()
-        for now, before in zip(ahead.batches(), whole, strict=True):
-            smaller = now.divided()
+        last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(first_parts.cell)) > MAX_PARTS
+        divided_parts, divided_integrals = list[SubCells](), list[Array]()
+        for batch, batch_integrals in zip(first_parts.batches(), coarse_integrals, strict=True):
+            smaller = batch.divided()
             X, w, area, f = evaluated(smaller)
-            fine = integrals(w, f)
-            error = scale[now.cell] * np.linalg.norm(
-                fine.reshape(len(before), each, -1).sum(axis=1) - before, axis=1
+            child_integrals = integrals(w, f)
+            error = scale[batch.cell] * np.linalg.norm(
+                child_integrals.reshape(len(batch_integrals), children, -1).sum(axis=1)
+                - batch_integrals,
+                axis=1,
             )
-            done = (error <= threshold) | last
-            errors += float((error[done & (now.cell < cells.owned)] ** 2).sum())
-            kept = np.repeat(done, each)
-            at, size = number[smaller.cell[kept]], np.linalg.norm(f[kept], axis=-1)
-            if len(at):  # Basix tabulates no empty set of points
-                phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
+            converged = (error <= threshold) | last
+            errors += float((error[converged & (batch.cell < cells.owned)] ** 2).sum())
+            is_added = np.repeat(converged, children)
+            cell_numbers, size = (
+                number[smaller.cell[is_added]],
+                np.linalg.norm(f[is_added], axis=-1),
+            )
+            if len(cell_numbers):  # Basix tabulates no empty set of points
+                phi = space.tabulate(0, X[is_added].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
                     *size.shape, space.dim
                 )
                 np.add.at(
-                    by_cell, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept])
+                    by_cell,
+                    cell_numbers,
+                    np.matmul(np.swapaxes(w[is_added][..., None] * phi, 1, 2), f[is_added]),
                 )
-                np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
-                np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
-            rest.append(smaller[~kept])
-            left.append(fine[~kept])
-        ahead = SubCells.concatenate(rest) if rest else ahead
-        if not cells.comm.allreduce(len(ahead.cell)):
+                np.add.at(sizes, cell_numbers, (area[is_added] * size).sum(axis=1))
+                np.add.at(squares, cell_numbers, (w[is_added] * size**2).sum(axis=1))
+            divided_parts.append(smaller[~is_added])
+            divided_integrals.append(child_integrals[~is_added])
+        first_parts = SubCells.concatenate(divided_parts) if divided_parts else first_parts
+        if not cells.comm.allreduce(len(first_parts.cell)):
             break
-        together = np.concatenate([np.empty((0, components)), *left])
-        whole = [together[i : i + BATCH_SIZE] for i in range(0, len(together), BATCH_SIZE)]
+        all_integrals = np.concatenate([np.empty((0, components)), *divided_integrals])
+        coarse_integrals = [
+            all_integrals[i : i + BATCH_SIZE] for i in range(0, len(all_integrals), BATCH_SIZE)
+        ]
     return by_cell, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
 
 
-def _bounded(at_nodes: Array, mean: Array, between: Array, f: Array) -> Array:
+def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Array:
     """Polynomials (cells, nodes, components) drawn towards their means until they have no values
     that f has not.
     """
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
-    every = np.concatenate([at_nodes, between], axis=1)
+    all_values = np.concatenate([at_nodes, inner_values], axis=1)
     share = np.ones_like(mean)
     for bound, extreme in (
-        (low, every.min(axis=1, keepdims=True)),
-        (high, every.max(axis=1, keepdims=True)),
+        (low, all_values.min(axis=1, keepdims=True)),
+        (high, all_values.max(axis=1, keepdims=True)),
     ):
-        away = extreme - mean
+        excess = extreme - mean
         share = np.minimum(
-            share, np.where(np.abs(away) > 0, (bound - mean) / np.where(away == 0, 1.0, away), 1.0)
+            share,
+            np.where(np.abs(excess) > 0, (bound - mean) / np.where(excess == 0, 1.0, excess), 1.0),
         )
     return np.asarray(mean + np.clip(share, 0.0, 1.0) * (at_nodes - mean))

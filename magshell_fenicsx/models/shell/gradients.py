@@ -60,7 +60,7 @@ class PointGradient:
         All on cells, or all on edges with as many sides.
     parts
         Which parts of the jets the points have.
-    each, count
+    points_per_entity, count
         Points of an entity, and of all; a chunk has whole entities.
     r0
         (points, sides * parts * 3) in the cells' own coordinates.
@@ -75,7 +75,7 @@ class PointGradient:
         self,
         terms: Sequence[PointTerm],
         parts: Sequence[str],
-        each: int,
+        points_per_entity: int,
         count: int,
         r0: Memo[Array],
         geometry: Array,
@@ -83,7 +83,7 @@ class PointGradient:
         log: KernelLog,
     ) -> None:
         self._size = terms[0].density.sides * len(parts) * 3
-        chunk = max(CHUNK_POINTS // each, 1) * each
+        chunk = max(CHUNK_POINTS // points_per_entity, 1) * points_per_entity
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         points = self._points = PointStorage(max(min(count, chunk), 1))
         self._u, placement, place = (
@@ -126,16 +126,16 @@ class PointGradient:
         """The kernel of a term's energy; None if that is zero."""
         if name not in self._energies:
             W = self._W[self._names.index(name)]
-            none = isinstance(W, Zero)
-            self._energies[name] = None if none else point_values(f"{name} energy", W, self._log)
+            is_zero = isinstance(W, Zero)
+            self._energies[name] = None if is_zero else point_values(f"{name} energy", W, self._log)
         return self._energies[name]
 
     def chunks(self) -> list[slice]:
         """The points that are treated together, to be evaluated one after the other with what is
         given now.
         """
-        for given in self._inputs:
-            given.values.renew()
+        for kernel_input in self._inputs:
+            kernel_input.values.renew()
         return self._chunks
 
     def input_array(self, chunk: slice) -> Array:
@@ -149,8 +149,8 @@ class PointGradient:
         """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by
         the next call.
         """
-        for given in self._inputs:
-            given.fill(chunk)
+        for kernel_input in self._inputs:
+            kernel_input.fill(chunk)
         return self._points.evaluate(kernel, chunk.stop - chunk.start)
 
 

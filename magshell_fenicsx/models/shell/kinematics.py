@@ -57,8 +57,8 @@ def cell_frame(mesh: ufl.Mesh) -> tuple[Expr, Expr]:
     J = ufl.Jacobian(mesh)
     first, second = J[:, 0], J[:, 1]
     t1 = first / ufl.sqrt(ufl.dot(first, first))
-    across = second - ufl.dot(second, t1) * t1
-    return t1, across / ufl.sqrt(ufl.dot(across, across))
+    second_normal = second - ufl.dot(second, t1) * t1
+    return t1, second_normal / ufl.sqrt(ufl.dot(second_normal, second_normal))
 
 
 def jet(v: Expr, mesh: ufl.Mesh) -> Jet:
@@ -127,12 +127,12 @@ def strain_components(
 
 
 def curvature_components(
-    n: Any, turned: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
+    n: Any, normal_change: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> list[Any]:
-    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `turned`, n - n0;
+    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `normal_change`, n - n0;
     `dot` as above.
     """
-    return [dot(n, uij) + dot(turned, rij) for rij, uij in zip(r0, u, strict=True)]
+    return [dot(n, uij) + dot(normal_change, rij) for rij, uij in zip(r0, u, strict=True)]
 
 
 def membrane_strain(r0: Jet, u: Jet) -> Expr:
@@ -177,8 +177,8 @@ def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
     """
     up = inverse_metric(r0)
     nu = ufl.dot(up, m) / ufl.sqrt(ufl.dot(m, ufl.dot(up, m)))
-    along = r0.r2 * m[0] - r0.r1 * m[1]
-    return nu[0], nu[1], ufl.sqrt(ufl.dot(along, along))
+    edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
+    return nu[0], nu[1], ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))
 
 
 @dataclass(frozen=True)
@@ -221,11 +221,14 @@ class Edge:
         return j.r1 * self.tangent_part[0] + j.r2 * self.tangent_part[1]
 
 
-def angle_from(sine: Expr, cosine: Expr, past: Expr) -> Expr:
-    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `past`
+def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
+    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `reference_turn`
     (2,).
     """
-    return ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
+    return ufl.atan2(
+        sine * reference_turn[0] - cosine * reference_turn[1],
+        cosine * reference_turn[0] + sine * reference_turn[1],
+    )
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,9 @@ class Laminate:
         if self.direction is None or self.isotropic:
             return
         unit = self.axes @ self.direction / np.linalg.norm(self.direction)
-        within = np.linalg.norm(np.cross(normals, unit), axis=-1)
+        in_surface = np.linalg.norm(np.cross(normals, unit), axis=-1)
         if (
-            comm.allreduce(float(within.max(axis=1).min(initial=1.0)), MPI.MIN)
+            comm.allreduce(float(in_surface.max(axis=1).min(initial=1.0)), MPI.MIN)
             < DIRECTION_TOLERANCE
         ):
             raise MeshError(
@@ -73,12 +73,12 @@ class Laminate:
         """Whether a plane mirrors plies that do not twist: it is along or across their directions
         everywhere.
         """
-        own = replace(
+        plane_in_shell_frame = replace(
             plane,
             normal=plane.normal @ self.axes,
             offset=plane.offset - float(plane.normal @ self.origin),
         )
-        return self.isotropic or own.keeps_lines(self.direction)
+        return self.isotropic or plane_in_shell_frame.keeps_lines(self.direction)
 
 
 @dataclass(frozen=True)
@@ -112,18 +112,20 @@ class Laminated(Law):
     def from_laminate(cls, laminate: Laminate, h: float, nu: float) -> Self:
         """That of plies."""
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
-        along, meridian = laminate.direction, laminate.direction is None
-        turned = laminate.axes @ (np.eye(3)[2] if along is None else along)
-        axis, origin = (tuple(float(c) for c in v) for v in (turned, laminate.origin))
+        direction, meridian = laminate.direction, laminate.direction is None
+        axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
+        axis, origin = (tuple(float(c) for c in v) for v in (axis_in_model, laminate.origin))
         return cls(h, nu, A=A, B=B, D=D, axis=axis, origin=origin, meridian=meridian)
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        return self.h, self.number, self.A, self.B, self.D, self.axis, self.origin
+        return self.h, self.parameter, self.A, self.B, self.D, self.axis, self.origin
 
     def with_numbers(self, *numbers: Any) -> Self:
-        names = "h", "number", "A", "B", "D", "axis", "origin"
-        return replace(self, t=1, e=1, **dict(zip(names, numbers, strict=True)))
+        names = "h", "parameter", "A", "B", "D", "axis", "origin"
+        return replace(
+            self, thickness_factor=1, modulus_factor=1, **dict(zip(names, numbers, strict=True))
+        )
 
     @property
     def depends_on_place(self) -> bool:
@@ -133,56 +135,70 @@ class Laminated(Law):
         def dot(v: Any, a: Any) -> Scalar:
             return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
 
-        one, two = (dot(self.axis, a) for a in (a1, a2))
+        component_1, component_2 = (dot(self.axis, a) for a in (a1, a2))
         if self.meridian:  # (e_theta x n) . a, times lengths
             x = [r[..., i] - self.origin[i] for i in range(3)]
-            one, two = (
-                dot(self.axis, n) * dot(x, a) - dot(x, n) * along
-                for a, along in ((a1, one), (a2, two))
+            component_1, component_2 = (
+                dot(self.axis, n) * dot(x, a) - dot(x, n) * component
+                for a, component in ((a1, component_1), (a2, component_2))
             )
-        return replace(self, direction=(one, two))
+        return replace(self, direction=(component_1, component_2))
 
     @property
     def bending_stiffness(self) -> Scalar:
-        return Koiter(self.h, self.number, self.t, self.e).bending_stiffness
+        return Koiter(
+            self.h, self.parameter, self.thickness_factor, self.modulus_factor
+        ).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         strain = _Frame(self.direction, up).strain(E)
-        return self.e * self.t / 2 * _work(_stress(self.A, strain), strain)
+        return (
+            self.modulus_factor * self.thickness_factor / 2 * _work(_stress(self.A, strain), strain)
+        )
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
-        return frame.components_up(self.e * self.t, _stress(self.A, frame.strain_components(E)))
+        return frame.components_up(
+            self.modulus_factor * self.thickness_factor, _stress(self.A, frame.strain_components(E))
+        )
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         frame = _Frame(self.direction, up)
         stretched, bent = frame.strain_components(E), frame.strain_components(K)
-        own, coupled = _work(_stress(self.D, bent), bent), _work(_stress(self.B, bent), stretched)
-        return self._of_D / 2 * own - self._of_B * coupled
+        bending_work, coupling_work = (
+            _work(_stress(self.D, bent), bent),
+            _work(_stress(self.B, bent), stretched),
+        )
+        return self._of_D / 2 * bending_work - self._of_B * coupling_work
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
         return frame.components_up(1, self._moment(frame, E, K))
 
     def edge_moment(
-        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self,
+        E: Tensor,
+        K: Tensor,
+        up: Tensor,
+        covector_up: tuple[Scalar, Scalar],
+        covector_square: Scalar,
     ) -> Scalar:
         frame = _Frame(self.direction, up)
-        return _work(self._moment(frame, E, K), frame.product(across))
+        return _work(self._moment(frame, E, K), frame.product(covector_up))
 
     def edge_stiffness(
-        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        bent = _Frame(self.direction, up).product(across)
+        bent = _Frame(self.direction, up).product(covector_up)
         return self._of_D * _work(_stress(self.D, bent), bent)
 
     @property
     def _of_B(self) -> Scalar:
-        return self.e * self.h * self.t**2
+        return self.modulus_factor * self.h * self.thickness_factor**2
 
     @property
     def _of_D(self) -> Scalar:
-        return self.e * self.h**2 * self.t**3
+        return self.modulus_factor * self.h**2 * self.thickness_factor**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
         of_D, of_B = (
@@ -198,26 +214,33 @@ class _Frame:
 
     def __init__(self, direction: tuple[Scalar, Scalar], up: Tensor) -> None:
         (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
-        raised = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
-        over, det = (c1 * raised[0] + c2 * raised[1]) ** -0.5, a11 * a22 - a12**2
+        direction_up = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
+        inverse_length, det = (
+            (c1 * direction_up[0] + c2 * direction_up[1]) ** -0.5,
+            a11 * a22 - a12**2,
+        )
         self._up = up
-        self.t1 = raised[0] * over, raised[1] * over
-        self.t2 = -(det**0.5) * c2 * over, det**0.5 * c1 * over
+        self.t1 = direction_up[0] * inverse_length, direction_up[1] * inverse_length
+        self.t2 = -(det**0.5) * c2 * inverse_length, det**0.5 * c1 * inverse_length
 
     def strain_components(self, S: Tensor) -> Triple:
         """S_11, S_22 and 2 S_12 of a tensor with indices down."""
 
-        def along(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
+        def component(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
             mixed = a[0] * b[1] + a[1] * b[0]
             return S[..., 0, 0] * a[0] * b[0] + S[..., 0, 1] * mixed + S[..., 1, 1] * a[1] * b[1]
 
-        return along(self.t1, self.t1), along(self.t2, self.t2), 2 * along(self.t1, self.t2)
+        return (
+            component(self.t1, self.t1),
+            component(self.t2, self.t2),
+            2 * component(self.t1, self.t2),
+        )
 
-    def product(self, across: tuple[Scalar, Scalar]) -> Triple:
+    def product(self, covector_up: tuple[Scalar, Scalar]) -> Triple:
         """The same of c c, where the covector c has these components with index up."""
-        c = lower_index(across, self._up)
-        one, two = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
-        return one**2, two**2, 2 * one * two
+        c = lower_index(covector_up, self._up)
+        c_1, c_2 = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
+        return c_1**2, c_2**2, 2 * c_1 * c_2
 
     def components_up(self, factor: Scalar, S: Triple) -> Components:
         """A factor times a stress S_11, S_22, S_12 as components with indices up."""

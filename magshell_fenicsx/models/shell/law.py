@@ -34,11 +34,11 @@ class Law(ABC):
     ----------
     h
         The thickness that energies are over.
-    number
+    parameter
         The law's own number.
-    t
+    thickness_factor
         What multiplies the thickness.
-    e
+    modulus_factor
         What multiplies Young's modulus.
     thins
         1 where the thickness follows from the area, so that the volume stays; else 0.
@@ -47,9 +47,9 @@ class Law(ABC):
     """
 
     h: Scalar
-    number: Scalar
-    t: Scalar = 1
-    e: Scalar = 1
+    parameter: Scalar
+    thickness_factor: Scalar = 1
+    modulus_factor: Scalar = 1
 
     @property
     def thins(self) -> Scalar:
@@ -62,11 +62,11 @@ class Law(ABC):
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """All but `t` and `e`, in their order; some laws have vectors among them."""
-        return self.h, self.number
+        """All but `thickness_factor` and `modulus_factor`, in their order; some laws have vectors among them."""
+        return self.h, self.parameter
 
     def with_numbers(self, *numbers: Any) -> Self:
-        """The same law with others, and `t` and `e` of 1."""
+        """The same law with others, and `thickness_factor` and `modulus_factor` of 1."""
         return type(self)(*numbers)
 
     @property
@@ -81,12 +81,12 @@ class Law(ABC):
 
     def thicker(self, factor: Scalar) -> Self:
         """That of a shell so many times as thick."""
-        return replace(self, t=factor * self.t)
+        return replace(self, thickness_factor=factor * self.thickness_factor)
 
-    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+    def with_material(self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0) -> Self:
         """The law with Young's modulus times e, with another Poisson's ratio where the law has one, and of several laws
         the one with this number."""
-        return replace(self, e=e * self.e)
+        return replace(self, modulus_factor=modulus_factor * self.modulus_factor)
 
     @property
     def linear(self) -> "Law":
@@ -114,8 +114,8 @@ class Law(ABC):
         """The stress of E and a change of it, less that of E."""
         if self.linear is self:
             return self.stress(change, up)
-        before, after = self.stress(E, up), self.stress(E + change, up)
-        S11, S12, S22 = (b - a for a, b in zip(before, after, strict=True))
+        stress, changed_stress = self.stress(E, up), self.stress(E + change, up)
+        S11, S12, S22 = (b - a for a, b in zip(stress, changed_stress, strict=True))
         return S11, S12, S22
 
     @abstractmethod
@@ -124,20 +124,25 @@ class Law(ABC):
 
     @abstractmethod
     def edge_moment(
-        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self,
+        E: Tensor,
+        K: Tensor,
+        up: Tensor,
+        covector_up: tuple[Scalar, Scalar],
+        covector_square: Scalar,
     ) -> Scalar:
         """The moment twice along a covector c.
 
         Parameters
         ----------
-        across, square
+        covector_up, covector_square
             c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural
             stretch.
         """
 
     @abstractmethod
     def edge_stiffness(
-        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
         """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is
         proportional.
@@ -153,41 +158,55 @@ class Koiter(Law):
 
     @property
     def nu(self) -> Scalar:
-        return self.number
+        return self.parameter
 
-    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> "Koiter":
-        return replace(self, e=e * self.e, number=nu)
+    def with_material(
+        self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0
+    ) -> "Koiter":
+        return replace(self, modulus_factor=modulus_factor * self.modulus_factor, parameter=nu)
 
     @property
     def bending_stiffness(self) -> Scalar:
-        return self.e * self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
+        return self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * (1 - self.nu**2))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        return self.e * self.t * self._square(E, up) / (2 * (1 - self.nu**2))
+        return (
+            self.modulus_factor
+            * self.thickness_factor
+            * self._square(E, up)
+            / (2 * (1 - self.nu**2))
+        )
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         return self.bending_stiffness / 2 * self._square(K, up)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        return self._scaled(self.e * self.t / (1 - self.nu**2), E, up)
+        return self._scaled(self.modulus_factor * self.thickness_factor / (1 - self.nu**2), E, up)
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         return self._scaled(self.bending_stiffness, K, up)
 
     def edge_moment(
-        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self,
+        E: Tensor,
+        K: Tensor,
+        up: Tensor,
+        covector_up: tuple[Scalar, Scalar],
+        covector_square: Scalar,
     ) -> Scalar:
-        bent = (
-            K[..., 0, 0] * across[0] ** 2
-            + 2 * K[..., 0, 1] * across[0] * across[1]
-            + K[..., 1, 1] * across[1] ** 2
+        curvature_across = (
+            K[..., 0, 0] * covector_up[0] ** 2
+            + 2 * K[..., 0, 1] * covector_up[0] * covector_up[1]
+            + K[..., 1, 1] * covector_up[1] ** 2
         )
-        return self.bending_stiffness * ((1 - self.nu) * bent + self.nu * square * trace(K, up))
+        return self.bending_stiffness * (
+            (1 - self.nu) * curvature_across + self.nu * covector_square * trace(K, up)
+        )
 
     def edge_stiffness(
-        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        return self.bending_stiffness * square**2
+        return self.bending_stiffness * covector_square**2
 
     def _square(self, S: Tensor, up: Tensor) -> Scalar:
         """(1 - nu) S:S + nu tr^2 S."""
@@ -198,10 +217,10 @@ class Koiter(Law):
         """A factor times (1 - nu) S + nu tr S with indices up."""
         T11, T12, T21, T22 = _mixed(S, up)
         a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
-        raised = (T11 * a11 + T12 * a12, T11 * a12 + T12 * a22, T21 * a12 + T22 * a22)
+        raised_components = (T11 * a11 + T12 * a12, T11 * a12 + T12 * a22, T21 * a12 + T22 * a22)
         S11, S12, S22 = (
-            factor * ((1 - self.nu) * each + self.nu * (T11 + T22) * a)
-            for each, a in zip(raised, (a11, a12, a22), strict=True)
+            factor * ((1 - self.nu) * component + self.nu * (T11 + T22) * a)
+            for component, a in zip(raised_components, (a11, a12, a22), strict=True)
         )
         return S11, S12, S22
 
@@ -226,11 +245,11 @@ class LawByShell(Law):
         return tuple(number for law in self.laws for number in law.numbers)
 
     def with_numbers(self, *numbers: Any) -> Self:
-        left, laws = list(numbers), list[Law]()
+        remaining_numbers, laws = list(numbers), list[Law]()
         for law in self.laws:
             count = len(law.numbers)
-            laws.append(law.with_numbers(*left[:count]))
-            del left[:count]
+            laws.append(law.with_numbers(*remaining_numbers[:count]))
+            del remaining_numbers[:count]
         return replace(self, laws=tuple(laws))
 
     @property
@@ -251,9 +270,10 @@ class LawByShell(Law):
     def thicker(self, factor: Scalar) -> Self:
         return self._with_each_law(lambda law: law.thicker(factor))
 
-    def with_material(self, e: Scalar, nu: Scalar, which: Scalar = 0) -> Self:
+    def with_material(self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0) -> Self:
         return replace(
-            self._with_each_law(lambda law: law.with_material(e, nu)), shell_number=which
+            self._with_each_law(lambda law: law.with_material(modulus_factor, nu)),
+            shell_number=shell_number,
         )
 
     @property
@@ -287,17 +307,22 @@ class LawByShell(Law):
         return M11, M12, M22
 
     def edge_moment(
-        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self,
+        E: Tensor,
+        K: Tensor,
+        up: Tensor,
+        covector_up: tuple[Scalar, Scalar],
+        covector_square: Scalar,
     ) -> Scalar:
         return self._value_at_place(
-            [law.edge_moment(E, K, up, across, square) for law in self.laws]
+            [law.edge_moment(E, K, up, covector_up, covector_square) for law in self.laws]
         )
 
     def edge_stiffness(
-        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
         return self._value_at_place(
-            [law.edge_stiffness(E, up, across, square) for law in self.laws]
+            [law.edge_stiffness(E, up, covector_up, covector_square) for law in self.laws]
         )
 
     def _with_each_law(self, change: Callable[[Law], Law]) -> Self:
@@ -305,13 +330,17 @@ class LawByShell(Law):
 
     def _value_at_place(self, values: Sequence[Scalar]) -> Scalar:
         """Of one value of each law that of the law at a place."""
-        chosen = values[0]
+        value_at_place = values[0]
         for i, value in enumerate(values[1:]):
             if isinstance(self.shell_number, Expr):
-                chosen = ufl.conditional(ufl.gt(self.shell_number, i + 0.5), value, chosen)
+                value_at_place = ufl.conditional(
+                    ufl.gt(self.shell_number, i + 0.5), value, value_at_place
+                )
             else:
-                chosen = np.where(np.asarray(self.shell_number) > i + 0.5, value, chosen)
-        return chosen
+                value_at_place = np.where(
+                    np.asarray(self.shell_number) > i + 0.5, value, value_at_place
+                )
+        return value_at_place
 
 
 def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -335,13 +364,15 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
     )
 
 
-def lower_index(across: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
+def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
     """The components with index down of a covector, from those with index up; `up` is the inverse
     metric (2, 2).
     """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
-    return (a22 * across[0] - a12 * across[1]) / det, (a11 * across[1] - a12 * across[0]) / det
+    return (a22 * covector_up[0] - a12 * covector_up[1]) / det, (
+        a11 * covector_up[1] - a12 * covector_up[0]
+    ) / det
 
 
 def work(S: Components, T: Tensor) -> Scalar:
@@ -350,39 +381,42 @@ def work(S: Components, T: Tensor) -> Scalar:
 
 
 def elastic_density(
-    density: Density, law: Law, t: Parameter | None = None, cell_materials: Parameter | None = None
+    density: Density,
+    law: Law,
+    thickness: Parameter | None = None,
+    cell_materials: Parameter | None = None,
 ) -> Density:
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
-    The numbers of the law become parameters. `t` (1,) multiplies the thickness; None for 1.
+    The numbers of the law become parameters. `thickness` (1,) multiplies the thickness; None for 1.
     `cell_materials` (4,) is `OwnMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
         return value if density.sides == 2 else [value]
 
-    def of(*arguments: Expr, **keywords: Any) -> Expr:
-        given, factors, materials = list(arguments), [1] * density.sides, None
+    def with_law(*arguments: Expr, **keywords: Any) -> Expr:
+        arguments_left, factors, materials = list(arguments), [1] * density.sides, None
         if cell_materials is not None:
-            materials = by_side(given.pop())
-        if t is not None:
-            factors = [factor[0] for factor in by_side(given.pop())]
-        count = len(given) - len(law.numbers)
-        laws = [law.with_numbers(*given[count:]).thicker(factor) for factor in factors]
+            materials = by_side(arguments_left.pop())
+        if thickness is not None:
+            factors = [factor[0] for factor in by_side(arguments_left.pop())]
+        count = len(arguments_left) - len(law.numbers)
+        laws = [law.with_numbers(*arguments_left[count:]).thicker(factor) for factor in factors]
         if materials is not None:
             laws = [
-                of_side.with_material(own[0], own[1], own[3])
-                for of_side, own in zip(laws, materials, strict=True)
+                of_side.with_material(numbers[0], numbers[1], numbers[3])
+                for of_side, numbers in zip(laws, materials, strict=True)
             ]
         return density.function(
-            *given[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords
+            *arguments_left[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords
         )
 
-    fields = (field for field in (t, cell_materials) if field is not None)
+    fields = (field for field in (thickness, cell_materials) if field is not None)
     parameters = (*density.parameters, *law.numbers, *fields)
     return replace(
         density,
-        function=of,
+        function=with_law,
         parameters=parameters,
         reference_parts=("r",) if law.depends_on_place else density.reference_parts,
     )

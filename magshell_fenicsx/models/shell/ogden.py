@@ -44,7 +44,7 @@ class Ogden(Incompressible):
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        return self.h, self.number, self.mu
+        return self.h, self.parameter, self.mu
 
     def with_numbers(self, *numbers: Any) -> Self:
         h, number, mu = numbers
@@ -63,56 +63,58 @@ class Ogden(Incompressible):
         return max(0.0, 2 - min(abs(alpha) for alpha in self.alpha))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        at, total = Stretched(E, up), 0.0
+        surface, total = Stretched(E, up), 0.0
         for mu, alpha in self.terms:
-            z, (V, _, _) = at.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(at))
+            z, (V, _, _) = surface.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(surface))
             total = total + mu / alpha * (
                 (z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V
             )  # of order one is nothing
-        return self.e * self.t * total
+        return self.modulus_factor * self.thickness_factor * total
 
-    def _slopes(self, at: Stretched) -> tuple[Scalar, Scalar]:
-        w, by_t, by_d = _uneven(at), 0.0, 0.0
+    def _slopes(self, surface: Stretched) -> tuple[Scalar, Scalar]:
+        w, by_t, by_d = _uneven(surface), 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
             V, V1, _ = _chebyshev(a, w)
-            by_t = by_t + mu / alpha * at.d ** ((a - 1) / 2) * V1
-            by_d = by_d + mu / alpha / at.d * (
-                at.d ** (a / 2) * (a * (1 + V) - (1 + w) * V1) - a * at.d**-a
+            by_t = by_t + mu / alpha * surface.d ** ((a - 1) / 2) * V1
+            by_d = by_d + mu / alpha / surface.d * (
+                surface.d ** (a / 2) * (a * (1 + V) - (1 + w) * V1) - a * surface.d**-a
             )
         return by_t + by_d, by_d
 
-    def _stiffness(self, at: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        w, soft = _uneven(at), self.softening
-        y, square, mixed, drawn, even = 1 + w, 0.0, 0.0, 0.0, 0.0
+    def _stiffness(self, surface: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        w, softening = _uneven(surface), self.softening
+        y, square, mixed, of_trace, equibiaxial = 1 + w, 0.0, 0.0, 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
             V, V1, V2 = _chebyshev(a, w)
-            z, m = at.d ** (a / 2), mu / alpha
+            z, m = surface.d ** (a / 2), mu / alpha
             by_d, by_both = a * (1 + V) - y * V1, (a - 1) * V1 - y * V2
-            drawn = drawn + 2 * m * z * V2
-            mixed = mixed + m * z * (4 * by_both + 2 * soft * V1)
-            in_surface = (2 * a - 4 + 2 * soft) * by_d - 2 * y * by_both
-            square = square + m * (z * in_surface + (4 * a * (a + 1) - 2 * a * soft) / z**2)
-            even = even + 4 * a * m * ((a - 1 + soft / 2) * z + (a + 1 - soft / 2) / z**2)
-        across = drawn + y * mixed + square
-        of_det = 2 * across**2 / (across + even)
-        factor = self.e * self.t**3 * self.h**2 / (12 * at.d)
-        s = root(at.d)
+            of_trace = of_trace + 2 * m * z * V2
+            mixed = mixed + m * z * (4 * by_both + 2 * softening * V1)
+            in_surface = (2 * a - 4 + 2 * softening) * by_d - 2 * y * by_both
+            square = square + m * (z * in_surface + (4 * a * (a + 1) - 2 * a * softening) / z**2)
+            equibiaxial = equibiaxial + 4 * a * m * (
+                (a - 1 + softening / 2) * z + (a + 1 - softening / 2) / z**2
+            )
+        uniaxial = of_trace + y * mixed + square
+        of_det = 2 * uniaxial**2 / (uniaxial + equibiaxial)
+        factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * surface.d)
+        s = root(surface.d)
         return (
             factor * square,
             -factor * mixed / s,
-            factor * of_det * at.up / at.d,
-            factor * drawn / at.d,
+            factor * of_det * surface.up / surface.d,
+            factor * of_trace / surface.d,
         )
 
 
-def _uneven(at: Stretched) -> Scalar:
+def _uneven(surface: Stretched) -> Scalar:
     """w = t/(2 sqrt(d)) - 1, in which no numbers of order one are subtracted: (t^2/4 - d)/(sqrt(d)
     (t/2 + sqrt(d))).
     """
-    s = root(at.d)
-    return (at.T**2 / 4 - at.D) / (s * (1 + at.T / 2 + s))
+    s = root(surface.d)
+    return (surface.T**2 / 4 - surface.D) / (s * (1 + surface.T / 2 + s))
 
 
 def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
@@ -121,32 +123,35 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     for k in range(1, SERIES_TERMS):
         c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
     series = [
-        _horner([float(each) for each in np.polynomial.polynomial.polyder(c, n)], w)
+        _horner([float(coefficient) for coefficient in np.polynomial.polynomial.polyder(c, n)], w)
         for n in range(3)
     ]
     if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
         return series[0], series[1], series[2]
-    small = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
-    far = _conditional(small, SERIES_LIMIT, w)
-    y = 1 + far
-    p = (y + root(far * (2 + far))) ** a
+    in_series = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
+    bounded_w = _conditional(in_series, SERIES_LIMIT, w)
+    y = 1 + bounded_w
+    p = (y + root(bounded_w * (2 + bounded_w))) ** a
     V = (p + 1 / p) / 2 - 1
-    V1 = a * (p - 1 / p) / (2 * root(far * (2 + far)))
-    V2 = (a**2 * (1 + V) - y * V1) / (far * (2 + far))
-    one, two, three = (
-        _conditional(small, near, f) for near, f in zip(series, (V, V1, V2), strict=True)
+    V1 = a * (p - 1 / p) / (2 * root(bounded_w * (2 + bounded_w)))
+    V2 = (a**2 * (1 + V) - y * V1) / (bounded_w * (2 + bounded_w))
+    value, slope, bend = (
+        _conditional(in_series, series_value, f)
+        for series_value, f in zip(series, (V, V1, V2), strict=True)
     )
-    return one, two, three
+    return value, slope, bend
 
 
 def _horner(c: list[float], w: Scalar) -> Scalar:
     total: Scalar = float(c[-1])
-    for each in reversed(c[:-1]):
-        total = total * w + float(each)
+    for coefficient in reversed(c[:-1]):
+        total = total * w + float(coefficient)
     return total
 
 
-def _conditional(small: Any, one: Scalar, two: Scalar) -> Scalar:
+def _conditional(condition: Any, if_true: Scalar, if_false: Scalar) -> Scalar:
     return (
-        ufl.conditional(small, one, two) if isinstance(small, Expr) else np.where(small, one, two)
+        ufl.conditional(condition, if_true, if_false)
+        if isinstance(condition, Expr)
+        else np.where(condition, if_true, if_false)
     )

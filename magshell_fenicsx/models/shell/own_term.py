@@ -51,8 +51,8 @@ COORDINATE_SAMPLES, COORDINATE_TOLERANCE = (
 
 def symbolic_functions() -> dict[str, Callable[..., Any]]:
     """UFL's functions of formulas."""
-    same = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
-    return same | {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
+    functions = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+    return functions | {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
 @dataclass(frozen=True)
@@ -239,8 +239,8 @@ class OwnTerm:
 
     def with_functions(
         self,
-        made: Callable[[FormulaParameter], Coefficient],
-        carried: Callable[[UserField], Coefficient] | None = None,
+        formula_to_function: Callable[[FormulaParameter], Coefficient],
+        field_to_function: Callable[[UserField], Coefficient] | None = None,
     ) -> OwnTerm:
         """With functions of numbers (size,) on a model's mesh in place of formulas and of fields
         that were given.
@@ -248,8 +248,8 @@ class OwnTerm:
 
         def function_of(p: Any) -> Any:
             if isinstance(p, FormulaParameter):
-                return made(p)
-            return carried(p) if carried and isinstance(p, UserField) else p
+                return formula_to_function(p)
+            return field_to_function(p) if field_to_function and isinstance(p, UserField) else p
 
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
@@ -258,25 +258,27 @@ class OwnTerm:
         if not angle or (self.turns and not self.formula_parameters):
             return self
 
-        def back(v: Expr, about: Expr) -> Expr:
+        def rotated(v: Expr, about: Expr) -> Expr:
             (c, s), (x, y, z) = (about[0], about[1]), (v[0], v[1], v[2])
             return ufl.as_vector([c * x - s * y, s * x + c * y, z])
 
         def in_frame(density: Callable[..., Expr]) -> Callable[..., Expr]:
-            def of(r0: Jet, u: Jet, *others: Any) -> Expr:
-                *rest, about = others
-                jets = (Jet(*(back(part, about) for part in jet.parts())) for jet in (r0, u))
+            def density_in_frame(r0: Jet, u: Jet, *arguments: Any) -> Expr:
+                *arguments_left, rotation = arguments
+                jets = (Jet(*(rotated(part, rotation) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
-                    edge, *rest = rest
-                    rest = [
+                    edge, *arguments_left = arguments_left
+                    arguments_left = [
                         replace(
-                            edge, outward=back(edge.outward, about), along=back(edge.along, about)
+                            edge,
+                            outward=rotated(edge.outward, rotation),
+                            along=rotated(edge.along, rotation),
                         ),
-                        *rest,
+                        *arguments_left,
                     ]
-                return density(*jets, *rest)
+                return density(*jets, *arguments_left)
 
-            return of
+            return density_in_frame
 
         parameters = (
             replace(p, turn=angle) if isinstance(p, FormulaParameter) else p
@@ -291,17 +293,20 @@ class OwnTerm:
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
         """A density that takes a function of one number as a vector of one."""
-        alone = [isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters]
-        if not any(alone):
+        is_number = [
+            isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters
+        ]
+        if not any(is_number):
             return density
 
-        def of(*arguments: Any) -> Expr:
-            others, parameters = arguments[: -len(alone)], arguments[-len(alone) :]
+        def density_of_numbers(*arguments: Any) -> Expr:
+            others, parameters = arguments[: -len(is_number)], arguments[-len(is_number) :]
             return density(
-                *others, *(p[0] if one else p for p, one in zip(parameters, alone, strict=True))
+                *others,
+                *(p[0] if number else p for p, number in zip(parameters, is_number, strict=True)),
             )
 
-        return of
+        return density_of_numbers
 
     @cached_property
     def linear(self) -> bool:
@@ -314,7 +319,7 @@ class OwnTerm:
             for a in parts
             for b in parts
         )
-        return all(isinstance(each, ufl.constantvalue.Zero) for each in second)
+        return all(isinstance(derivative, ufl.constantvalue.Zero) for derivative in second)
 
     @cached_property
     def turns(self) -> bool:
@@ -322,13 +327,14 @@ class OwnTerm:
         random jets.
         """
 
-        def turned(jet: Array, angle: float) -> Array:
+        def rotated(jet: Array, angle: float) -> Array:
             c, s = np.cos(angle), np.sin(angle)
             return np.asarray(jet @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
 
         samples = enumerate(_random_samples(), 1)
         return not self.varying and all(
-            self._is_same((r0, u, m), (turned(r0, a), turned(u, a), m)) for a, (r0, u, m) in samples
+            self._is_same((r0, u, m), (rotated(r0, a), rotated(u, a), m))
+            for a, (r0, u, m) in samples
         )
 
     def mirrored(self, mirror: Mirror) -> bool:
@@ -362,12 +368,12 @@ class OwnTerm:
                 p.mirrored(mirror, outline) for p in self.formula_parameters
             )
 
-        shared, name = (
+        is_shared, name = (
             self.mirrored(Y0_PLANE) and turns,
             self.name + (" or what it observes" if self.observed else ""),
         )
         return SymmetryConstraint(
-            None if shared else f"the energy {name} does not share it", (), mirrors, name
+            None if is_shared else f"the energy {name} does not share it", (), mirrors, name
         )
 
     @property
@@ -378,8 +384,8 @@ class OwnTerm:
             for density in self.densities
             for sample in _random_samples()
         ]
-        free = [(p.name, p.value) for p in self.free_parameters]
-        text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
+        free_parameters = [(p.name, p.value) for p in self.free_parameters]
+        text = f"{self.name} {self.value!r} {free_parameters} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
         text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, UserField))
         text += "".join(f" {p.text}" for p in self.formula_parameters)
@@ -403,10 +409,10 @@ class OwnTerm:
         try:
             return Symbolic(self._expression(r0, u, m, self.densities[0]), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
-            said = f"{type(e).__name__}: {e}"
-            taken = "r0, u" if self.on is None else "r0, u, an edge"
+            message = f"{type(e).__name__}: {e}"
+            arguments = "r0, u" if self.on is None else "r0, u, an edge"
             raise ValueError(
-                f"{self.name}: the density cannot be computed ({said}). It is a function of {taken} and "
+                f"{self.name}: the density cannot be computed ({message}). It is a function of {arguments} and "
                 f"{len(self.parameters)} parameters, and returns a scalar made of r0.r, u.r, u.r1, ... by functions of "
                 "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
             ) from e
@@ -435,12 +441,12 @@ class OwnTerm:
             ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
         ):
             for sample in _random_samples()[:COORDINATE_SAMPLES]:
-                one, other = (
+                value, value_in_others = (
                     self._value(sample, density),
                     self._value(_in_other_coordinates(sample), density),
                 )
-                if abs(one - other) > COORDINATE_TOLERANCE * max(
-                    abs(one), abs(other)
+                if abs(value - value_in_others) > COORDINATE_TOLERANCE * max(
+                    abs(value), abs(value_in_others)
                 ):  # nan: it has no value there
                     raise ValueError(
                         f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 and r2, which are "

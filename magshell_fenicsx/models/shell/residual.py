@@ -69,7 +69,7 @@ class FastResidual:
         Of the elements.
     terms
         What has a density.
-    apart
+    one_by_one
         Whether each term has a kernel of its own, so that it can be added alone.
 
     Attributes
@@ -86,18 +86,20 @@ class FastResidual:
         terms: Sequence[PointTerm],
         log: KernelLog,
         *,
-        apart: bool = False,
+        one_by_one: bool = False,
     ) -> None:
         on_cells = [term for term in terms if not term.density.on_edges]
         on_edges = [term for term in terms if term.density.on_edges]
 
         def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
-            return term.density.quadrature, term.amplitude, term.name if apart else ""
+            return term.density.quadrature, term.amplitude, term.name if one_by_one else ""
 
         sites: list[_ResidualPart] = []
-        for this in dict.fromkeys(map(kind, on_cells)):
-            together = [term for term in on_cells if kind(term) == this]
-            sites.append(_CellTerms(r0, this[0] or cell_quadrature(degree), together, log))
+        for kind_of_terms in dict.fromkeys(map(kind, on_cells)):
+            terms_of_kind = [term for term in on_cells if kind(term) == kind_of_terms]
+            sites.append(
+                _CellTerms(r0, kind_of_terms[0] or cell_quadrature(degree), terms_of_kind, log)
+            )
         if on_edges:
             sites.append(_EdgeTerms(r0, edge_quadrature(degree), on_edges, log))
         self._sites = sites
@@ -137,7 +139,7 @@ class _CellTerms:
         V = r0.function_space
         self.names = [term.name for term in terms]
         X, self._weights = cell_rule(degree)
-        table, each = ShapeTable.tabulate(V.element.basix_element, X), len(X)
+        table, points_per_cell = ShapeTable.tabulate(V.element.basix_element, X), len(X)
         parts = [
             name
             for name in JET_NAMES
@@ -148,18 +150,21 @@ class _CellTerms:
             np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32),
             cell_frames(V.mesh),
         )
-        geometry, count = np.repeat(frames[cells], each, axis=0), len(cells) * each
+        geometry, count = (
+            np.repeat(frames[cells], points_per_cell, axis=0),
+            len(cells) * points_per_cell,
+        )
 
         def placement() -> Array:
             return _placement(r0, table, frames, parts)[cells].reshape(count, 3 * len(parts))
 
-        placed = Memo(placement, lambda: (r0.x.array,))
+        placements = Memo(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
             terms,
             parts,
-            each,
+            points_per_cell,
             count,
-            placed,
+            placements,
             geometry,
             lambda field: at_points(field, X, cells),
             log,
@@ -190,9 +195,9 @@ class _CellTerms:
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
         """Each chunk, with the derivatives of u filled in, and its cells."""
-        each = len(self._weights)
+        points_per_cell = len(self._weights)
         for chunk in self._points.chunks():
-            cells = slice(chunk.start // each, chunk.stop // each)
+            cells = slice(chunk.start // points_per_cell, chunk.stop // points_per_cell)
             self._sheet.at_points(nodal[cells], self._points.input_array(chunk))
             yield chunk, cells
 
@@ -207,7 +212,7 @@ class _EdgeTerms:
         self.names = [term.name for term in terms]
         rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
         self._weights = rules[0][1]
-        each = len(self._weights)
+        points_per_edge = len(self._weights)
         X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
         table = ShapeTable.tabulate(V.element.basix_element, X)
         parts = [
@@ -228,11 +233,13 @@ class _EdgeTerms:
                 for name, (rows, _) in on_terms.items()
             }
 
-        on_terms = {term.name: _points_on_edges(V, term.density, frames, each) for term in terms}
-        placed = Memo(placements, lambda: (r0.x.array,))
+        on_terms = {
+            term.name: _points_on_edges(V, term.density, frames, points_per_edge) for term in terms
+        }
+        all_placements = Memo(placements, lambda: (r0.x.array,))
 
-        def placed_on(name: str) -> Array:
-            return placed.renew()[name]
+        def placements_on(name: str) -> Array:
+            return all_placements.renew()[name]
 
         for term in terms:
             rows, geometry = on_terms[term.name]
@@ -242,8 +249,10 @@ class _EdgeTerms:
                     len(rows), rows.shape[1] * field.ufl_shape[0]
                 )
 
-            at_cells = Memo(partial(placed_on, term.name), lambda: (r0.x.array,))
-            points = PointGradient([term], parts, each, len(rows), at_cells, geometry, values, log)
+            at_cells = Memo(partial(placements_on, term.name), lambda: (r0.x.array,))
+            points = PointGradient(
+                [term], parts, points_per_edge, len(rows), at_cells, geometry, values, log
+            )
             self._on[term.name] = rows, points
 
     def begin(self, *, energies: bool) -> None:
@@ -299,7 +308,7 @@ def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequen
 
 
 def _points_on_edges(
-    V: fem.FunctionSpace, density: Density, frames: Array, each: int
+    V: fem.FunctionSpace, density: Density, frames: Array, points_per_edge: int
 ) -> tuple[NDArray[np.intp], Array]:
     """(points, sides) among those of all cells' edges, and the geometry that `PointGradient` asks
     for.
@@ -308,12 +317,16 @@ def _points_on_edges(
     """
     if density.facets is None:
         cells, edges, backwards = interior_edges(V)
-        turned = np.column_stack([np.zeros_like(backwards), backwards])
+        is_reversed = np.column_stack([np.zeros_like(backwards), backwards])
     else:
         cells, edges = boundary_edges(V, density.facets)
-        turned = np.zeros(cells.shape, dtype=bool)
-    order = np.where(turned[:, None], np.arange(each)[::-1, None], np.arange(each)[:, None])
-    rows = (each * (3 * cells + edges))[:, None] + order
+        is_reversed = np.zeros(cells.shape, dtype=bool)
+    order = np.where(
+        is_reversed[:, None],
+        np.arange(points_per_edge)[::-1, None],
+        np.arange(points_per_edge)[:, None],
+    )
+    rows = (points_per_edge * (3 * cells + edges))[:, None] + order
     p, q, s, area = frames[cells].transpose(2, 0, 1)
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
@@ -323,7 +336,9 @@ def _points_on_edges(
         m.reshape(-1, 2 * density.sides),
         width[:, None],
     ]
-    return rows.reshape(-1, density.sides), np.repeat(np.concatenate(sides, axis=1), each, axis=0)
+    return rows.reshape(-1, density.sides), np.repeat(
+        np.concatenate(sides, axis=1), points_per_edge, axis=0
+    )
 
 
 Serve = Callable[[Sequence[PointTerm]], FastResidual]
@@ -387,11 +402,13 @@ def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
 def derivative_by(density: Density, p: fem.Constant) -> Density:
     """The density's derivative by a parameter of it."""
 
-    def of(*arguments: Any) -> Expr:
+    def derivative(*arguments: Any) -> Expr:
         first = len(arguments) - len(density.parameters)
         positions = [first + i for i, q in enumerate(density.parameters) if q is p]
         variable = ufl.variable(arguments[positions[0]])
-        given = [variable if i in positions else argument for i, argument in enumerate(arguments)]
-        return ufl.algorithms.expand_derivatives(ufl.diff(density.function(*given), variable))
+        substituted = [
+            variable if i in positions else argument for i, argument in enumerate(arguments)
+        ]
+        return ufl.algorithms.expand_derivatives(ufl.diff(density.function(*substituted), variable))
 
-    return replace(density, function=of, work=None, linear=())
+    return replace(density, function=derivative, work=None, linear=())

@@ -42,61 +42,70 @@ class Incompressible(Law):
 
     @property
     def linear(self) -> Koiter:
-        return Koiter(self.h, 0.5, self.t, self.e)
+        return Koiter(self.h, 0.5, self.thickness_factor, self.modulus_factor)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        at = Stretched(E, up)
-        by_T, by_D = (self.e * self.t * slope for slope in self._slopes(at))
+        surface = Stretched(E, up)
+        by_T, by_D = (
+            self.modulus_factor * self.thickness_factor * slope for slope in self._slopes(surface)
+        )
         adjugate = E[..., 1, 1], -E[..., 0, 1], E[..., 0, 0]
         a = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         S11, S12, S22 = (
-            2 * by_T * raised + 4 * by_D * at.up * turned
-            for raised, turned in zip(a, adjugate, strict=True)
+            2 * by_T * metric_up + 4 * by_D * surface.up * strain_cofactor
+            for metric_up, strain_cofactor in zip(a, adjugate, strict=True)
         )
         return S11, S12, S22
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
+        of_square, of_mixed, of_det, of_drawn = self._stiffness(surface := Stretched(E, up))
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
-        T, tau = at.deformed_trace(K), trace(K, up)
+        T, tau = surface.deformed_trace(K), trace(K, up)
         return (of_square * T**2 - of_mixed * T * tau - of_det * det + of_drawn * tau**2) / 2
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
-        of_square, of_mixed, of_det, of_drawn = self._stiffness(at := Stretched(E, up))
-        T, tau = at.deformed_trace(K), trace(K, up)
+        of_square, of_mixed, of_det, of_drawn = self._stiffness(surface := Stretched(E, up))
+        T, tau = surface.deformed_trace(K), trace(K, up)
         a, adjugate = (
             (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]),
             (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0]),
         )
         by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
         M11, M12, M22 = (
-            by_T * raised + by_tau * once - of_det / 2 * turned
-            for raised, once, turned in zip(at.inverse, a, adjugate, strict=True)
+            by_T * deformed_up + by_tau * metric_up - of_det / 2 * curvature_cofactor
+            for deformed_up, metric_up, curvature_cofactor in zip(
+                surface.inverse, a, adjugate, strict=True
+            )
         )
         return M11, M12, M22
 
     def edge_moment(
-        self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self,
+        E: Tensor,
+        K: Tensor,
+        up: Tensor,
+        covector_up: tuple[Scalar, Scalar],
+        covector_square: Scalar,
     ) -> Scalar:
-        M, (c1, c2) = self.moment(E, K, up), lower_index(across, up)
+        M, (c1, c2) = self.moment(E, K, up), lower_index(covector_up, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(
-        self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar
+        self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
         of_square, of_mixed, _, of_drawn = self._stiffness(
-            at := Stretched(E, up)
+            surface := Stretched(E, up)
         )  # c c has no determinant
-        (c1, c2), (a11, a12, a22) = lower_index(across, up), at.inverse
+        (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
-        return of_square * T**2 - of_mixed * T * square + of_drawn * square**2
+        return of_square * T**2 - of_mixed * T * covector_square + of_drawn * covector_square**2
 
     @abstractmethod
-    def _slopes(self, at: "Stretched") -> tuple[Scalar, Scalar]:
+    def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
         """The derivatives by T and D of the energy of stretching, per volume over E."""
 
     @abstractmethod
-    def _stiffness(self, at: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
         """What multiplies T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending, T = a^ij K_ij with the
         deformed a."""
 
@@ -106,23 +115,40 @@ class Rubber(Incompressible):
     """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        at = Stretched(E, up)
-        return self.e * self.t / 6 * ((1 - self.number) * at.first + self.number * at.second)
+        surface = Stretched(E, up)
+        return (
+            self.modulus_factor
+            * self.thickness_factor
+            / 6
+            * ((1 - self.parameter) * surface.first + self.parameter * surface.second)
+        )
 
-    def _slopes(self, at: "Stretched") -> tuple[Scalar, Scalar]:
-        first = 2 * at.T + at.D - at.first, at.T - 1 - at.first
-        second = 2 * (at.d - 1) - at.second, 2 * (at.d - 1) - 1 - at.second
+    def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
+        first_slopes = 2 * surface.T + surface.D - surface.first, surface.T - 1 - surface.first
+        second_slopes = (
+            2 * (surface.d - 1) - surface.second,
+            2 * (surface.d - 1) - 1 - surface.second,
+        )
         by_T, by_D = (
-            ((1 - self.number) * one + self.number * two) / (6 * at.d)
-            for one, two in zip(first, second, strict=True)
+            ((1 - self.parameter) * of_first + self.parameter * of_second) / (6 * surface.d)
+            for of_first, of_second in zip(first_slopes, second_slopes, strict=True)
         )
         return by_T, by_D
 
-    def _stiffness(self, at: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        factor = self.e * self.t**3 * self.h**2 / 18 / at.d**2  # h^2/(12 d) times 4/6 and 1/d
-        one, two, t = 1 - self.number, self.number, 2 + at.T
-        of_det = one + two * (t - root(at.d))  # W'' has d^2 in place of the root
-        return factor * 2 * (one + two * t), factor * 2 * two, factor * 2 * of_det * at.up / at.d, 0
+    def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        factor = (
+            self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
+        )  # h^2/(12 d) times 4/6 and 1/d
+        first_share, second_share, t = 1 - self.parameter, self.parameter, 2 + surface.T
+        of_det = first_share + second_share * (
+            t - root(surface.d)
+        )  # W'' has d^2 in place of the root
+        return (
+            factor * 2 * (first_share + second_share * t),
+            factor * 2 * second_share,
+            factor * 2 * of_det * surface.up / surface.d,
+            0,
+        )
 
 
 class Stretched:

@@ -44,10 +44,10 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
     """
 
     def __init__(
-        self, V: fem.FunctionSpace, name: str, again: Callable[[fem.Function], fem.Function]
+        self, V: fem.FunctionSpace, name: str, rebuild: Callable[[fem.Function], fem.Function]
     ) -> None:
         super().__init__(V, name=name)
-        self.rebuild = again
+        self.rebuild = rebuild
 
 
 def radial(r0: Array, n0: Array) -> Array:
@@ -104,8 +104,8 @@ class WithinRims:
     def __call__(self, r0: Array, n0: Array) -> Array:
         centre = r0.mean(axis=1)
         vectors = np.tile(self.outside, (len(r0), 1))
-        for inside, vector in reversed(self.within):
-            vectors[inside(centre)] = vector
+        for is_inside, vector in reversed(self.within):
+            vectors[is_inside(centre)] = vector
         return np.broadcast_to(vectors[:, None], (*r0.shape[:-1], len(self.outside)))
 
 
@@ -129,8 +129,8 @@ class PosedPattern:
     factor: float = 1.0
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        own = self.pattern(self.place.to_shell_frame(r0), n0 @ self.place.Q)
-        return np.asarray(self.factor * own @ self.place.Q.T)
+        vectors_in_shell = self.pattern(self.place.to_shell_frame(r0), n0 @ self.place.Q)
+        return np.asarray(self.factor * vectors_in_shell @ self.place.Q.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +142,10 @@ class PatternsByPatch:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         vectors = np.array(self.others(r0, n0))
-        for inside, pattern in self.patterns:
-            of = inside[: len(r0)]  # owned cells come first
-            if of.any():
-                vectors[of] = pattern(r0[of], n0[of])
+        for is_inside, pattern in self.patterns:
+            own_cells = is_inside[: len(r0)]  # owned cells come first
+            if own_cells.any():
+                vectors[own_cells] = pattern(r0[own_cells], n0[own_cells])
         return vectors
 
 
@@ -181,18 +181,22 @@ class CellPolynomials:
             basix.LatticeType.equispaced,
             True,
         )
-        at, drawn = (
+        value_table, place_table = (
             element.tabulate(0, X)[0, :, :, 0] for element in (self.element, self.cells.element)
         )
         owned = slice(self.cells.owned)
-        return np.matmul(at, self.values[owned]), np.matmul(drawn, self.cells.nodal[owned])
+        return np.matmul(value_table, self.values[owned]), np.matmul(
+            place_table, self.cells.nodal[owned]
+        )
 
     def _reference(self, places: Array) -> Array:
         """The reference points (n, 2) of places (n, 3) of the first cell, by Newton's method."""
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
         for _ in range(MAX_NEWTON_STEPS):
-            x, a1, a2 = (each[..., 0] @ nodal for each in element.tabulate(1, X))
+            x, a1, a2 = (
+                derivative_table[..., 0] @ nodal for derivative_table in element.tabulate(1, X)
+            )
             slopes = np.stack([a1, a2], axis=-1)
             step = np.einsum("nai,ni->na", np.linalg.pinv(slopes), places - x)
             X = X + step
@@ -202,7 +206,7 @@ class CellPolynomials:
 
 
 def user_field_polynomials(
-    given: UserField, midsurface: Midsurface, cells: CellGeometry
+    user_field: UserField, midsurface: Midsurface, cells: CellGeometry
 ) -> CellPolynomials:
     """What was given on the mesh, in the cells of this rank.
 
@@ -211,12 +215,14 @@ def user_field_polynomials(
     MeshError
         If its degree is higher than that of the displacement.
     """
-    if given.degree > cells.element.degree:
+    if user_field.degree > cells.element.degree:
         raise MeshError(
-            f"{given.name}: is a function of degree {given.degree}; allowed is at most that of the displacement, "
+            f"{user_field.name}: is a function of degree {user_field.degree}; allowed is at most that of the displacement, "
             f"{cells.element.degree}"
         )
-    return CellPolynomials(midsurface.in_cells(given), lagrange_element(given.degree), cells)
+    return CellPolynomials(
+        midsurface.in_cells(user_field), lagrange_element(user_field.degree), cells
+    )
 
 
 def by_patch(
@@ -245,14 +251,16 @@ def by_patch(
     MeshError
         If there is no such patch.
     """
-    given = {name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()}
-    zero = np.zeros_like(next(iter(given.values())))
-    by_cell = np.tile(given.get("rest", zero), (cells, 1))
+    vector_by_patch = {
+        name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()
+    }
+    zero = np.zeros_like(next(iter(vector_by_patch.values())))
+    by_cell = np.tile(vector_by_patch.get("rest", zero), (cells, 1))
     patterns = list[tuple[NDArray[np.bool_], Pattern]]()
-    for name, vector in given.items():
+    for name, vector in vector_by_patch.items():
         if name in patches:
             by_cell[patches[name]] = vector
-            patterns = [(inside & ~patches[name], pattern) for inside, pattern in patterns]
+            patterns = [(is_inside & ~patches[name], pattern) for is_inside, pattern in patterns]
             pattern = vectors[name]
             if callable(pattern):
                 patterns.append((patches[name], pattern))
@@ -298,12 +306,12 @@ def pattern_field(
         Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
     )
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
-    fit = project_pattern(
+    projection = project_pattern(
         pattern, cell_geometry(r0), pattern(inside_cells(nodes), n0), Q.element.basix_element
     )
-    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
-    around = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
-    return field, None if fit.smooth else around * fit.size
+    field.x.array.reshape(-1, size)[Q.dofmap.list] = projection.nodal
+    angle = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
+    return field, None if projection.smooth else angle * projection.size
 
 
 def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
@@ -328,40 +336,51 @@ def pattern_on_edge(
     cells = np.array([topology.connectivity(1, 2).links(f)[0] for f in facets], dtype=np.int64)
     pairs = zip(cells, facets, strict=True)
     local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in pairs]
-    element, on = Q.element.basix_element, V.element.basix_element
+    element, placement_element = Q.element.basix_element, V.element.basix_element
     corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
     family, interval, variant = (
         basix.ElementFamily.P,
         basix.CellType.interval,
         basix.LagrangeVariant.gll_warped,
     )
-    line, along = (
-        basix.create_element(family, interval, one.degree, variant) for one in (on, element)
+    edge_placement_element, edge_element = (
+        basix.create_element(family, interval, cell_element.degree, variant)
+        for cell_element in (placement_element, element)
     )
 
-    def side(points: Array, number: int) -> Array:
+    def points_on_side(points: Array, number: int) -> Array:
         a, b = corners[ends[number]]
         return np.asarray(a + points * (b - a))
 
-    placed = np.array([on.tabulate(0, side(line.points, i))[0, :, :, 0] for i in range(3)])
-    nodal = np.matmul(placed[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(
+    place_tables = np.array(
+        [
+            placement_element.tabulate(0, points_on_side(edge_placement_element.points, i))[
+                0, :, :, 0
+            ]
+            for i in range(3)
+        ]
+    )
+    nodal = np.matmul(place_tables[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(
         len(cells), -1, 3
     )
     owned = int(np.sum(facets < topology.index_map(1).size_local))
-    edge = CellGeometry(line, nodal, owned, V.mesh.comm)
-    x, normals, _ = edge.evaluate(along.points)
-    fit = project_pattern(pattern, edge, pattern(inside_cells(x), normals), along)
+    edge = CellGeometry(edge_placement_element, nodal, owned, V.mesh.comm)
+    x, normals, _ = edge.evaluate(edge_element.points)
+    projection = project_pattern(pattern, edge, pattern(inside_cells(x), normals), edge_element)
     nodes = element.points
-    near = [
-        [int(np.argmin(np.linalg.norm(nodes - p, axis=1))) for p in side(along.points, i)]
+    nodes_on_side = [
+        [
+            int(np.argmin(np.linalg.norm(nodes - p, axis=1)))
+            for p in points_on_side(edge_element.points, i)
+        ]
         for i in range(3)
     ]
     values = field.x.array.reshape(-1, 3)
     for cell, number, vectors in (
-        zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ()
+        zip(cells, local, projection.nodal, strict=True) if not projection.smooth else ()
     ):
-        values[Q.dofmap.list[cell][near[number]]] = vectors
-    return field, None if fit.smooth else fit.size
+        values[Q.dofmap.list[cell][nodes_on_side[number]]] = vectors
+    return field, None if projection.smooth else projection.size
 
 
 @dataclass(frozen=True)
@@ -405,7 +424,7 @@ def inside_cells(nodes: Array) -> Array:
     return np.asarray(nodes + INWARD_SHARE * (nodes.mean(axis=1, keepdims=True) - nodes))
 
 
-def positions_and_normals(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
+def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tuple[Array, Array]:
     """The nodes of every cell, or other reference points (n, 2), and the cell's normals there:
     (cells, n, 3) each.
 
@@ -413,7 +432,7 @@ def positions_and_normals(r0: fem.Function, at: Array | None = None) -> tuple[Ar
     """
     V = r0.function_space
     element, size = V.element.basix_element, V.dofmap.index_map_bs
-    table = element.tabulate(1, element.points if at is None else at)[..., 0]
+    table = element.tabulate(1, element.points if points is None else points)[..., 0]
     jets = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, size)[V.dofmap.list])
     if size == 2:
         (rho, z), (rho_s, z_s) = np.moveaxis(jets, -1, 1)
@@ -437,9 +456,9 @@ def body_positions_and_normals(V: fem.FunctionSpace) -> tuple[Array, Array]:
     each.
     """
     element = V.element.basix_element
-    along = element.tabulate(1, element.points)[:, :, :, 0]
+    table = element.tabulate(1, element.points)[:, :, :, 0]
     nodes = V.tabulate_dof_coordinates()[V.dofmap.list]
-    a1, a2 = np.einsum("dvk,cki->dcvi", along[1:3], nodes)
+    a1, a2 = np.einsum("dvk,cki->dcvi", table[1:3], nodes)
     m = np.cross(a1, a2)
     return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
@@ -471,13 +490,13 @@ def field_in_body(
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (size,)))
     field = fem.Function(Q, name=name)
     refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm, key)
-    fit = project_pattern(
+    projection = project_pattern(
         pattern,
         body_cell_geometry(V),
         pattern(inside_cells(nodes), normals),
         Q.element.basix_element,
     )
-    field.x.array.reshape(-1, size)[Q.dofmap.list] = fit.nodal
+    field.x.array.reshape(-1, size)[Q.dofmap.list] = projection.nodal
     return field
 
 

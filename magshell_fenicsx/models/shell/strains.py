@@ -90,12 +90,12 @@ class TangentFrame:
 
         The stretch s of the thickness is that of a volume that stays where `thins` is 1, else 1.
         """
-        carried = self._moved_with(self._deformed(u), v, u)
+        convected = self._moved_with(self._deformed(u), v, u)
         if not np.any(thins):
-            return carried
+            return convected
         m, area = _area_vector(self.jet[:3] + u[:3])
         thinned = thins * (self.area / area - 1)
-        return np.asarray(carried + (thinned * _dot(self.n0, v) / area)[..., None] * m)
+        return np.asarray(convected + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
         """R v with the rotation R of F, of vectors (..., 3); see `magnetism.laws`."""
@@ -143,14 +143,14 @@ class NaturalFrame:
     ) -> "NaturalFrame":
         """From the tensors of `parts.natural.shape.Natural.at`, times R, and the amplitudes."""
         t0 = frame.t
-        inside = [
+        tensors_in_frame = [
             np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)
         ]
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
         b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
-        U = np.eye(2) + inside[0]
-        bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ inside[1] @ U
-        strain = inside[0] + inside[0] @ inside[0] / 2
+        U = np.eye(2) + tensors_in_frame[0]
+        bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ tensors_in_frame[1] @ U
+        strain = tensors_in_frame[0] + tensors_in_frame[0] @ tensors_in_frame[0] / 2
         return cls(_components(strain), _components(bend), np.linalg.inv(U), s[..., 0, 0])
 
     def elastic(self, E: Array) -> Array:
@@ -191,8 +191,8 @@ def _of_symmetric(A: Array) -> Array:
     """B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), of A (..., n, 2)."""
     first, second = A[..., 0], A[..., 1]
     mixed = first[..., :, None] * second[..., None, :]
-    one, two = (v[..., :, None] * v[..., None, :] for v in (first, second))
-    return np.stack([one, mixed + np.swapaxes(mixed, -1, -2), two], axis=-1)
+    first_square, second_square = (v[..., :, None] * v[..., None, :] for v in (first, second))
+    return np.stack([first_square, mixed + np.swapaxes(mixed, -1, -2), second_square], axis=-1)
 
 
 def _times(A: Array, S: Array) -> Array:

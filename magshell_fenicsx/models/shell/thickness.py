@@ -56,7 +56,7 @@ class Thickness:
         if self.of_position is None:
             return nodal
         element = cells.element
-        fit = project_formula(
+        projection = project_formula(
             lambda x, n: self.values_at(x)[..., None],
             cells,
             nodal[..., None],
@@ -65,7 +65,7 @@ class Thickness:
             bounded=True,
             formulas=self.formulas,
         )
-        return fit.nodal[..., 0]
+        return projection.nodal[..., 0]
 
 
 @dataclass(frozen=True)
@@ -120,13 +120,13 @@ def thickness_field(
     values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     if thickness.carried:
-        between, sampled = thickness.carried.values_between_nodes()
-        refuse_unfit(between[..., 0], sampled, V.mesh.comm)
+        between_nodes, sampled = thickness.carried.values_between_nodes()
+        refuse_unfit(between_nodes[..., 0], sampled, V.mesh.comm)
     values = thickness.values_in_cells(cell_geometry(r0), values)
     for name, factor in (thickness.patches or {}).items():
-        inside = patch_of(patches or {}, name, "shell.thickness_factor")
-        values[inside] = (
-            factor.in_cells(select_cells(cell_geometry(r0), inside))
+        is_inside = patch_of(patches or {}, name, "shell.thickness_factor")
+        values[is_inside] = (
+            factor.in_cells(select_cells(cell_geometry(r0), is_inside))
             if isinstance(factor, PlacedFactor)
             else factor
         )
@@ -147,14 +147,14 @@ def material_field(
     Q = fem.functionspace(domain, ("DG", 0, (4,)))
     field = fem.Function(Q, name="material")
     values = field.x.array.reshape(-1, 4)
-    for name, own in shells.items():
-        values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = own.numbers
+    for name, material in shells.items():
+        values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = material.numbers
     return field
 
 
-def select_cells(cells: CellGeometry, which: NDArray[np.bool_]) -> CellGeometry:
+def select_cells(cells: CellGeometry, selection: NDArray[np.bool_]) -> CellGeometry:
     """Some of this rank's cells."""
-    return replace(cells, nodal=cells.nodal[which], owned=int(which[: cells.owned].sum()))
+    return replace(cells, nodal=cells.nodal[selection], owned=int(selection[: cells.owned].sum()))
 
 
 def patch_of(
@@ -178,8 +178,8 @@ def thickness_weighted(density: Density, t: fem.Function, component: int = 0) ->
     over h.
     """
 
-    def of(*arguments: Expr) -> Expr:
-        *given, factor = arguments
-        return factor[component] * density.function(*given)
+    def weighted(*arguments: Expr) -> Expr:
+        *arguments_left, factor = arguments
+        return factor[component] * density.function(*arguments_left)
 
-    return replace(density, function=of, parameters=(*density.parameters, t))
+    return replace(density, function=weighted, parameters=(*density.parameters, t))

@@ -123,17 +123,17 @@ def follower_pressure_work_on_end(
 
 
 def turning(
-    X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr
+    X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, reference_turn: Expr
 ) -> Expr:
     """-Pi of a moment per length about t: intensity times the mean angle that lines along n have
     turned.
 
     With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a
-    traction linear in z. `past` is that of `models.shell.edges.turning`.
+    traction linear in z. `reference_turn` is that of `models.shell.edges.turning`.
     """
     line = n + ufl.dot(H, n)
     sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)
-    return -intensity * weight[0] * kin.angle_from(sine, cosine, past)
+    return -intensity * weight[0] * kin.angle_from(sine, cosine, reference_turn)
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def vibrations(
         count += 1
         try:
             modes = ShellModes(scene.model).vibrations(
-                state, count, loose=scene.allows_rigid_motion
+                state, count, allows_rigid_motion=scene.allows_rigid_motion
             )
         except ModesNotFound as e:
             raise LostResult(f"no frequencies here: {e}") from None

@@ -1,0 +1,127 @@
+"""Reuse of a scene for a problem with other fields: nothing is meshed or compiled again.
+
+A scene serves another problem whose remanence, thickness or natural curvature alone differ: their
+coefficients get new values.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.models.shell import spatial_fields
+from magshell_fenicsx.models.shell.thickness import thickness_field
+from magshell_fenicsx.parts.natural.shape import natural_field
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:  # one of them is built
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
+
+# section -> keys of the fields that a scene can take from another problem
+FIELD_KEYS = {"magnetic": {"remanent"}, "shell": {"thickness_factor"}, "natural": {"curvature"}}
+
+
+@dataclass
+class SceneReuse:
+    """The latest scene, which serves the next problem if it can."""
+
+    scene: Scene | None = None
+
+    def scene_for(self, problem: Problem, comm: MPI.Comm) -> Scene:
+        """Return the scene of a problem; collective.
+
+        Raises
+        ------
+        MeshError
+            If it cannot be made.
+        """
+        scene, self.scene = self.scene, None
+        if scene is None or not update_fields(scene, problem):
+            scene = Scene(problem, comm)
+        self.scene = scene
+        return scene
+
+
+def update_fields(scene: Scene, problem: Problem) -> bool:
+    """Give a scene the remanence, thickness and natural curvature of a problem; collective.
+
+    Returns
+    -------
+    Whether they are all that differs and the scene has them as fields; otherwise it stays as it is.
+
+    Raises
+    ------
+    MeshError
+        If a field has no fit value somewhere; the scene is unfit then.
+    """
+    model, old = scene.model, scene.problem
+    has_same_data = _data_without_fields(old) == _data_without_fields(problem)
+    if not (old.document.data and has_same_data):
+        return False
+    if not model.thin or model.contacts or model.shell_contacts or old.loads.dead:
+        return False
+    symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, problem)]
+    if symmetries[0] != symmetries[1] or _fields(problem) != _fields(old):
+        return False
+    if _has_fields_by_patch(problem) or _has_fields_by_patch(old):
+        return False
+    _set_fields(model, problem)
+    model.loads = problem.loads
+    scene.problem = problem
+    scene.newton = BorderedNewton(model.system, scene.newton.options)
+    scene.__dict__.pop("stability_monitor", None)
+    return True
+
+
+def _data_without_fields(problem: Problem) -> dict[str, Any]:
+    """Return the data of a problem's case without the fields that a scene can take."""
+    return {
+        key: {name: v for name, v in section.items() if name not in FIELD_KEYS[key]}
+        if key in FIELD_KEYS
+        else section
+        for key, section in problem.document.data.items()
+    }
+
+
+def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
+    """Return which fields the terms of a problem have."""
+    magnetic, natural = problem.loads.magnetic, problem.loads.natural
+    amplitudes = natural.amplitudes if natural else ()
+    soft_scale = magnetic.soft.scale if magnetic and magnetic.soft else 0.0
+    has_remanence = callable(magnetic and magnetic.remanent)
+    return has_remanence, problem.thickness is not None, soft_scale, *amplitudes
+
+
+def _has_fields_by_patch(problem: Problem) -> bool:
+    """Whether a field is given by patches of a mesh."""
+    magnetic, natural, thickness = problem.loads.magnetic, problem.loads.natural, problem.thickness
+    has_natural_patches = natural is not None and any(
+        isinstance(v, Mapping) for v in (natural.curvature, natural.stretch)
+    )
+    has_patches = (magnetic and magnetic.patches) or (thickness and thickness.patches)
+    return has_natural_patches or bool(has_patches)
+
+
+def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:
+    """Put the fields of a problem into the coefficients of a model."""
+    magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
+    coefficients = {
+        coefficient.name: coefficient
+        for term in model.system.terms
+        if isinstance(term, FormTerm)
+        for coefficient in term.form.coefficients()
+    }
+    if magnetic and callable(magnetic.remanent):
+        remanence = spatial_fields.pattern_field(magnetic.remanent, r0)[0]
+        coefficients["Br"].x.array[:] = remanence.x.array
+    if problem.thickness and model.thickness:
+        patches = model.midsurface.patches if model.midsurface else {}
+        model.thickness.x.array[:] = thickness_field(problem.thickness, r0, patches).x.array
+    if natural:
+        curvature = natural_field(natural, spatial_fields.cells_of(r0), model.V)
+        coefficients["natural"].x.array[:] = curvature.x.array
