@@ -128,7 +128,7 @@ def check_derivatives(
 
     `far` is the step of the energy's difference over that of the forces'.
     """
-    system, (term,), mu = scene.model.system, scene.model.touchings, scene.unloaded().mu
+    system, (term,), mu = scene.model.system, scene.model.shell_contacts, scene.unloaded().mu
     rough, moved, other = (
         system.zero_at_supports(
             np.random.default_rng([seed, k]).standard_normal(flat.size)[: system.size]

@@ -50,7 +50,7 @@ GROUPS = {
         "parts/supports",
     ),
     "magnetism": ("parts/magnetism",),
-    "contact": ("parts/touching", "parts/bodies", "parts/gap.py"),
+    "contact": ("parts/contact", "parts/bodies", "parts/gap.py"),
     "simulate": ("simulate",),
     "output": ("output", "quantities"),
 }  # the package's files, by what is asked of them

@@ -56,7 +56,7 @@ ALONE = {  # room -> all rooms that it knows
 }
 REGISTRY = {"parts.kinds", "parts.registered"}  # by which rooms below find parts
 OF_TYPES = {
-    "parts/seen.py",
+    "parts/observables.py",
     "parts/supports/reacting.py",
     "parts/supports/reactions.py",
     "parts/magnetism/interacting.py",

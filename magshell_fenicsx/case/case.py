@@ -38,7 +38,9 @@ from magshell_fenicsx.input.section import (
 )
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.bodies.press import approaches
+from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.bodies.contact_step import approaches
+from magshell_fenicsx.parts.contact.contact_section import Pairs
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.joints import Joints
 from magshell_fenicsx.parts.kinds import Bodies
@@ -48,11 +50,9 @@ from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.natural.section import NaturalSection
-from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
-from magshell_fenicsx.parts.touching.section import Pairs
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (
     FrequenciesSection,

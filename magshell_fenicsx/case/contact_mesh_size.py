@@ -13,8 +13,8 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
-from magshell_fenicsx.parts.course import Fit
-from magshell_fenicsx.parts.touching.section import WHOLE
+from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
+from magshell_fenicsx.parts.step_control import Fit
 from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def contact_places(
     half_thickness = {
         name: np.broadcast_to(np.asarray(thickness[name]) / 2, len(places[name])) for name in names
     }
-    are_all = [WHOLE, WHOLE] in [[*pair] for pair in pairs]
+    are_all = [WHOLE_SHELL, WHOLE_SHELL] in [[*pair] for pair in pairs]
     for a, b in all_pairs if are_all else pairs:
         if a == b or a not in places or b not in places:
             continue

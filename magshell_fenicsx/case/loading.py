@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import ChosenByKey
-from magshell_fenicsx.parts.course import Gas
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
+from magshell_fenicsx.parts.step_control import Gas
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 if TYPE_CHECKING:

@@ -1,8 +1,8 @@
 """What touches the faces of a shell: the penalty of a penetration, and the thickness of the shell.
 
 A shell that keeps its volume gets thinner as its surface stretches. A natural shape is what has
-grown without stress, and its volume stays. Penetrations and thicknesses are over R, stiffnesses over
-E h/R^2. docs/theory.md, Contact.
+grown without stress, and its volume stays. Penetrations and thicknesses are over R, stiffnesses
+over E h/R^2. docs/theory.md, Contact.
 """
 
 from collections.abc import Callable

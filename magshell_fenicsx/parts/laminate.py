@@ -16,7 +16,7 @@ from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_valida
 
 from magshell_fenicsx.input.section import Section, case_sizes, or_number
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.parts.ability import Ability, Context
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, no_plane, unit
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import is_over_unit, over_unit
-from magshell_fenicsx.parts.course import (
+from magshell_fenicsx.parts.step_control import (
     Control,
     Course,
     Drive,
@@ -21,7 +21,7 @@ from magshell_fenicsx.parts.course import (
     Target,
     Until,
 )
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import LEAST_TARGET, Step
 
 Count = Annotated[

@@ -14,8 +14,8 @@ from pydantic import Field, PrivateAttr, create_model
 
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.part import Ability, Account, Context, Part
-from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.ability import Ability, Account, Context, Part
+from magshell_fenicsx.parts.observables import Seen
 from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
@@ -31,11 +31,11 @@ KINDS_OF_STEPS: dict[str, str] = {
     "rotation": "magnetism.field_step.RotationSection",
     "natural": "natural.section.GrowthSection",
     "imperfection": "imperfections.growth.ImperfectionStep",
-    "dead": "forces.dead.DeadSection",
+    "dead": "forces.dead_load_step.DeadSection",
     "edge": "supports.motion.EdgeSection",
-    "contact": "bodies.press.ContactSection",
+    "contact": "bodies.contact_step.ContactSection",
     "source": "magnetism.source_step.SourceStep",
-    "time": "motion.step.TimeSection",
+    "time": "motion.motion_step.TimeSection",
     "spin": "spin.SpinStep",
     "gravity": "gravity.GravityStep",
     "interaction": "magnetism.interaction.InteractionStep",
@@ -59,14 +59,14 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "rubber.Rubber",
     "motion.history.Viscosity",
     "bodies.body.RigidBodies",
-    "touching.section.ShellContact",
+    "contact.contact_section.ShellContact",
     "joints.Joined",
 )
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "natural.section.NaturalSeen",
     "imperfections.growth.GrowingSeen",
     "pressure.pressure.PressureSeen",
-    "forces.dead.ForcesSeen",
+    "forces.dead_load_step.ForcesSeen",
     "supports.reacting.ReactionsSeen",
     "magnetism.readings.FieldSeen",
     "magnetism.source_step.SourcesSeen",
@@ -74,18 +74,18 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "magnetism.interaction.InteractionSeen",
     "magnetism.readings.SensorsSeen",
     "magnetism.field_maps.FieldMapsSeen",
-    "bodies.press.BodiesSeen",
-    "touching.seen.TouchingSeen",
+    "bodies.contact_step.BodiesSeen",
+    "contact.contact_observables.ContactObservables",
     "joints.FoldSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
     "natural.planned",
     "pressure.pressure",
-    "forces.dead_load",
+    "forces.load_vectors",
     "supports.reacting",
-    "bodies.standing",
-    "touching.section",
+    "bodies.body_setup",
+    "contact.contact_section",
     "joints",
 )
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Rubberlike, Section
-from magshell_fenicsx.parts.part import Ability, Context, Offer
+from magshell_fenicsx.parts.ability import Ability, Context, Offer
 
 Exponent = Annotated[float, Field(ge=-20, le=20)]
 

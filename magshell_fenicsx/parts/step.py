@@ -11,7 +11,7 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.course import (
+from magshell_fenicsx.parts.step_control import (
     Ahead,
     Course,
     Curves,
@@ -23,17 +23,17 @@ from magshell_fenicsx.parts.course import (
     Target,
     Until,
 )
-from magshell_fenicsx.parts.course import (
+from magshell_fenicsx.parts.step_control import (
     ProgrammeStep as ProgrammeStep,
 )
-from magshell_fenicsx.parts.part import Context, Formulas, Modelled
+from magshell_fenicsx.parts.ability import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.parts.motion.step import TimeSection
+    from magshell_fenicsx.parts.motion.motion_step import TimeSection
     from magshell_fenicsx.shape.outline import Outline
 
 LEAST_TARGET = 1e-9

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import log
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.platform.environment import available_memory
 from magshell_fenicsx.problem.mesh_sizes import degree_of
 from magshell_fenicsx.problem.problem import Problem, layer_bounds

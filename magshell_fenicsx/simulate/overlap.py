@@ -22,7 +22,7 @@ from magshell_fenicsx.shells.t_junctions import (
 )
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
-MOST = 20_000  # cells in which they are looked for: some seconds
+MAX_CELLS = 20_000  # cells in which they are looked for: some seconds
 
 
 def refuse_overlap(problem: Problem, cells: int) -> None:
@@ -37,28 +37,25 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     CaseError
         If magnetised parts are in each other.
     """
-    pairs, h, given = problem.loads.pairs, problem.material.h, problem.thickness
-    if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MOST:
+    pairs, h, factor = problem.loads.pairs, problem.material.h, problem.thickness
+    if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MAX_CELLS:
         return
     if problem.axisymmetric:
-        from magshell_fenicsx.parts.contact import meridian_contact as curves
+        from magshell_fenicsx.parts.contact.meridian_contact import (
+            ModelMeridian,
+            meridian_contacts,
+        )
 
         meridian = build_meridian(problem)
         V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
         r0 = meridian.placement(V)
         refuse_misplaced_parallels(problem.loads.joints, meridian, r0, h)
-        thickness = thickness_field(given, r0, meridian.patches) if given else None
-        curves.shell_contacts(
-            pairs,
-            r0,
-            fem.Function(V),
-            meridian.patches,
-            h,
-            meridian_domain(r0).contact_rule,
-            thickness,
-        )
+        thickness = thickness_field(factor, r0, meridian.patches) if factor else None
+        rule = meridian_domain(r0).contact_rule
+        model = ModelMeridian(r0, fem.Function(V), meridian.patches, h, rule, thickness)
+        meridian_contacts(pairs, model)
         return
-    from magshell_fenicsx.parts.contact.model_surface import shell_contacts
+    from magshell_fenicsx.parts.contact.model_surface import ModelSurface, surface_contacts
 
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
@@ -66,14 +63,13 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     refuse_misplaced_edges(problem.loads.joints, surface, r0, h)
     if problem.loads.interaction:
         _refuse_parts_in_each_other(r0, h)
-    if given and given.given:
-        given = replace(
-            given, carried=user_field_polynomials(given.given, surface, cell_geometry(r0))
+    if factor and factor.given:
+        factor = replace(
+            factor, carried=user_field_polynomials(factor.given, surface, cell_geometry(r0))
         )
-    thickness = thickness_field(given, r0, surface.patches) if given else None
-    shell_contacts(
-        pairs, r0, fem.Function(V), surface.patches, h, surface_domain(r0).contact_rule, thickness
-    )
+    thickness = thickness_field(factor, r0, surface.patches) if factor else None
+    rule = surface_domain(r0).contact_rule
+    surface_contacts(pairs, ModelSurface(r0, fem.Function(V), surface.patches, h, rule, thickness))
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
@@ -92,10 +88,10 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     nodes = surfaces.cells.nodes
     part = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
     for number in np.unique(part)[1:]:
-        own = np.unique(nodes[part == number])
+        own_nodes = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)
         if (
-            surfaces.nearest_places(surfaces.r0[own], others)[2].min(initial=np.inf)
+            surfaces.nearest_places(surfaces.r0[own_nodes], others)[2].min(initial=np.inf)
             < OVERLAP_DISTANCE * h
         ):
             raise CaseError(TOO_NEAR)

@@ -15,7 +15,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.system import State, System, Vector
-from magshell_fenicsx.simulate.onset import way_to_touch
+from magshell_fenicsx.simulate.contact_onset import first_contact
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -83,14 +83,14 @@ class Stage:
         """
         if control == "conjugate":
             _refuse_open(self.scene, name)
-        scene, given = (
+        scene, path_arguments = (
             self.scene,
             (self.newton, name, control, options, scale, self.scene.journal, self.scene.progress),
         )
         return (
-            Path(*given, partial(way_to_touch, scene, self.leave))
-            if scene.model.touchings
-            else Path(*given)
+            Path(*path_arguments, partial(first_contact, scene, self.leave))
+            if scene.model.shell_contacts
+            else Path(*path_arguments)
         )
 
     def begin(
@@ -123,12 +123,12 @@ def _refuse_open(scene: Scene, name: str) -> None:
         )
 
 
-def plain(scene: Scene) -> Stage:
+def load_stage(scene: Scene) -> Stage:
     """A stage in which all other amplitudes are loads."""
     return Stage(scene, scene.newton)
 
 
-def staged(
+def make_stage(
     scene: Scene,
     state: State,
     held: Mapping[str, HeldConjugate] | None = None,

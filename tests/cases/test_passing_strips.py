@@ -42,12 +42,12 @@ CASE: dict[str, Any] = {
 RUN = """
 import os, sys
 from magshell_fenicsx.cli import main
-from magshell_fenicsx.parts.touching.touching import Touching
-from magshell_fenicsx.simulate import walked
+from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+from magshell_fenicsx.simulate import path_records
 
-sees, refuse, looks = Touching.through, walked.refuse_passing, []
+sees, refuse, looks = SurfaceContact.passes_through, path_records.refuse_passing, []
 long = [False]
-Touching.through = lambda self, u, v: sees(self, u, v) or long[0]
+SurfaceContact.passes_through = lambda self, u, v: sees(self, u, v) or long[0]
 
 def refuse_passing(stage, low, high):
     looks.append(high.s)
@@ -56,7 +56,7 @@ def refuse_passing(stage, low, high):
     long[0] = high.s - low.s > 0.5
     refuse(stage, low, high)
 
-walked.refuse_passing = refuse_passing
+path_records.refuse_passing = refuse_passing
 sys.argv = ["magshell", *sys.argv[1:]]
 main()
 """

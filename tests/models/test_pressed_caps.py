@@ -68,7 +68,7 @@ def test_two_caps_are_one_on_a_plane() -> None:
         "loading": loading,
     }
     two = Scene(Case.from_source(data))
-    (touching,) = two.model.touchings
+    (touching,) = two.model.shell_contacts
     r, of_one = (scene.model.r0.x.array.reshape(-1, 3) for scene in (two, one))
     (far, i), (far_turned, j) = (
         cKDTree(nodes).query(r) for nodes in (of_one, of_one @ TURNED.T + MOVED)

@@ -79,7 +79,7 @@ def test_derivatives(tmp_path: Path, angle: float, floor_at: float) -> None:
     1e-6.
     """
     scene = Scene(Case.model_validate(standing(tmp_path, np.radians(angle), floor_at)))
-    model, (term,), mu = scene.model, scene.model.touchings, scene.unloaded().mu
+    model, (term,), mu = scene.model, scene.model.shell_contacts, scene.unloaded().mu
     system, rng = model.system, np.random.default_rng(angle)
     u = 1e-4 * h * rng.standard_normal((system.size // 3, 3))
     u[:, 2] -= (GAP + 3e-3) * h * (model.r0.x.array.reshape(-1, 3)[:, 2] > 0)
@@ -101,7 +101,7 @@ def test_a_corner(tmp_path: Path) -> None:
     0.01 h times the slope, and differences are as those of an edge.
     """
     scene = Scene(Case.model_validate(standing(tmp_path, STEEP)))
-    model, (term,), mu = scene.model, scene.model.touchings, scene.unloaded().mu
+    model, (term,), mu = scene.model, scene.model.shell_contacts, scene.unloaded().mu
     system, rng = model.system, np.random.default_rng(3)
     r, deep, tilt = model.r0.x.array.reshape(-1, 3), 0.1 * h, np.radians(30)
     along, up = np.array([0, 1.0, 0]), np.array([np.cos(STEEP), 0, np.sin(STEEP)])

@@ -81,8 +81,12 @@ def test_derivatives(seed: int) -> None:
     if seed:
         r = ring().model.r0.x.array.reshape(-1, 3)
         slid = u.reshape(-1, 3) + 0.7 * seed * h * np.outer(np.tanh(r[:, 1] / 0.2), [1, 0, 0])
-        mu = mu | {term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.improved_cuts)}
-        assert system.at_state(State(u, mu)).evaluate(lambda: len(term._active_set()[0].point)) > 2000
+        mu = mu | {
+            term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.improved_cuts)
+        }
+        assert (
+            system.at_state(State(u, mu)).evaluate(lambda: len(term._active_set()[0].point)) > 2000
+        )
     v = system.zero_at_supports(
         1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size)
     )
@@ -213,16 +217,18 @@ def test_nearest_places() -> None:
     model, term = ring().model, touching()
     at = model.system.at_state(State(flattened(0.7, 0.3, 0.01), ring().unloaded().mu))
     h, cells, points = model.material.h, term._cells, term._rule
-    places = at.evaluate(lambda: term._search.found(term._displacement(), 4 * h))
+    places = at.evaluate(lambda: term._search.projections(term._displacement(), 4 * h))
     r = at.evaluate(lambda: term._r0 + term._displacement())
-    x, n = term._search.x_of(points, r), 40
+    x, n = term._search.places_of_points(points, r), 40
     X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     fine = np.einsum("mk,nki->nmi", cells.element.tabulate(0, X)[0, :, :, 0], r[cells.nodes])
     inner = np.flatnonzero(np.abs(x[places.point, 0]) < 0.4)
     assert len(inner) > 300
     for k in inner[::20]:
         i = points.cell[places.point[k]]
-        _, far = term._search._fit(np.full(len(cells.nodes), i), np.arange(len(cells.nodes)))
+        _, far = term._search._select_pairs(
+            np.full(len(cells.nodes), i), np.arange(len(cells.nodes)), 0.0
+        )
         least = np.linalg.norm(fine[far] - x[places.point[k]], axis=-1).min()
         assert places.distance[k] <= least + 1e-12
         assert places.distance[k] == pytest.approx(least, abs=0.05 * h)
@@ -267,7 +273,11 @@ def test_the_least_gap_of_shells_that_are_apart() -> None:
         at.evaluate(lambda: term._active_set() and term._points),
     )
     every, few = (
-        at.evaluate(lambda least=least: facing.found(term._displacement(), far, points, least=least))
+        at.evaluate(
+            lambda least=least: facing.projections(
+                term._displacement(), far, points, least_only=bool(least)
+            )
+        )
         for least in (0, 1)
     )
     assert len(few.point) < 3 * len(points.cell) < len(every.point)
@@ -305,9 +315,9 @@ def test_a_step_that_passes_through() -> None:
     """Walls that change places on the straight way, and walls that only come near."""
     system, h = ring().model.system, ring().model.material.h
     here, there, near = (flattened(half, 0.0).reshape(-1, 3) for half in (0.7, -0.7, 0.51))
-    assert touching().through(here, there)
-    assert not touching().through(here, near)
-    assert not touching().through(here, here + 100 * h * np.array([0, 0, 1.0]))
+    assert touching().interpolated_on_surface(here, there)
+    assert not touching().interpolated_on_surface(here, near)
+    assert not touching().interpolated_on_surface(here, here + 100 * h * np.array([0, 0, 1.0]))
     assert system.size == here.size
 
 

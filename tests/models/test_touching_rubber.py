@@ -13,7 +13,7 @@ from scipy.sparse.linalg import spsolve
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.gap import SOFT
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION
 
 Array = NDArray[np.float64]
 h, FOUNDATION = 0.02, 1e-3  # over R; over E/R
@@ -83,7 +83,7 @@ def test_gap_of_stretched_sheets() -> None:
     model, r0 = scene.model, scene.model.r0.x.array.reshape(-1, 3)
     u = (r0 * [0.3, 0.2, 0.1]).ravel()
     gap = model.system.at_state(State(u, scene.unloaded().mu)).evaluate(
-        model.touchings[0].least_gap
+        model.shell_contacts[0].least_gap
     )
     assert gap == pytest.approx(1.1 * 1.25 * h - h / 2 - 0.75 * h / (1.3 * 1.2), abs=1e-14)
 
@@ -94,11 +94,11 @@ def test_pressed_sheets() -> None:
     With the pressure q per undeformed area, the tension T and the penetration s, of each sheet that
     has grown to g
 
-        (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT h/2).
+        (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT_PENETRATION h/2).
     """
     g = 1.1
     scene = sheets(grown=g)
-    model, (term,) = scene.model, scene.model.touchings
+    model, (term,) = scene.model, scene.model.shell_contacts
     system, r0 = model.system, model.r0.x.array.reshape(-1, 3)
     upper = r0[:, 2] > h / 2
     guess = r0 * (g * np.array([1.14, 1.15, 1.0]) - [1, 1, g])
@@ -123,7 +123,7 @@ def test_pressed_sheets() -> None:
     assert g**2 * (stretch - stretch**-5) / 3 == pytest.approx(
         TENSION + q * h / (2 * stretch**3), rel=1e-6
     )
-    s = q / term.stiffness.value + SOFT * h / 2
+    s = q / term.stiffness.value + SOFT_PENETRATION * h / 2
     assert d == pytest.approx(g * h / stretch**2 - s, abs=1e-6 * h)
 
 
@@ -177,7 +177,7 @@ def test_derivatives_by_the_natural_stretch() -> None:
     """
     load = [{"kind": "natural", "stretch": 1}, {"kind": "pressure"}]
     scene = ring(natural={"stretch": ["1.2 + 0.1*x", 0.9], "along": [0, 0, 1]}, loading=load)
-    system, (term,), flat = scene.model.system, scene.model.touchings, flattened(scene).ravel()
+    system, (term,), flat = scene.model.system, scene.model.shell_contacts, flattened(scene).ravel()
     u = system.zero_at_supports(
         flat + 0.002 * h * np.random.default_rng(1).standard_normal(flat.size)
     )
@@ -209,7 +209,7 @@ def test_derivatives_by_the_natural_stretch() -> None:
 def test_thin_walls_that_pass_through() -> None:
     """Stretched walls may come nearer than half the undeformed thickness, and are then still apart."""
     scene = sheets()
-    (term,), r0 = scene.model.touchings, scene.model.r0.x.array.reshape(-1, 3)
+    (term,), r0 = scene.model.shell_contacts, scene.model.r0.x.array.reshape(-1, 3)
     upper = r0[:, 2] > h / 2
 
     def apart(d: float) -> Array:
@@ -217,5 +217,5 @@ def test_thin_walls_that_pass_through() -> None:
         u[upper, 2] = (d - 1) * h
         return u
 
-    assert not term.through(apart(1.0), apart(0.26))
-    assert term.through(apart(0.3), apart(-0.3))
+    assert not term.interpolated_on_surface(apart(1.0), apart(0.26))
+    assert term.interpolated_on_surface(apart(0.3), apart(-0.3))

@@ -13,8 +13,8 @@ from interrupted import kill, start, wait_for_rows
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
-from magshell_fenicsx.parts.touching.facing import Facing
-from magshell_fenicsx.parts.touching.on_meridian import MeridianTouching
+from magshell_fenicsx.parts.contact.closest_points import ClosestPointSearch
+from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 from magshell_fenicsx.shells.waves import Waves
 
 THICK = [
@@ -98,7 +98,11 @@ def pressed_caps(down: float, points: int, **mesh: Any) -> dict[str, Any]:
     }
 
 
-LOOKS = [(Facing, "places_in"), (MeridianTouching, "_found"), (Waves, "counts")]
+LOOKS = [
+    (ClosestPointSearch, "projections_in_cells"),
+    (MeridianContact, "_projections"),
+    (Waves, "counts"),
+]
 FEW = 4  # looks of the undeformed shells, and of the last point
 
 

@@ -21,11 +21,11 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
-from magshell_fenicsx.parts.touching.expanded import _area
+from magshell_fenicsx.parts.contact.frozen_contact import _area_ratio
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
-from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
 
@@ -101,7 +101,7 @@ def by_difference(
     """Of whole runs with other numbers."""
 
     def run(change: float) -> Array:
-        other = Scene(on_mesh_of(scene, case(data, {key: value * (1 + change)}).problem()))
+        other = Scene(problem_on_mesh_of(scene, case(data, {key: value * (1 + change)}).problem()))
         state = solved(other).point.state
         return np.array([functional(other, state, of).value for of in results])
 
@@ -113,7 +113,7 @@ def ends_of(
 ) -> list[tuple[Scene, State]]:
     """Both caps with a number that is larger and smaller, at the same load."""
     cases = (case(CAPS, {key: value * (1 + way * change)}) for way in (1, -1))
-    scenes = (Scene(on_mesh_of(scene, each.problem())) for each in cases)
+    scenes = (Scene(problem_on_mesh_of(scene, each.problem())) for each in cases)
     return [(other, held_at(other, last)) for other in scenes]
 
 
@@ -217,7 +217,7 @@ def thicker(scene: Scene, c: float) -> Scene:
 
 def deviated(scene: Scene, c: float, data: dict[str, Any]) -> Scene:
     """A new case on the same mesh: both shells deviate more, along their normals."""
-    return Scene(on_mesh_of(scene, Case.from_source(imperfect(data, c)).problem()))
+    return Scene(problem_on_mesh_of(scene, Case.from_source(imperfect(data, c)).problem()))
 
 
 def imperfect(data: dict[str, Any], c: float = 0.0) -> dict[str, Any]:
@@ -237,13 +237,17 @@ def imperfect(data: dict[str, Any], c: float = 0.0) -> dict[str, Any]:
 
 def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     """The equilibrium of another scene, whose points are those of the state of the first one."""
-    (one,), (same,), state = scene.model.touchings, other.model.touchings, last.point.state
+    (one,), (same,), state = (
+        scene.model.shell_contacts,
+        other.model.shell_contacts,
+        last.point.state,
+    )
     number = state.mu.get(one.pair.cuts, 0.0)
     points, normals = scene.model.system.at_state(state).evaluate(
-        lambda: one._cuts.points(number, one._now())
+        lambda: one._cuts.points(number, one._displacement())
     )
-    area, its = (_area(one._cells, each._r0, points) for each in (one, same))
-    same._cuts._latest[number] = replace(points, weight=points.weight * its / area), normals
+    area, its = (_area_ratio(one._cells, each._r0, points) for each in (one, same))
+    same._cuts._latest_points[number] = replace(points, weight=points.weight * its / area), normals
     return held_at(other, last, "lambda_m")
 
 
@@ -364,7 +368,9 @@ def test_frequencies_of_two_arches() -> None:
 
     def at(change: float, key: str = "", value: float = 0.0) -> float:
         data = imperfect(ARCHES, 0.0 if key else change)
-        made = Scene(on_mesh_of(scene, case(data, {key: value + change} if key else {}).problem()))
+        made = Scene(
+            problem_on_mesh_of(scene, case(data, {key: value + change} if key else {}).problem())
+        )
         return lowest(made, with_same_cuts(scene, last, made))
 
     expected = (at(1e-4, MODULUS, 1.0) - at(-1e-4, MODULUS, 1.0)) / 2e-4

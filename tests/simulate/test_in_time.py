@@ -11,7 +11,7 @@ from command import magshell
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.motion.step import level_in
+from magshell_fenicsx.parts.motion.motion_step import level_in
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.rows import columns, rows
 from magshell_fenicsx.runs.summary import snaps

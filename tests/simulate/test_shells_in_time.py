@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.nonlocal_terms import times
-from magshell_fenicsx.parts.touching.in_steps import Look, looks_of_step, of_each
+from magshell_fenicsx.parts.contact.time_averaging import (
+    StepSample,
+    at_each_sample,
+    samples_of_step,
+)
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
@@ -76,7 +80,7 @@ def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
     within 1e-3, as the tangent leaves out how factors at kinks change with the direction of the way."""
     steps = {"loading": [{"kind": "time", "duration": 1.0, "points": 1}], "symmetry": symmetry}
     scene = Scene(Case.from_source(discs(**shell) | steps | {"mesh": MESHES[symmetry]}))
-    (contact,), h = scene.model.touchings, scene.model.material.h
+    (contact,), h = scene.model.shell_contacts, scene.model.material.h
     r = contact._r0
 
     def clapped(w: float, seed: int) -> Array:
@@ -85,16 +89,16 @@ def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
         return u + 1e-5 * h * np.random.default_rng(seed).standard_normal(u.shape)
 
     def force(end: Array, part: float) -> Array:
-        contact.looks = ()
-        contact.looks = looks_of_step(contact, begin, end, part)
-        return np.sum(of_each(contact, contact._forces), axis=0)[:, : r.shape[1]]
+        contact.samples = ()
+        contact.samples = samples_of_step(contact, begin, end, part)
+        return np.sum(at_each_sample(contact, contact._forces), axis=0)[:, : r.shape[1]]
 
     def energy(u: Array) -> float:
-        contact.looks, contact.look = (), Look(u)
+        contact.samples, contact.sample = (), StepSample(u)
         try:
             return contact.energy()
         finally:
-            contact.look = None
+            contact.sample = None
 
     begin, end = clapped(ends[0], 0), clapped(ends[1], 1)
     energies = energy(begin), energy(end)
@@ -105,11 +109,11 @@ def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
     v = 1e-7 * h * np.random.default_rng(3).standard_normal(r.shape)
     force(end, 0.6)
     i, j, values = map(
-        np.concatenate, zip(*of_each(contact, contact._entries, tangent=True), strict=True)
+        np.concatenate, zip(*at_each_sample(contact, contact._entries, tangent=True), strict=True)
     )
     expected = 0.6 * times([(1.0, (i, j, values))], v.ravel())
     change = (force(end + v / 2, 0.6) - force(end - v / 2, 0.6)).ravel()
-    contact.looks = ()
+    contact.samples = ()
     assert np.abs(change).max() > 0
     assert np.abs(change - expected).max() < 1e-3 * np.abs(change).max()
 
@@ -227,7 +231,7 @@ def test_equal_plates_that_meet_flat_exchange_their_velocities(speed: float, har
     assert np.abs(v[~high] + speed).max() < 1e-6 * speed
     assert end.clock["kinetic"] == pytest.approx(start.clock["kinetic"], rel=1e-6)
     assert abs(end.clock["imbalance"]) < 1e-9 * start.clock["kinetic"]
-    pair = scene.model.touchings[0].pair
+    pair = scene.model.shell_contacts[0].pair
     assert end.point.state.mu.get(pair.setting, pair.stiffness) == harder * pair.stiffness
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import add_array, add_texts, arrays, content_of, read_grid
-from magshell_fenicsx.parts.seen import MapGrid
+from magshell_fenicsx.parts.observables import MapGrid
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid

@@ -12,7 +12,7 @@ from magshell_fenicsx.output.fields.tessellation import tessellate
 from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMNS, columns, drawing
 from magshell_fenicsx.output.pictures.readings import unit_of
 from magshell_fenicsx.output.pictures.scales import number_format
-from magshell_fenicsx.parts.seen import MapGrid
+from magshell_fenicsx.parts.observables import MapGrid
 from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import

@@ -41,7 +41,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.manifest import refuse_unwritten, write_manifest
 from magshell_fenicsx.output.store.stored_results import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
-from magshell_fenicsx.parts.seen import MapGrid
+from magshell_fenicsx.parts.observables import MapGrid
 
 MAX_PANELS = 12  # of solutions.png
 MAPS = "field_maps"  # key of the case with the names of grids

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import DirectionVector, Section, or_number
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.part import Context, KeyAbility
+from magshell_fenicsx.parts.ability import Context, KeyAbility
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.shape.drawn_bodies import Solid
 from magshell_fenicsx.shape.reference_shell import At, Coordinates

@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
 from magshell_fenicsx.parts.contact.projection import (
-    SELF_CONTACT_DISTANCE,
-    LATTICE_RADIUS_FACTOR,
     CELL_RADIUS_FACTOR,
-    PLACE_SHAPES,
+    LATTICE_RADIUS_FACTOR,
     MAX_DIRECTIONS,
+    PLACE_SHAPES,
+    SELF_CONTACT_DISTANCE,
     Cells,
-    SearchLimits,
     Longs,
     Projections,
+    SearchLimits,
     UndeformedPairs,
-    polynomial_bound,
     jets,
     near_spheres,
     nearest_places,
     points_in_cells,
+    polynomial_bound,
 )
 from magshell_fenicsx.parts.contact.segments import ContactPoints
 
@@ -244,8 +244,7 @@ class ClosestPointSearch:
     def least_distance(
         self, u: Array, max_reach: float, points: ContactPoints | None = None
     ) -> float:
-        """Return the least distance of any point at a displacement, at most the reach; collective.
-        """
+        """Return the least distance of any point at a displacement, up to a reach; collective."""
         for reach in (*(part * max_reach for part in FIRST_REACHES), max_reach):
             places = self.projections(u, reach, points, least_only=True)
             own_least = float(places.distance.min(initial=max_reach))
@@ -390,7 +389,9 @@ class ClosestPointSearch:
         least = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
         return places.select(places.distance < least + DISTANCE_TOLERANCE * self._h)
 
-    def are_left_to_edges(self, points: ContactPoints, places: Projections, normals: Array) -> Flags:
+    def are_left_to_edges(
+        self, points: ContactPoints, places: Projections, normals: Array
+    ) -> Flags:
         """Return which places (n,) do not count, since an edge's own points are there.
 
         They are those of points inside a surface that face an edge of another one, steeply. Such
@@ -421,9 +422,10 @@ class ClosestPointSearch:
         is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
         return np.asarray(is_steep & ~is_on_edge)
 
-    def _edge_and_steepness(self, points: ContactPoints, nearest: Projections, normals: Array) -> tuple[Flags, Flags]:
-        """Return which places are on an edge, and which are in a cell that is steep to the point's.
-        """
+    def _edge_and_steepness(
+        self, points: ContactPoints, nearest: Projections, normals: Array
+    ) -> tuple[Flags, Flags]:
+        """Return which places are on an edge, and which are steep to their point's cell."""
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         moves_along_side = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
         is_boundary = self._cells.neighbours[nearest.cell] < 0

@@ -155,7 +155,9 @@ class FaceOffsets:
         """Return derivatives (cells, functions) by the factor of h, of those (nodes,) by the
         volumes.
         """
-        by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[self._place_numbers]
+        by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[
+            self._place_numbers
+        ]
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         return np.asarray(by_place_volume * volume_per_factor * self._areas(self._r0, slice(None)))
 
@@ -165,14 +167,17 @@ class FaceOffsets:
         Only what of these depends on the undeformed place alone counts.
         """
         at_volumes, at_areas = (
-            np.bincount(self._same_place, f, len(f))[self._place_numbers] for f in (by_volume, by_area)
+            np.bincount(self._same_place, f, len(f))[self._place_numbers]
+            for f in (by_volume, by_area)
         )
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         by_J0 = at_volumes * volume_per_factor * self._thickness_factor
         by_J0 += at_areas * ~self._keeps_volume[:, None]
         loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
         forces = np.zeros(self._r0.size)
-        by_place = np.einsum("cq,cqm->cm", by_J0[loaded_cells], self._area_slopes(0 * self._r0, loaded_cells))
+        by_place = np.einsum(
+            "cq,cqm->cm", by_J0[loaded_cells], self._area_slopes(0 * self._r0, loaded_cells)
+        )
         np.add.at(forces, self._unknowns_of_cells(loaded_cells), by_place)
         return forces.reshape(self._r0.shape)
 
@@ -232,7 +237,9 @@ class FaceOffsets:
         to_place_numbers = scipy.sparse.coo_array(
             (np.ones(count), (np.arange(count), self._same_place)), (count, count)
         ).tocsr()
-        nodes_of_thickness = scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
+        nodes_of_thickness = (
+            scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
+        )
         couplings = scipy.sparse.coo_array(
             (np.ones(len(rows)), (rows, columns)), (count, count)
         ).tocsr()
@@ -242,10 +249,14 @@ class FaceOffsets:
     def _half_volumes(self, order: int = 0) -> Array:
         """Return (h/2) sum V at all nodes, or its derivative of an order by the amplitude."""
         powers = np.polynomial.polynomial
-        return np.asarray(powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order)))
+        return np.asarray(
+            powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order))
+        )
 
     def _areas_at_nodes(self, u: Array) -> Array:
-        return self._fixed_area + self._sum_at_nodes(self._thinning_cells, self._areas(self._r0 + u, self._thinning_cells))
+        return self._fixed_area + self._sum_at_nodes(
+            self._thinning_cells, self._areas(self._r0 + u, self._thinning_cells)
+        )
 
     def _sum_at_nodes(self, cells: Any, values: Array) -> Array:
         """Return sums at nodes of values (cells, functions) in some cells."""
@@ -261,7 +272,9 @@ class FaceOffsets:
         """Return derivatives (nodes, 3 nodes) of the areas, with rows of the needed nodes."""
         cells = self._cells_around(is_needed)
         slope, places = self._area_slopes(u, cells), self._place_numbers[cells]
-        rows, columns = np.broadcast_arrays(places[:, :, None], self._unknowns_of_cells(cells)[:, None, :])
+        rows, columns = np.broadcast_arrays(
+            places[:, :, None], self._unknowns_of_cells(cells)[:, None, :]
+        )
         size = len(self._r0), self._components * len(self._r0)
         return scipy.sparse.coo_array(
             (slope.ravel(), (rows.ravel(), columns.ravel())), size
@@ -269,7 +282,9 @@ class FaceOffsets:
 
     def _unknowns_of_cells(self, cells: Longs) -> Longs:
         """Return numbers of the displacement's unknowns in some cells."""
-        return unknown_numbers(self._cells.nodes[cells], len(self._r0), self._components, self._components)
+        return unknown_numbers(
+            self._cells.nodes[cells], len(self._r0), self._components, self._components
+        )
 
     # of surfaces
 
@@ -283,8 +298,7 @@ class FaceOffsets:
         return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
 
     def _area_slopes(self, u: Array, cells: Longs) -> Array:
-        """Return derivatives (cells, places, dofs) of areas by what moves the nodes of their cells.
-        """
+        """Return derivatives (cells, places, dofs) of areas by the unknowns of their cells."""
         return self._area_vectors(u, cells).slope
 
     def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
@@ -301,7 +315,9 @@ class FaceOffsets:
         return np.asarray(H)
 
     def _area_vectors(self, u: Array, cells: Longs) -> _AreaVectors:
-        a1, a2 = np.einsum("dqk,cki->dcqi", self._slope_table, (self._r0 + u)[self._cells.nodes[cells]])
+        a1, a2 = np.einsum(
+            "dqk,cki->dcqi", self._slope_table, (self._r0 + u)[self._cells.nodes[cells]]
+        )
         n = np.cross(a1, a2)
         J = np.linalg.norm(n, axis=-1)
         slopes1, slopes2 = self._slope_table[..., None]

@@ -27,7 +27,10 @@ from magshell_fenicsx.parts.contact.projection import JoinedPlaces, Longs, Proje
 from magshell_fenicsx.parts.contact.segments import ContactPoints
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.meridian_projection import MeridianProjections, MeridianPoints
+    from magshell_fenicsx.parts.contact.meridian_projection import (
+        MeridianPoints,
+        MeridianProjections,
+    )
 
 Array = NDArray[np.float64]
 Penalty = tuple[Array, Array, Array]

@@ -11,8 +11,8 @@ Where the thickness varies d is the least of |x - y| - H(y), less H(x), plus h, 
 thickness H. Then n . y' is -H', C_s has y' less its part along n, and A is
 |y'|^2 - (x - y) . y'' - H'^2 - |x - y| H''. H less h/2 is a third component of places.
 
-Along e_theta the closest place moves as it does along the curve. A wave (U cos, V sin, W cos) of
-m theta moves it by C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves
+Along e_theta the closest place moves as it does along the curve. A wave (U cos, V sin, W cos) of m
+theta moves it by C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves
 it stays. The points are those of a rule on each cell. At a free end one is next to the end, which
 an edge stands on. docs/theory.md, Contact.
 """
@@ -469,9 +469,7 @@ class MeridianContact(ContactTerm):
         soft = SOFT_PENETRATION * self._h
         if self._frozen:
             is_held = self.held is not None
-            return expanded_penalty(
-                penetration, self._frozen[1], k, soft, with_third_order=is_held
-            )
+            return expanded_penalty(penetration, self._frozen[1], k, soft, with_third_order=is_held)
         penalties = penalty(penetration, k, soft)
         return self.sample.weigh(places.point, penalties) if self.sample else penalties
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.free_parameters import SettableNumber
-from magshell_fenicsx.parts.contact.meridian_projection import AXIS_TOLERANCE, MeridianCurves
 from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
+from magshell_fenicsx.parts.contact.meridian_projection import AXIS_TOLERANCE, MeridianCurves
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -85,12 +85,16 @@ class MeridianOffsets(FaceOffsets):
         return np.asarray(rho * np.linalg.norm(tangent, axis=-1))
 
     def _area_rows(self, u: Array, cells: Longs) -> tuple[Array, Array, Array, Array]:
-        """Return rho, |r'|, and the rows a and b (cells, places, functions, 3) by (U, V, W) of nodes.
+        """Return rho, |r'|, and the rows a and b (cells, places, functions, 3) by (U, V, W) of
+        nodes.
         """
         rho, tangent = self._radius_and_tangent(self._r0 + u, cells)
         a, b = np.zeros((2, *rho.shape, rho.shape[1], 3))
         a[..., IN_PLANE] = self._slopes[..., None] * tangent[:, :, None]
-        b[..., 0], b[..., 1] = self._value_table[cells], (self._wave_number or 0.0) * self._value_table[cells]
+        b[..., 0], b[..., 1] = (
+            self._value_table[cells],
+            (self._wave_number or 0.0) * self._value_table[cells],
+        )
         return rho, np.linalg.norm(tangent, axis=-1), a, b
 
     def _by_unknowns(self, rows: Array) -> Array:

@@ -1,8 +1,8 @@
 """The contacts of a model: from its mid-surface on each rank to the cells that contacts search.
 
-In goes the mid-surface as a model has it (`ModelSurface`), out come the terms of all pairs of a case
-(`surface_contacts`). The cells are gathered on all ranks, and those of a half or a sector are copied
-until they make the whole. See `surface_contact` for the energy, and docs/theory.md, Contact.
+In goes the mid-surface as a model has it (`ModelSurface`), out come the terms of all pairs of a
+case (`surface_contacts`). The cells are gathered on all ranks, and those of a half or a sector are
+copied until they make the whole. See `surface_contact` for the energy, and docs/theory.md, Contact.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -157,9 +157,7 @@ class _AllCells:
         cells = Cells(element, gathered.nodes, gathered.gather_values(corners))
         r0 = global_values(surface.r0)
         factors = [gathered.gather_values(each) for each in surface.volume_factors]
-        patches = {
-            name: gathered.gather_values(inside) for name, inside in surface.patches.items()
-        }
+        patches = {name: gathered.gather_values(inside) for name, inside in surface.patches.items()}
         patches[WHOLE_SHELL] = np.ones(len(cells.nodes), dtype=bool)
         keeps_volume = gathered.gather_values(surface.keeps_volume)
         same_place = np.arange(len(r0))
@@ -219,13 +217,8 @@ def _contact_geometry(
     """Return what the contacts of all pairs share."""
     cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
     element, first_cell = surface.space.element.basix_element, gathered.own_range.start
-    displacement: Callable[[], Array] = partial(global_values, surface.u)
     if images:
         own_dofs = 0, r0.size
-
-        def displacement() -> Array:
-            return images.displacements(global_values(surface.u))
-
     growth: SettableNumber | None = surface.natural.stretch if surface.natural else None
     offsets = None
     if surface.thickness is not None or all_cells.keeps_volume.any():
@@ -244,7 +237,7 @@ def _contact_geometry(
     return ContactGeometry(
         cells,
         r0,
-        displacement,
+        _displacement_of(surface, images),
         surface.h,
         segments,
         ContactFields(surface.r0, surface.thickness, gathered.nodes, own),
@@ -253,6 +246,13 @@ def _contact_geometry(
         (first_cell, len(surface.keeps_volume)),
         surface.space.mesh.comm,
     )
+
+
+def _displacement_of(surface: ModelSurface, images: Images | None) -> Callable[[], Array]:
+    """Return what gives the present displacement (nodes, 3) of all cells; it is collective."""
+    if images is None:
+        return partial(global_values, surface.u)
+    return lambda: images.displacements(global_values(surface.u))
 
 
 def _refuse_overlap(contact: SurfaceContact, h: float) -> None:

@@ -9,7 +9,8 @@ those of a rule on each cell; where cells face others, they are on segments, see
 
 With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distance and F = d^2/2:
 
-    d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),   A = F,ab
+    d,u = beta n,   d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),
+    A = F,ab
 
 where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact
 Mechanics, Springer 2006, sec. 4.1 and 9; docs/theory.md, Contact.
@@ -21,7 +22,6 @@ H follows from the displacement (`FaceOffsets`).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
@@ -247,7 +247,9 @@ class SurfaceContact(ContactTerm):
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
         rows, columns, values = (list(parts) for parts in zip(*blocks, strict=True))
         if joined.several.any():
-            for parts, added in zip((rows, columns, values), self._entries_of_joints(), strict=True):
+            for parts, added in zip(
+                (rows, columns, values), self._entries_of_joints(), strict=True
+            ):
                 parts.append(added)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
@@ -377,9 +379,7 @@ class SurfaceContact(ContactTerm):
         own_share = force * (1 - is_edge_alone / 2)
         np.add.at(pressure, points.cell[nearest.point] - first_cell, own_share)
         gap = np.full(count, self._reach - self._h)
-        near = self._search.projections(
-            self._displacement(), self._reach, points, least_only=True
-        )
+        near = self._search.projections(self._displacement(), self._reach, points, least_only=True)
         np.minimum.at(gap, points.cell[near.point] - first_cell, near.distance - self._h)
         pressed_area, pressed_points = np.zeros(count), np.unique(nearest.point)
         pressed_cells = points.cell[pressed_points] - first_cell
@@ -511,7 +511,7 @@ class SurfaceContact(ContactTerm):
 
     def _with_cuts_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Projections]:
         """Return the points with cuts at a displacement, and their places that count there."""
-        points, normals = self._cuts.at(u, divisions)
+        points, normals = self._cuts.points_at(u, divisions)
         places = self._search.projections(u, self._h, points)
         is_left = self._search.are_left_to_edges(points, places, normals)
         return points, places.select(~is_left)

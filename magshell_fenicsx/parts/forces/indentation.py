@@ -12,8 +12,8 @@ from magshell_fenicsx.input.section import Direction, over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.parts.course import Fit, Now, Target, Until
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.step_control import Fit, Now, Target, Until
+from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS

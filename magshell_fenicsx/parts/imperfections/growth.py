@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.course import Target
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.step_control import Target
+from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import LoadStep
-from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.observables import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 

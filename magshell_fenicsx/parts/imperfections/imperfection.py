@@ -18,7 +18,7 @@ from pydantic import (
 from magshell_fenicsx.input.section import Section, Sized, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.parts.part import Context, KeyAbility
+from magshell_fenicsx.parts.ability import Context, KeyAbility
 from magshell_fenicsx.shape.reference_shell import At, Distance, ReferenceShell, locate
 
 Array = NDArray[np.float64]

@@ -19,8 +19,8 @@ from magshell_fenicsx.parts.magnetism.sensors import (
     refuse_unknown_field,
     units,
 )
-from magshell_fenicsx.parts.part import Context, KeyAbility
-from magshell_fenicsx.parts.seen import MapGrid, Seen, Sight
+from magshell_fenicsx.parts.ability import Context, KeyAbility
+from magshell_fenicsx.parts.observables import MapGrid, Seen, Sight
 from magshell_fenicsx.shape.reference_shell import Coordinates
 
 if TYPE_CHECKING:

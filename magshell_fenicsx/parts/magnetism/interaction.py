@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.course import Course, Target
+from magshell_fenicsx.parts.step_control import Course, Target
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import FactorStep
-from magshell_fenicsx.parts.seen import Seen
+from magshell_fenicsx.parts.observables import Seen
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.shell_sections import MeshSurface

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, number_and_unit, with_unit
-from magshell_fenicsx.parts.part import Ability, Context, Offer
+from magshell_fenicsx.parts.ability import Ability, Context, Offer
 
 Value = Callable[[Any], float]  # a time or a level as a plain number
 Curve = Callable[

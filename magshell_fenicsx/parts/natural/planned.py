@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.expressions import FormulaVectors, formula_function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.models.shell.spatial_fields import Inside, Pattern, WithinRims
+from magshell_fenicsx.models.shell.spatial_fields import InsideRim, Pattern, WithinRims
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
@@ -23,7 +23,7 @@ EQUALITY_TOLERANCE = 1e-9  # over the largest value: smaller differences are rou
 MERIDIAN = "meridian"
 
 
-def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natural | None:
+def natural(context: Context, turn: float, within: Mapping[str, InsideRim]) -> Natural | None:
     """Return the natural shape in a frame turned by `turn` about e3 (rad); None without one.
 
     `within` has the rims of patches by name, see `Problem`.

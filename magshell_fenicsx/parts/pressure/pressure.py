@@ -9,10 +9,10 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.course import Course, Fit, GasSection, Here, Now, Target, Until
-from magshell_fenicsx.parts.part import Account, Context, Modelled
+from magshell_fenicsx.parts.step_control import Course, Fit, GasSection, Here, Now, Target, Until
+from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.parts.path_step import PathStep
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolution_sections import CapSurface

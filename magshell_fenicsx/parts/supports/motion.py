@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.parts.course import Now, Target, Until
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.step_control import Now, Target, Until
+from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection

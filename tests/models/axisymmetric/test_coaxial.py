@@ -260,9 +260,12 @@ def test_an_edge_presses_on_a_face(symmetry: str) -> None:
     u = np.zeros((model.system.size // model.V.dofmap.bs, model.V.dofmap.bs))
     of_shells = model.meridian.patches if model.axisymmetric else model.midsurface.patches
     u[np.unique(model.V.dofmap.list[of_shells["tube"]]), -1] = 0.02 * h
-    (contact,), at = model.shell_contacts, model.system.at_state(State(u.ravel(), scene.unloaded().mu))
+    (contact,), at = (
+        model.shell_contacts,
+        model.system.at_state(State(u.ravel(), scene.unloaded().mu)),
+    )
     pressure, force = at.evaluate(contact.cell_pressures_and_gaps)[0], at.evaluate(contact.force)
-    points = contact._rule if model.axisymmetric else contact._points
+    points = contact._points
     area = np.bincount(points.cell, points.weight, len(pressure))
     assert force > 0
     for inside in of_shells.values():
@@ -280,7 +283,10 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
     scene = touching(cap(radius=1.3), 2.3 + (thick + 1e-4) * h, PRESSURE, **shell)
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.shell_contacts
     at = system.at_state(state)
-    faced, (H, nodes) = at.evaluate(contact._active_set), at.evaluate(lambda: contact._second_derivative(m))
+    faced, (H, nodes) = (
+        at.evaluate(contact._active_set),
+        at.evaluate(lambda: contact._second_derivative(m)),
+    )
     r = scene.model.r0.x.array.reshape(-1, 2)
     U, V, W, T = (
         100 * r[:, 0] ** 2 * np.cos(k * r[:, 0] + r[:, 1]) for k in (1, 2, 3, 4)
@@ -290,7 +296,7 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
     Q = np.einsum("na,nab,nb", waves, H[some], waves) / 2
     nodal = np.column_stack([r + state.u.reshape(-1, 2), U, V, W])
     element, cells = scene.model.V.element.basix_element, scene.model.V.dofmap.list
-    rule, k, size, half = contact._rule, contact.stiffness.value, contact._h, contact._half
+    rule, k, size, half = contact._points, contact.stiffness.value, contact._h, contact._half
 
     def moved(row: Any, theta: Any, e: float) -> Any:
         rho, z, u, v, w = row

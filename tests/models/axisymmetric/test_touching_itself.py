@@ -112,7 +112,7 @@ def test_derivatives_of_what_has_grown() -> None:
     """Energy and forces by the natural stretch, of fourth order: 1e-6."""
     load = [{"kind": "natural", "stretch": 1}, PRESSURE]
     scene = two(cap(**RUBBER), cap(**RUBBER), 2 + h, natural={"stretch": 1.1}, loading=load)
-    system, (term,), step = scene.model.system, scene.model.touchings, 1e-6
+    system, (term,), step = scene.model.system, scene.model.shell_contacts, 1e-6
     slope, u = (
         system.parameters["natural_stretch"].slopes[-1],
         system.zero_at_supports(stretched(scene, 0.4 * h).ravel()),
@@ -151,7 +151,7 @@ def test_a_pair_of_all_shells_is_that_of_two() -> None:
     assert all_of.model.axisymmetric
     seen = list[tuple[float, Array]]()
     for scene in (one, all_of):
-        system, (term,) = scene.model.system, scene.model.touchings
+        system, (term,) = scene.model.system, scene.model.shell_contacts
         u, mu = system.zero_at_supports(stretched(scene, 0.4 * h).ravel()), scene.unloaded().mu
         seen.append((system.energies(u, mu)[term.name], system.forces(u, mu, term.name)))
     assert seen[0][0] > 0
@@ -165,10 +165,10 @@ def test_thickness_along_a_wave(m: int) -> None:
     by its mean.
     """
     scene = two(cap(**RUBBER), cap(**RUBBER), 2 + h)
-    (term,), r = scene.model.touchings, scene.model.r0.x.array.reshape(-1, 2)
-    faces, u, nodes = term._rings, stretched(scene, 0.1 * h), term._nodes
+    (term,), r = scene.model.shell_contacts, scene.model.r0.x.array.reshape(-1, 2)
+    faces, u, nodes = term._offsets, stretched(scene, 0.1 * h), term._nodes
     U, V, W = (r[:, 0] ** (m + 1) * np.cos(k + 3 * r[:, 0] + r[:, 1]) for k in (1, 2, 3))
-    wave, along, count = np.column_stack([U, V, W]), term._curves.at_nodes, 4 * m
+    wave, along, count = np.column_stack([U, V, W]), term._curves.slopes_at_nodes, 4 * m
     nodal = np.column_stack([r + u, wave])[nodes]
     values, slopes = nodal, np.einsum("qk,cki->cqi", along, nodal)
 
@@ -187,7 +187,7 @@ def test_thickness_along_a_wave(m: int) -> None:
         return np.asarray(area)
 
     off, e = r[:, 0] > 1e-9, 1e-3
-    volume = faces.half(u) * half(0.0, 0.0)
+    volume = faces.half_thickness(u) * half(0.0, 0.0)
     angles = 2 * np.pi * (np.arange(count) + 0.3) / count
     ahead, here, back = (
         np.array([volume[off] / half(t, way * e)[off] for t in angles]) for way in (1, 0, -1)

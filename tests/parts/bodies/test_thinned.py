@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.bodies.body_contact import Contact
 from magshell_fenicsx.parts.bodies.plane import Plane
 from magshell_fenicsx.parts.bodies.sphere import Sphere
 from magshell_fenicsx.parts.loads import Loads

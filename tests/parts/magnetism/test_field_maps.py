@@ -30,7 +30,7 @@ from magshell_fenicsx.output.pictures.field_maps import (
 )
 from magshell_fenicsx.output.pictures.plot import PicturedRun, plot
 from magshell_fenicsx.parts.registered import SEEN
-from magshell_fenicsx.parts.seen import MapGrid
+from magshell_fenicsx.parts.observables import MapGrid
 
 MM = 1e-3
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa",

@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSect
 from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, PlacedSource
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 HALFWAY = 0.371  # of a motion: no symmetric place

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx.parts.touching.segments import INSIDE, Triangles
+from magshell_fenicsx.parts.contact.segments import NOT_ON_EDGE, Triangles
 
 
 def test_quarters_of_triangles_cover_them() -> None:
@@ -11,9 +11,9 @@ def test_quarters_of_triangles_cover_them() -> None:
     the edge turns.
     """
     first, e1, e2 = np.random.default_rng(3).random((3, 5, 2))
-    ends = np.array([INSIDE, 1, 2, 3, INSIDE])
+    ends = np.array([NOT_ON_EDGE, 1, 2, 3, NOT_ON_EDGE])
     whole = Triangles(np.arange(5), 7 + np.arange(5), first, e1, e2, ends)
-    quarters = whole.divided()
+    quarters = whole.divide()
     middles = quarters.first + (quarters.e1 + quarters.e2) / 3
     for cell in range(5):
         of_cell = quarters.cell == cell
@@ -23,5 +23,5 @@ def test_quarters_of_triangles_cover_them() -> None:
             first[cell] + (e1[cell] + e2[cell]) / 3
         )
         end = ends[cell]
-        at_ends = [INSIDE, INSIDE] if end == INSIDE else [end & 1, end & 2]
-        assert sorted(quarters.ends[of_cell]) == sorted([INSIDE, INSIDE, *at_ends])
+        at_ends = [NOT_ON_EDGE, NOT_ON_EDGE] if end == NOT_ON_EDGE else [end & 1, end & 2]
+        assert sorted(quarters.ends[of_cell]) == sorted([NOT_ON_EDGE, NOT_ON_EDGE, *at_ends])

@@ -14,10 +14,10 @@ from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
-from magshell_fenicsx.parts.course import Fit, Now, Target, Until
-from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
+from magshell_fenicsx.parts.step_control import Fit, Now, Target, Until
+from magshell_fenicsx.parts.ability import Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
@@ -47,7 +47,7 @@ Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
 Three = Field(min_length=3, max_length=3)
 Force = Annotated[list[Moment], Three]
-LARGEST = 1e30
+MAX_COMPONENT = 1e30
 
 
 def _or_formula(unit: str) -> Any:
@@ -60,10 +60,10 @@ def _or_formula(unit: str) -> Any:
         if (
             isinstance(number, bool)
             or not isinstance(number, int | float)
-            or not abs(number) <= LARGEST
+            or not abs(number) <= MAX_COMPONENT
         ):
             raise ValueError(
-                f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas"
+                f"{value!r}: allowed are numbers up to {MAX_COMPONENT:g} in size, with a unit, and formulas"
             )
         return number
 
@@ -281,8 +281,8 @@ class DeadSection(PathStep):
         return size if size < 0.35 else None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
-        from magshell_fenicsx.models.shell.patterns import (
-            LARGEST,
+        from magshell_fenicsx.models.shell.spatial_fields import (
+            MAX_COMPONENT,
         )  # the solver takes long to import
 
         scales = context.scales
@@ -290,10 +290,10 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
-                most = LARGEST * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
+                most = MAX_COMPONENT * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
             if load.potential:  # of the deformed place: the undeformed one is looked at
-                most = LARGEST * scales.E * scales.h
+                most = MAX_COMPONENT * scales.E * scales.h
                 yield Formulas(
                     f"{key}.loads.{i}.potential",
                     [load.potential],
@@ -304,7 +304,7 @@ class DeadSection(PathStep):
                 )
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.forces.dead_load import (
+        from magshell_fenicsx.parts.forces.load_vectors import (
             dead_load,
         )  # the solver takes long to import
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Name, over_size
-from magshell_fenicsx.parts.course import Control, Course, Here, Now, Target, Until
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.step_control import Control, Course, Here, Now, Target, Until
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.seen import Seen, Sight
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 

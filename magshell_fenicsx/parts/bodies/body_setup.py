@@ -13,11 +13,11 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
-from magshell_fenicsx.parts.bodies.contact import Contact
-from magshell_fenicsx.parts.bodies.press import ContactSection
-from magshell_fenicsx.parts.course import Fit
+from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.bodies.contact_step import ContactSection
+from magshell_fenicsx.parts.step_control import Fit
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.reference_shell import ReferenceShell, locate

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.parts.course import Ahead, Errors
+from magshell_fenicsx.parts.step_control import Ahead, Errors
 from magshell_fenicsx.parts.motion.history import (
     History,
     Level,
@@ -17,7 +17,7 @@ from magshell_fenicsx.parts.motion.history import (
     measured,
     times_of,
 )
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
 from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding

@@ -6,7 +6,7 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.touching.nearest import Cells, highest, places_near
+from magshell_fenicsx.parts.contact.projection import Cells, nearest_places, polynomial_bound
 
 COUNT = 60
 ELEMENT = basix.create_element(
@@ -30,7 +30,9 @@ def test_nearest_in_cells(parts: int) -> None:
     cells = Cells(
         ELEMENT, np.arange(COUNT * k).reshape(COUNT, k), np.zeros((COUNT, 3), dtype=np.int64)
     )
-    pair, at = places_near(cells, r, x, (each, each, np.ones(COUNT, dtype=np.int64), each), np.inf)
+    pair, at = nearest_places(
+        cells, r, x, (each, each, np.ones(COUNT, dtype=np.int64), each), np.inf
+    )
     assert list(pair) == list(each)
     kinds = at.free.any(axis=1).sum(axis=1)
     assert min(np.bincount(kinds)) >= 3  # in corners, on sides, inside
@@ -58,7 +60,7 @@ def test_a_bound_of_polynomials() -> None:
     X = np.random.default_rng(1).dirichlet(np.ones(3), 20000)[:, :2]
     values = np.random.default_rng(2).normal(size=(COUNT, len(ELEMENT.points)))
     largest = (values @ ELEMENT.tabulate(0, X)[0, :, :, 0].T).max(axis=1)
-    bounds = [highest(each[None], cells.lebesgue) for each in values]
+    bounds = [polynomial_bound(each[None], cells.lebesgue_constant) for each in values]
     assert (bounds >= largest).all()
     assert (largest > values.max(axis=1) + 0.1).any()
-    assert highest(np.full((2, 10), 0.7), cells.lebesgue) == pytest.approx(0.7)
+    assert polynomial_bound(np.full((2, 10), 0.7), cells.lebesgue_constant) == pytest.approx(0.7)

@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
+from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import (
@@ -22,9 +22,9 @@ from magshell_fenicsx.models.shell.parameters import (
     Force,
     PointForce,
 )
-from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
+from magshell_fenicsx.models.shell.spatial_fields import ADDED_LOAD_DEGREE, pattern_field
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.dead_load import within
+from magshell_fenicsx.parts.forces.load_vectors import within
 from magshell_fenicsx.parts.loads import forces
 
 Integral = Callable[[Expr], ufl.Form]
@@ -32,10 +32,10 @@ Integral = Callable[[Expr], ufl.Form]
 
 @dataclass(frozen=True)
 class Around:
-    """Integrals over parts of a surface of revolution, per radian as those of its carrier."""
+    """Integrals over parts of a surface of revolution, per radian as those of its domain."""
 
     meridian: Meridian
-    carrier: Carrier
+    domain: IntegrationDomain
     parts: Sequence[Facets] = ()
     measures: Sequence[ufl.Measure] = ()
 
@@ -52,18 +52,18 @@ class Around:
             )
             if not any(np.array_equal(of, part) for part in parts):
                 parts.append(of)
-        return replace(self, parts=parts, measures=self.carrier.each_ds(parts) if parts else [])
+        return replace(self, parts=parts, measures=self.domain.measures_on(parts) if parts else [])
 
     def _ds(self, facets: Facets) -> ufl.Measure:
         each = zip(self.parts, self.measures, strict=True)
         return next(
             (ds for part, ds in each if np.array_equal(part, facets)), None
-        ) or self.carrier.ds(facets)
+        ) or self.domain.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
         """Along the undeformed circle of an end, or the mean over that."""
         ds = self._ds(self.meridian.ends[name])
-        return lambda f: f / (2 * np.pi) * ds if mean else f * self.carrier.r0[0] * ds
+        return lambda f: f / (2 * np.pi) * ds if mean else f * self.domain.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
         """The value at a point on the axis, over 2 pi."""
@@ -72,18 +72,18 @@ class Around:
 
     def area(self, load: AreaForce) -> Integral:
         """Over the undeformed area, or that of one of several shells."""
-        over = self.carrier.over_area()
+        over = self.domain.over_area()
         if load.patch is None:
             return over
-        marked = within(self.carrier.mesh, patch_of(self.meridian.patches, load.patch))
+        marked = within(self.domain.mesh, patch_of(self.meridian.patches, load.patch))
         return lambda f: over(marked * f)
 
     def patch(self, radius: float, point: str) -> Integral:
         """Of f (1 - d^2/radius^2)^2, d the distance in space from a point on the axis."""
         at = np.array([self.meridian.points[point][0]])
-        a, pole = self.carrier.constant(radius), self.carrier.constant(self.meridian.section(at)[0])
-        inside = 1 - ufl.dot(self.carrier.r0 - pole, self.carrier.r0 - pole) / a**2
-        weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.carrier.over_area()
+        a, pole = self.domain.constant(radius), self.domain.constant(self.meridian.section(at)[0])
+        inside = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
+        weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.domain.over_area()
         return lambda f: over(weight * f)
 
 
@@ -109,7 +109,7 @@ def dead_loads(
         else:
             over = on.area(load)
         if not isinstance(load, PointForce) and callable(load.force):
-            along, whole = pattern_field(load.force, on.carrier.r0, FINER)
+            along, whole = pattern_field(load.force, on.domain.r0, ADDED_LOAD_DEGREE)
             parts.append((along, over))
             fitted = whole is not None and isinstance(load, AreaForce) and load.patch is None
             per = ufl.sqrt(ufl.dot(along, along))
@@ -119,15 +119,15 @@ def dead_loads(
         whole = _whole(over, on, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
             along, strength = (
-                -kin.normal(on.carrier.j0) * on.carrier.constant(load.force),
+                -kin.normal(on.domain.j0) * on.domain.constant(load.force),
                 abs(load.force),
             )
         else:
             vector = np.asarray(load.force)
-            along, strength = on.carrier.constant(vector), float(np.linalg.norm(vector))
+            along, strength = on.domain.constant(vector), float(np.linalg.norm(vector))
         parts.append((along, over))
         size += strength * whole
-        sizes.append(2 * np.pi * over(on.carrier.constant(strength)))
+        sizes.append(2 * np.pi * over(on.domain.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
         return sum(
@@ -146,13 +146,13 @@ def pole_force(name: str, force: Force, unit: float, on: Around, log: KernelLog)
     begins = np.isclose(
         on.meridian.cells[:, 0], on.meridian.points[force.point][0]
     ).any()  # the normal is e3 there
-    share = on.carrier.constant((1.0 if begins else -1.0) * unit / _whole(over, on, log))
+    share = on.domain.constant((1.0 if begins else -1.0) * unit / _whole(over, on, log))
     return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
 
 
 def _whole(over: Integral, on: Around, log: KernelLog) -> float:
     """The integral of 1, all around."""
-    return _integral(on.carrier.constant(1.0), over, log)
+    return _integral(on.domain.constant(1.0), over, log)
 
 
 def _integral(f: Expr, over: Integral, log: KernelLog) -> float:

@@ -1,24 +1,25 @@
-"""What is seen of shells that touch: the force, the least gap and the penalty's stiffness."""
+"""Observables of shells that touch: the force, the least gap and the penalty's stiffness."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.touching.section import WHOLE
+from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
+from magshell_fenicsx.parts.observables import Seen, Sight
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
+    from magshell_fenicsx.parts.contact.contact_section import Pair
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.parts.touching.section import Pair
 
 
-class TouchingSeen(Seen):
-    """Of each pair."""
+class ContactObservables(Seen):
+    """The columns of each pair that may touch."""
 
     quantities = (
         Quantity(
@@ -54,33 +55,34 @@ class TouchingSeen(Seen):
         return tuple(pair.setting for pair in loads.pairs)
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        """See that the surface has the parts of all pairs, and that no place is in two pairs.
+        """See that the surface has the patches of all pairs, and that no place is in two pairs.
 
         Raises
         ------
         MeshError
             With the name or the pairs.
         """
-        inside = {**surface.patches, WHOLE: np.ones(len(surface.cells), dtype=bool)}
+        patches = {**surface.patches, WHOLE_SHELL: np.ones(len(surface.cells), dtype=bool)}
         for number, pair in enumerate(loads.pairs):
             for name in pair.names:
-                if name not in inside:
-                    there = ", ".join(sorted(inside))
-                    raise MeshError(f"contact: {name}: the surface has no such part, only {there}")
-            for before in loads.pairs[:number]:
-                for one, other in (pair.names, pair.names[::-1]):
-                    both = zip((one, other), before.names, strict=True)
-                    if all((inside[name] & inside[inner]).any() for name, inner in both):
-                        raise MeshError(
-                            f"contact: {pair.words}: shares cells with {before.words}: no place is in two pairs"
-                        )
+                if name not in patches:
+                    allowed = ", ".join(sorted(patches))
+                    raise MeshError(
+                        f"contact: {name}: the surface has no such part, only {allowed}"
+                    )
+            for earlier in loads.pairs[:number]:
+                if _share_cells(pair, earlier, patches):
+                    raise MeshError(
+                        f"contact: {pair.words}: shares cells with {earlier.words}: no place is in "
+                        "two pairs"
+                    )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return tuple(column for pair in loads.pairs for column in _columns(pair))
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         model, values = sight.model, dict[str, float]()
-        for each in model.touchings:
+        for each in model.shell_contacts:
             at = model.system.at_state(state)
             force, gap = at.evaluate(each.force), at.evaluate(each.least_gap)
             numbers = force / model.force_unit, gap / sight.h, each.stiffness.value
@@ -88,5 +90,15 @@ class TouchingSeen(Seen):
         return values
 
 
+def _share_cells(pair: "Pair", other: "Pair", patches: Mapping[str, NDArray[np.bool_]]) -> bool:
+    """Return whether both members of a pair have cells in those of another, in either order."""
+    first, second = (patches[name] for name in other.names)
+    one, two = (patches[name] for name in pair.names)
+    straight = (one & first).any() and (two & second).any()
+    crossed = (two & first).any() and (one & second).any()
+    return bool(straight or crossed)
+
+
 def _columns(pair: "Pair") -> Iterator[str]:
-    return (q.name + pair.suffix for q in TouchingSeen.quantities)
+    """Return the names of the columns of a pair."""
+    return (q.name + pair.suffix for q in ContactObservables.quantities)

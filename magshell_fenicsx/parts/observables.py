@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State, Vector
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.shells.observed import Observed
+    from magshell_fenicsx.shells.model_base import ModelBase
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Sight:
         Sign of the case's field.
     """
 
-    model: "Observed"
+    model: "ModelBase"
     length: float
     modulus: float
     mirror: Mirror | None

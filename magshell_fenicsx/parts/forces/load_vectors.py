@@ -29,11 +29,11 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
     Potential,
 )
-from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field, pattern_on_edge
+from magshell_fenicsx.models.shell.spatial_fields import ADDED_LOAD_DEGREE, Pattern, pattern_field, pattern_on_edge
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
+from magshell_fenicsx.parts.forces.dead_load_step import DeadLoadSection, potential
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.part import Account, Context, Modelled
+from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.platform import compat
 
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
@@ -412,8 +412,8 @@ class SurfaceMeasures:
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
         if edge is None:
-            return pattern_field(pattern, self._r0, FINER)
-        return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], FINER)
+            return pattern_field(pattern, self._r0, ADDED_LOAD_DEGREE)
+        return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], ADDED_LOAD_DEGREE)
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         surface = self._midsurface

@@ -24,7 +24,14 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
-from magshell_fenicsx.parts.gap import SOFT, Thinning, expanded, mean_pressure, penalty, thinned
+from magshell_fenicsx.parts.gap import (
+    SOFT_PENETRATION,
+    ThicknessRatio,
+    expanded_penalty,
+    mean_pressure,
+    penalty,
+    thickness_ratio,
+)
 
 Array = NDArray[np.float64]
 PAIRS = np.triu_indices(3)
@@ -117,7 +124,7 @@ def thinned_energy(
     """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies,
     multiplies.
     """
-    s, t = _moved(u, P, motion, approach), thinned(r0, u, natural, thins)
+    s, t = _moved(u, P, motion, approach), thickness_ratio(r0, u, natural, thins)
     return _polynomial(P, s) + _of_face(F, factor[0][0] * t if factor else t, s)
 
 
@@ -224,7 +231,7 @@ class Pressing:
     thickness
         What multiplies h; None for 1.
     thinning
-        How thick the deformed shell is over that, see `thinning`; None for 1.
+        How thick the deformed shell is over that, see `thickness_ratio_at_points`; None for 1.
 
     Attributes
     ----------
@@ -245,7 +252,7 @@ class Pressing:
         approach: fem.Constant,
         degree: int,
         thickness: fem.Function | None = None,
-        thinning: Thinning | None = None,
+        thinning: ThicknessRatio | None = None,
     ) -> None:
         V = u.function_space
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
@@ -324,7 +331,7 @@ class Pressing:
         about = self._about[0] if self._about else gap
         pressed = about < 0
         k = float(self.stiffness.value)
-        of_depth = expanded(-gap[pressed], -about[pressed], k, SOFT * self._h)
+        of_depth = expanded_penalty(-gap[pressed], -about[pressed], k, SOFT_PENETRATION * self._h)
         value, first, second = (a[:, None] for a in of_depth)
         return _Expanded(pressed, value, first, second, n[pressed], N[pressed])
 
@@ -395,7 +402,7 @@ class Pressing:
         part
             Of the step at which the system has its forces.
         """
-        k, soft, half = float(self.stiffness.value), SOFT * self._h, self._h / 2
+        k, soft, half = float(self.stiffness.value), SOFT_PENETRATION * self._h, self._h / 2
         middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
         gaps, n, N = zip(*(self._gap_at(*where) for where in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
@@ -452,7 +459,7 @@ class Pressing:
             (self._r0.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
         )
         pressure, d = (
-            penalty(-gap, float(self.stiffness.value), SOFT * self._h)[1],
+            penalty(-gap, float(self.stiffness.value), SOFT_PENETRATION * self._h)[1],
             self.contact.direction,
         )
         most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)

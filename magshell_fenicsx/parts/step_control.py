@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self, TypeAlia
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.input.section import Pressure, Section, over_size
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.quantities.quantity import VOLUME
 
 if TYPE_CHECKING:

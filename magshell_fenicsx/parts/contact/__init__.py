@@ -1,0 +1,1 @@
+"""Contact of shells with each other and with themselves."""

@@ -1,0 +1,461 @@
+"""Closest-point projection of points on meridians onto other meridians.
+
+Places have rho, z, and half the thickness less h/2, with the other sign for points: see
+`projection` and `meridian_contact`. docs/theory.md, Contact.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.parts.contact.closest_points import FOLD_SHRINKAGE, SAME_DIRECTION_COSINE
+from magshell_fenicsx.parts.contact.projection import (
+    CELL_RADIUS_FACTOR,
+    LEBESGUE_FACTOR,
+    SELF_CONTACT_DISTANCE,
+    near_along_surface,
+)
+from magshell_fenicsx.parts.contact.quadrature_rules import EDGE_OFFSET, line_rule
+
+Array = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+MAX_NEWTON_ITERATIONS = 30  # of a projection
+STEP_TOLERANCE = 1e-10  # a place is exact after a smaller step, in the reference cell
+MIN_CURVATURE_RATIO = 1e-3  # over the squared speed, which a step takes below that
+STARTS_PER_DEGREE = 4  # parts of a cell, from whose ends Newton's method may begin
+DISTANCE_TOLERANCE = 1e-9  # thicknesses by which distances of two cells differ at one place
+AXIS_TOLERANCE = 1e-9  # rho over R of a node on the axis
+COMPONENT_SIGNS = np.array([1.0, 1.0, -1.0])  # of the squares of components in A
+ABOVE_SINE = 0.5  # of the angle between a curve and the direction to a point that is above it
+
+
+@dataclass(frozen=True)
+class MeridianPoints:
+    """The quadrature points on the cells of two shells.
+
+    Attributes
+    ----------
+    cell, shape, weight
+        (n,) number, (n, functions) shape functions of that cell, and undeformed area over R^2, all
+        around.
+    is_first
+        (n,) whether it is on the first shell.
+    normal
+        (n, 2) undeformed.
+    is_on_edge
+        (n,) whether it is next to a free end.
+    """
+
+    cell: Longs
+    shape: Array
+    weight: Array
+    is_first: Flags
+    normal: Array
+    is_on_edge: Flags
+
+
+@dataclass(frozen=True)
+class MeridianProjections:
+    """Points and the places of a meridian that are nearest to them.
+
+    Attributes
+    ----------
+    point, cell, X
+        (n,) number of the point, cell of the place, and where it is in that.
+    free
+        (n,) whether it may move along the curve.
+    distance
+        (n,) over R.
+    """
+
+    point: Longs
+    cell: Longs
+    X: Array
+    free: Flags
+    distance: Array
+
+    def select(self, selection: Flags | Longs) -> "MeridianProjections":
+        """Return the selected places: numbers or flags."""
+        return MeridianProjections(*(getattr(self, each.name)[selection] for each in fields(self)))
+
+
+def neighbours_of(nodes: Longs) -> Longs:
+    """Return the cell beyond each end (cells, 2); -1 where there is none.
+
+    Parameters
+    ----------
+    nodes
+        (cells, functions) the ends first.
+    """
+    neighbours = np.full((len(nodes), 2), -1, dtype=np.int64)
+    end_at_vertex = dict[int, tuple[int, int]]()
+    for cell, end in np.ndindex(len(nodes), 2):
+        vertex = int(nodes[cell, end])
+        other = end_at_vertex.get(vertex)
+        if other:
+            neighbours[cell, end], neighbours[other] = other[0], cell
+        end_at_vertex[vertex] = cell, end
+    return neighbours
+
+
+class NeighbouringMaterial:
+    """The material around a point, which it does not touch; see `projection`.
+
+    Parameters
+    ----------
+    points, cells
+        Undeformed places of the points (n, 3) and of the nodes of all cells (cells, functions, 3),
+        the last component half the thickness, of points with the other sign.
+    nodes
+        (cells, functions) of all cells, the ends first.
+    cells_of_points
+        (n,).
+    """
+
+    def __init__(self, points: Array, cells: Array, nodes: Longs, cells_of_points: Longs) -> None:
+        self._points, self._cells, self.cells_of_points = points, cells, cells_of_points
+        count = len(nodes)
+        r0 = np.zeros((int(nodes.max()) + 1, 3))
+        r0[nodes] = cells
+        near: Flags = np.zeros(count * count, dtype=bool)
+        reach = 2 * SELF_CONTACT_DISTANCE * r0[:, 2]
+        near[near_along_surface(nodes[:, :2], r0[:, :2], reach)] = True
+        self._near = near.reshape(count, count)
+
+    def are_near(self, cell: Longs, other: Longs) -> Flags:
+        """Return whether the way from cells (n,) to others, -1 for none, is short on the curve."""
+        return np.asarray(self._near[cell, other] & (other >= 0))
+
+    def may_touch(self, cell: Longs, other: Longs, nodal: Array) -> Flags:
+        """Return whether cells (n,) may touch others: near on the curve where one is folded.
+
+        Parameters
+        ----------
+        nodal
+            (cells, functions, 2) deformed places of nodes.
+        """
+        may_touch = ~self._near[cell, other]
+        near = np.flatnonzero(~may_touch & (cell != other))
+        i, j = cell[near], other[near]
+        deformed, undeformed = (
+            np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3)
+            for r in (nodal, self._cells[..., :2])
+        )
+        may_touch[near] = (deformed < FOLD_SHRINKAGE * undeformed).any(axis=(1, 2))
+        return may_touch
+
+    def are_distinct(self, places: MeridianProjections, shape: Array, is_above: Flags) -> Flags:
+        """Return which places count: those that are not the material around their point.
+
+        They are far along the curve, or else far undeformed and above or below their points.
+
+        Parameters
+        ----------
+        shape
+            (n, functions) at the places.
+        """
+        near = self.are_near(self.cells_of_points[places.point], places.cell)
+        undeformed = np.einsum("nk,nki->ni", shape, self._cells[places.cell])
+        off = self._points[places.point] - undeformed
+        distance = np.linalg.norm(off[:, :2], axis=1)
+        is_far = distance > SELF_CONTACT_DISTANCE * np.abs(off[:, 2])
+        return np.asarray(~near | (is_above & is_far))
+
+
+class CandidateSearch:
+    """The search for cells of the other shell that points may be near to.
+
+    First by circles about cells, then by their chords.
+
+    Parameters
+    ----------
+    nodes
+        (cells, functions) of all cells, the ends first.
+    sides
+        Whether each cell belongs to the first shell, and to the second.
+    element
+        Of basix.
+    material
+        Of a shell that may touch itself; both sides are then the same.
+    """
+
+    def __init__(
+        self,
+        points: MeridianPoints,
+        nodes: Longs,
+        sides: tuple[Flags, Flags],
+        element: Any,
+        material: NeighbouringMaterial | None,
+    ) -> None:
+        self._first_cells, self._second_cells = (np.flatnonzero(side) for side in sides)
+        self._material = material
+        self._counts = np.bincount(points.cell, minlength=len(nodes))
+        self._starts = np.zeros_like(self._counts)  # points of a cell follow each other
+        self._starts[points.cell[::-1]] = np.arange(len(points.cell))[::-1]
+        X = np.linspace(0.0, 1.0, 20 * element.degree + 1, dtype=np.float64)[:, None]
+        inner = np.abs(element.tabulate(0, X)[0, :, 2:, 0])
+        # the bulge of a curve, over that of its nodes
+        self._bulge = CELL_RADIUS_FACTOR * float(inner.sum(axis=1).max(initial=0.0))
+        self._inner_nodes = element.points[2:, :1]
+
+    def __call__(self, x: Array, nodal: Array, reach: float) -> tuple[Longs, Longs]:
+        """Return points and cells, among them all pairs of less than this distance.
+
+        Parameters
+        ----------
+        x, nodal
+            Places of all points (n, 2), and of the nodes of all cells (cells, functions, 2).
+        """
+        point, cell = self._in_circles(nodal, reach)
+        a, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
+        off = nodal[:, 2:] - a[:, None] - self._inner_nodes * chord[:, None]
+        bulge = self._bulge * np.linalg.norm(off, axis=2).max(axis=1, initial=0.0)
+        way, chords = x[point] - a[cell], chord[cell]
+        squares = np.sum(chord * chord, axis=1)
+        part = np.clip(np.sum(way * chords, axis=1) / squares[cell], 0.0, 1.0)
+        distance = np.linalg.norm(way - part[:, None] * chords, axis=1)
+        is_near = distance - bulge[cell] < reach
+        return point[is_near], cell[is_near]
+
+    def _in_circles(self, nodal: Array, reach: float) -> tuple[Longs, Longs]:
+        """Return points and cells whose circles are near each other."""
+        first, second, centres = self._first_cells, self._second_cells, nodal.mean(axis=1)
+        squares = np.sum((nodal - centres[:, None]) ** 2, axis=2)
+        radii = CELL_RADIUS_FACTOR * np.sqrt(squares.max(axis=1))
+        way = centres[first][:, None] - centres[second]
+        limit = (radii[first][:, None] + radii[second] + reach) ** 2
+        i, j = np.nonzero(np.sum(way * way, axis=2) < limit)
+        own, cell = first[i], second[j]
+        if self._material:
+            may_touch = self._material.may_touch(own, cell, nodal)
+            own, cell = own[may_touch], cell[may_touch]
+        else:
+            own, cell = np.concatenate([own, cell]), np.concatenate([cell, own])
+        count = self._counts[own]
+        start = np.repeat(self._starts[own] - np.cumsum(count) + count, count)
+        return start + np.arange(len(start)), np.repeat(cell, count)
+
+
+def no_projections() -> MeridianProjections:
+    """Return no places."""
+    no_numbers = np.zeros(0, dtype=np.int64)
+    return MeridianProjections(
+        no_numbers, no_numbers, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0)
+    )
+
+
+def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
+    """Return how places are drawn to points x (n, 3) along their curves, times the distance.
+
+    Parameters
+    ----------
+    jets
+        (3, n, 3) the places and their derivatives along the curve.
+
+    Returns
+    -------
+    pull
+        (n,) minus the derivative of the distance along the curve.
+    curvature
+        (n,) A, the second derivative of the distance along the curve.
+    speed
+        (n,) A of a straight line.
+    """
+    y, first, second = jets
+    way = (x - y)[:, :2]
+    off = np.column_stack([way, np.linalg.norm(way, axis=1)])
+    speed = np.sum(first * first * COMPONENT_SIGNS, axis=1)
+    return np.sum(off * first, axis=1), speed - np.sum(off * second, axis=1), speed
+
+
+def distances(off: Array) -> Array:
+    """Return the distances (...,) of the differences (..., 3) between points and places."""
+    return np.asarray(np.linalg.norm(off[..., :2], axis=-1) + off[..., 2])
+
+
+class MeridianCurves:
+    """The meridians of all shells.
+
+    Parameters
+    ----------
+    element
+        Of basix, with its nodes.
+    nodes
+        (cells, functions), the ends first.
+    r0
+        (nodes, 2) undeformed.
+    h
+        Thickness over R.
+
+    Attributes
+    ----------
+    neighbours
+        (cells, 2): the cell beyond each end; -1 where there is none.
+    lebesgue_constant
+        A bound of the element's, see `projection.polynomial_bound`.
+    slopes_at_nodes
+        (places, functions): derivatives of shape functions at the nodes.
+    """
+
+    def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
+        self.element, self.nodes, self._r0, self._h = element, nodes, r0, h
+        self.neighbours = neighbours_of(nodes)
+        starts = STARTS_PER_DEGREE * element.degree
+        self._starts = np.linspace(0.0, 1.0, starts + 1, dtype=np.float64)
+        self.slopes_at_nodes = self.table(1, element.points.ravel())[1]
+        sums = np.abs(self.table(0, self._starts)[0]).sum(axis=1)
+        self.lebesgue_constant = LEBESGUE_FACTOR * float(sums.max())
+
+    def table(self, order: int, X: Array) -> Array:
+        """Return shape functions and derivatives (order + 1, n, functions) at X (n,)."""
+        if not len(X):  # which basix does not take
+            return np.zeros((order + 1, 0, self.nodes.shape[1]))
+        return np.asarray(self.element.tabulate(order, X[:, None])[..., 0])
+
+    def jets(self, X: Array, nodal: Array) -> Array:
+        """Return places and two derivatives (3, n, 3) of curves through nodes (n, functions, 3)."""
+        return np.asarray(np.einsum("dnk,nki->dni", self.table(2, X), nodal))
+
+    def rule(self, count: int, sides: tuple[Flags, Flags]) -> MeridianPoints:
+        """Return the points of Gauss's rule in each cell; with a free end this is among them.
+
+        Parameters
+        ----------
+        count
+            Number of points in a cell.
+        sides
+            Whether each cell belongs to the first shell, and to the second.
+        """
+        off_axis = np.abs(self._r0[self.nodes[:, :2], 0]) > AXIS_TOLERANCE
+        is_free_end = (self.neighbours < 0) & off_axis
+        parts = list[tuple[Longs, Array, Array, Flags, Array, Flags]]()
+        for begins, ends in ((False, False), (True, False), (False, True), (True, True)):
+            has_ends = (is_free_end == [begins, ends]).all(axis=1)
+            cells = np.flatnonzero(np.any(sides, axis=0) & has_ends)
+            X, w = line_rule(count, begins, ends)
+            table = self.table(1, X)
+            x, tangent = np.einsum("dqk,cki->dcqi", table, self._r0[self.nodes[cells]])
+            speed = np.linalg.norm(tangent, axis=2)
+            area = 2 * np.pi * x[..., 0] * speed * w
+            normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1) / speed[..., None]
+            at_begin, at_end = (X < 2 * EDGE_OFFSET) & begins, (X > 1 - 2 * EDGE_OFFSET) & ends
+            is_on_edge = np.tile(at_begin | at_end, len(cells))
+            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
+            flat_normal = normal.reshape(-1, 2)
+            parts.append((cell, shape, area.ravel(), sides[0][cell], flat_normal, is_on_edge))
+        return MeridianPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def project(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> MeridianProjections:
+        """Return the closest place of each cell to its point, by Newton's method.
+
+        Parameters
+        ----------
+        x, nodal
+            Places of all points (n, 3), and of the nodes of all cells (cells, functions, 3).
+        point, cell
+            (m,) numbers of points and cells.
+        """
+        shape = self.table(0, self._starts)[0]
+        off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
+        X = self._starts[distances(off).argmin(axis=1)]
+        moving = np.arange(len(X))
+        for _ in range(MAX_NEWTON_ITERATIONS):
+            jets = self.jets(X[moving], nodal[cell[moving]])
+            pull, curvature, speed = slopes(x[point[moving]], jets)
+            step = pull / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
+            before = X[moving]
+            X[moving] = np.clip(before + np.clip(step, -0.25, 0.25), 0.0, 1.0)
+            moving = moving[np.abs(X[moving] - before) >= STEP_TOLERANCE]
+            if not len(moving):
+                break
+        jets = self.jets(X, nodal[cell])
+        pull, *_ = slopes(x[point], jets)
+        is_fixed = (X == 0.0) & (pull <= 0) | (X == 1.0) & (pull >= 0)
+        return MeridianProjections(point, cell, X, ~is_fixed, distances(x[point] - jets[0]))
+
+    def select_nearest(
+        self,
+        places: MeridianProjections,
+        x: Array,
+        nodal: Array,
+        material: NeighbouringMaterial | None,
+    ) -> MeridianProjections:
+        """Return the places from which the curve goes on to no nearer one.
+
+        One on each side of a point at most.
+
+        Parameters
+        ----------
+        x, nodal
+            See `project`.
+        """
+        number = len(self.nodes)
+        places = places.select(np.argsort(places.point * number + places.cell))
+        is_above: Flags = np.ones(len(places.point), dtype=bool)
+        if material:
+            is_above = self._are_above(places, x, nodal)
+            shape = self.table(0, places.X)[0]
+            is_distinct = material.are_distinct(places, shape, is_above)
+            places, is_above = places.select(is_distinct), is_above[is_distinct]
+        keys = places.point * number + places.cell
+        is_nearest: Flags = np.ones(len(keys), dtype=bool)
+        for end, X in enumerate((0.0, 1.0)):
+            neighbour = self.neighbours[places.cell, end]
+            neighbour_key = places.point * number + neighbour
+            row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
+            is_listed = keys[row] == neighbour_key
+            tolerance = DISTANCE_TOLERANCE * self._h
+            is_nearer = is_listed & (places.distance[row] < places.distance - tolerance)
+            is_inside = ~((places.X == X) & (neighbour >= 0))
+            is_nearest &= (
+                is_inside
+                | (is_listed & ~is_nearer)
+                | self._are_folded(places, neighbour, is_above, material)
+            )
+        places = places.select(is_nearest)
+        places = places.select(np.lexsort((places.distance, places.point)))
+        if not len(places.point):
+            return places
+        way = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
+        way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+        begins = np.flatnonzero(np.diff(places.point, prepend=-1))
+        nearest = np.repeat(begins, np.diff([*begins, len(way)]))
+        is_opposite = np.sum(way * way[nearest], axis=1) < SAME_DIRECTION_COSINE
+        is_chosen = np.zeros(len(way), dtype=bool)
+        is_chosen[begins] = True
+        opposite = np.flatnonzero(is_opposite)
+        is_chosen[opposite[np.flatnonzero(np.diff(places.point[opposite], prepend=-1))]] = True
+        return places.select(is_chosen)
+
+    def _are_folded(
+        self,
+        places: MeridianProjections,
+        neighbour: Longs,
+        is_above: Flags,
+        material: NeighbouringMaterial | None,
+    ) -> Flags | bool:
+        """Return whether the curve beyond places is near their point's cell, and not searched."""
+        if not material:
+            return False
+        own_cell = material.cells_of_points[places.point]
+        return np.asarray(is_above & material.are_near(own_cell, neighbour))
+
+    def _are_above(self, places: MeridianProjections, x: Array, nodal: Array) -> Flags:
+        """Return whether points are above or below their places.
+
+        Else they are beside them, as in one curve that is straight.
+        """
+        y, tangent, _ = self.jets(places.X, nodal[places.cell])[..., :2]
+        way = x[places.point, :2] - y
+        height = np.abs(way[:, 0] * tangent[:, 1] - way[:, 1] * tangent[:, 0])
+        size = np.linalg.norm(way, axis=1) * np.linalg.norm(tangent, axis=1)
+        return np.asarray(height > ABOVE_SINE * size)
+
+    def cell_normals(self) -> Array:
+        """Return the undeformed unit normals (cells, 2) of the lines between the ends."""
+        a, b = self._r0[self.nodes[:, 0]], self._r0[self.nodes[:, 1]]
+        n = np.column_stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]])
+        return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])

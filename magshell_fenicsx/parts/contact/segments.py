@@ -1,0 +1,586 @@
+"""Quadrature points on contact segments: a cell is cut along the sides of the cells that it faces.
+
+The forces of a pressure on the other surface are integrals of its shape functions, which have kinks
+at the sides of its cells. A rule on the cells of one surface integrates across them: the forces of
+a uniform pressure are then not those of one. So the corners of what a cell faces are projected on
+its plane, and each part of the cell that faces one other cell is cut into triangles with a rule of
+their own. M. A. Puso and T. A. Laursen, Computer Methods in Applied Mechanics and Engineering 193
+(2004) 601-629; docs/theory.md, Contact.
+
+The cuts are those at an earlier state, whose number is part of the history of a state. So the
+points stay where they are on their surface while a state is solved: energy, forces and tangent are
+exact derivatives of each other, and need none of the cuts. Where surfaces slide,
+`SurfaceContact.improved_cuts` makes the cuts anew.
+
+Two curved surfaces touch in a zone that may be narrower than the distance of the points. Its force
+then sits on single points and goes along with their material, so that a mode which slides there
+seems to be unstable. For such states the triangles in the zone are divided, as often as the number
+of the cuts says: see `Cuts`.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.parts.contact.projection import (
+    CELL_RADIUS_FACTOR,
+    CORNERS,
+    Cells,
+    Longs,
+    Projections,
+)
+from magshell_fenicsx.parts.contact.quadrature_rules import (
+    EDGE_OFFSET,
+    cover_distance,
+    edge_rule,
+    triangle_rule,
+)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+REFERENCE_AREA = 0.5  # of the reference cell
+AREA_TOLERANCE = 1e-12  # an area in the reference cell up to which there is none
+LARGE_AREA = 0.1  # an area in the reference cell from which the rule is that of a whole cell
+# barycentric coordinates up to which a corner is on a side, so that sides that nearly meet leave no
+# slivers
+SNAP_TOLERANCE = 0.01
+SAME_CORNER_TOLERANCE = 1e-9  # distance in the reference cell of corners that are one
+# distance of a corner's point from it, over the thickness: cells that meet opposite do not share it
+CORNER_OFFSET = 0.01
+NOT_ON_EDGE = -1  # the `ends` of a triangle that is not on an edge
+TURN_COSINE = 0.97  # of the angle by which an edge turns at corners that have points
+NO_CELL = -1  # the cell that a part of a cell faces where none is
+# a direction in which no two corners are level: it orders them, on any ranks
+ORDERING_DIRECTION = np.array([1.0, 2**0.5, 3**0.5])
+HASH_BYTES = 6  # of the hash of a displacement in the number of its cuts
+DIVISION_LEVELS = 16  # of a number of cuts: a float has these and the hash exactly
+# in the reference triangle
+CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])
+
+
+@dataclass(frozen=True)
+class ContactPoints:
+    """The quadrature points of this rank at which gaps are measured.
+
+    Attributes
+    ----------
+    cell
+        (n,) global number.
+    shape
+        (n, functions) shape functions of that cell.
+    weight
+        (n,) undeformed area over R^2.
+    faces
+        (n,) the cell that a point faced where the cuts were made; `NO_CELL` where it faced none.
+    is_on_edge
+        (n,) whether it is on an edge of the surface.
+    divisions
+        (n,) how often its triangle was divided.
+    """
+
+    cell: Longs
+    shape: Array
+    weight: Array
+    faces: Longs
+    is_on_edge: Flags
+    divisions: Longs
+
+    @cached_property
+    def by_cell(self) -> tuple[Longs, Longs]:
+        """The order of the points by cells, and their cells in this order."""
+        order = np.argsort(self.cell, kind="stable")
+        return order, self.cell[order]
+
+    def select(self, is_selected: Flags) -> "ContactPoints":
+        """Return the selected points."""
+        return ContactPoints(*(getattr(self, each.name)[is_selected] for each in fields(self)))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["ContactPoints"]) -> "ContactPoints":
+        """Return all points of several sets."""
+        return cls(
+            *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls))
+        )
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Triangles in reference cells.
+
+    Attributes
+    ----------
+    cell, faces
+        (n,) their cells, and the cells that they face.
+    first, e1, e2
+        (n, 2) a corner, and the sides from there.
+    ends
+        (n,) `NOT_ON_EDGE`, or where the edge turns on which the third side is: see `edge_rule`.
+    """
+
+    cell: Longs
+    faces: Longs
+    first: Array
+    e1: Array
+    e2: Array
+    ends: Longs
+
+    @property
+    def size(self) -> Array:
+        """Twice their areas (n,) in the reference cell."""
+        return np.asarray(self.e1[:, 0] * self.e2[:, 1] - self.e1[:, 1] * self.e2[:, 0])
+
+    def select(self, is_selected: Flags) -> "Triangles":
+        """Return the selected triangles."""
+        return Triangles(*(getattr(self, each.name)[is_selected] for each in fields(self)))
+
+    def divide(self) -> "Triangles":
+        """Return the four quarters of each triangle.
+
+        They are at the first corner, at both ends of the third side, and in the middle.
+        """
+        half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
+        inside = np.full_like(self.ends, NOT_ON_EDGE)
+        at_begin, at_end = (
+            np.where(self.ends == NOT_ON_EDGE, NOT_ON_EDGE, self.ends & corner) for corner in (1, 2)
+        )
+        quarters = (
+            (self.first, half1, half2, inside),
+            (self.first + half1, half1, half2, at_begin),
+            (self.first + half2, half1, half2, at_end),
+            (middle, -half1, -half2, inside),
+        )
+        first, e1, e2, ends = (np.concatenate(each) for each in zip(*quarters, strict=True))
+        return Triangles(np.tile(self.cell, 4), np.tile(self.faces, 4), first, e1, e2, ends)
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """Convex polygons in reference cells.
+
+    Attributes
+    ----------
+    cell, faces
+        (n,) their cells, and the cells that they face.
+    corners
+        (n, m, 2) counterclockwise, some of them repeated.
+    """
+
+    cell: Longs
+    faces: Longs
+    corners: Array
+
+    @classmethod
+    def cells(cls, cell: Longs) -> "Polygons":
+        """Return whole cells, which face none."""
+        return cls(
+            cell, np.full(len(cell), NO_CELL), np.array(np.broadcast_to(CORNERS, (len(cell), 3, 2)))
+        )
+
+    def select(self, selection: Longs | Flags) -> "Polygons":
+        """Return the selected polygons."""
+        return Polygons(self.cell[selection], self.faces[selection], self.corners[selection])
+
+    def with_faces(self, faces: Longs) -> "Polygons":
+        """Return these polygons, facing other cells."""
+        return Polygons(self.cell, faces, self.corners)
+
+    def with_area(self) -> "Polygons":
+        """Return the polygons that have an area."""
+        return self.select(area(self.corners) > AREA_TOLERANCE)
+
+    def concatenate_with(self, other: "Polygons") -> "Polygons":
+        """Return these polygons and others."""
+        most = max(self.corners.shape[1], other.corners.shape[1])
+        corners = list[Array]()
+        for polygons in (self, other):
+            missing = most - polygons.corners.shape[1]
+            corners.append(np.pad(polygons.corners, ((0, 0), (0, missing), (0, 0)), "edge"))
+        return Polygons(
+            np.concatenate([self.cell, other.cell]),
+            np.concatenate([self.faces, other.faces]),
+            np.concatenate(corners),
+        )
+
+    def triangles(self, open_sides: Flags, edge_turns: Flags) -> Triangles:
+        """Return the triangles between the centroids and each side.
+
+        A triangle with one side on an edge of the surface, or none, is one by itself. So they do
+        not depend on which corner is the first.
+
+        Parameters
+        ----------
+        open_sides, edge_turns
+            (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge
+            turns in the corner.
+        """
+        c, after = self.corners, np.roll(self.corners, -1, axis=1)
+        has_side = np.linalg.norm(c - after, axis=2) > SAME_CORNER_TOLERANCE
+        coordinates = np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)
+        on_side = np.abs(coordinates) < SAME_CORNER_TOLERANCE
+        on_open_side = on_side & np.roll(on_side, -1, axis=1) & open_sides[self.cell][:, None]
+        is_edge = has_side & on_open_side.any(axis=2)
+        at_turn = on_side[..., [1, 2, 0]] & on_side[..., [2, 0, 1]]
+        turns = (at_turn & edge_turns[self.cell][:, None]).any(axis=2)
+        ends = np.where(is_edge, turns + 2 * np.roll(turns, -1, axis=1), NOT_ON_EDGE)
+        is_whole = (has_side.sum(axis=1) == 3) & (is_edge.sum(axis=1) <= 1)
+        centre = np.zeros((len(c), 2))
+        centre[~is_whole] = centroid(c[~is_whole])
+        n, k = np.nonzero(has_side & ~is_whole[:, None])
+        sides = c[n, k] - centre[n], after[n, k] - centre[n]
+        fans = Triangles(self.cell[n], self.faces[n], centre[n], *sides, ends[n, k])
+        single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
+        arrays = [[getattr(part, each.name) for part in (single, fans)] for each in fields(fans)]
+        return Triangles(*(np.concatenate(each) for each in arrays))
+
+    def _single_triangles(self, has_side: Flags, ends: Longs) -> Triangles:
+        """Return these polygons of three sides as triangles, an edge of the surface the third side.
+
+        Parameters
+        ----------
+        has_side, ends
+            (n, m) whether a side begins at a corner, and the `ends` of that side.
+        """
+        own = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
+        corners = np.take_along_axis(self.corners, own[..., None], axis=1)
+        side_ends = np.take_along_axis(ends, own, axis=1)
+        has_edge = (side_ends != NOT_ON_EDGE).any(axis=1)
+        apex = np.where(has_edge, (side_ends.argmax(axis=1) + 2) % 3, 0)[:, None]
+        first, a, b = (
+            np.take_along_axis(corners, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3)
+        )
+        return Triangles(self.cell, self.faces, first, a - first, b - first, side_ends.max(axis=1))
+
+    def clip(self, a: Array, b: Array) -> "Polygons":
+        """Return the parts of the polygons to the left of lines from a (n, 2) to b."""
+        normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
+        height = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
+        height[np.abs(height) < AREA_TOLERANCE] = 0.0
+        next_height, next_corner = np.roll(height, -1, axis=1), np.roll(self.corners, -1, axis=1)
+        is_crossed = height * next_height < 0
+        part = height / np.where(is_crossed, height - next_height, 1.0)
+        count, m = height.shape
+        crossing = self.corners + part[..., None] * (next_corner - self.corners)
+        candidates = np.stack([self.corners, crossing], axis=2).reshape(count, 2 * m, 2)
+        has_side = (next_corner != self.corners).any(axis=2)
+        is_kept = np.stack([(height >= 0) & has_side, is_crossed], axis=2).reshape(count, 2 * m)
+        most = max(3, int(is_kept.sum(axis=1).max(initial=0)))
+        first = np.argsort(~is_kept, axis=1, kind="stable")[:, :most]
+        corners = np.take_along_axis(candidates, first[..., None], axis=1)
+        is_corner = np.take_along_axis(is_kept, first, axis=1)
+        corners = np.where(is_corner[..., None], corners, corners[:, :1])
+        return Polygons(self.cell, self.faces, corners)
+
+
+def area(corners: Array) -> Array:
+    """Return the areas (n,) of polygons (n, m, 2), positive counterclockwise."""
+    off = corners - corners[:, :1]
+    x, y = off[..., 0], off[..., 1]
+    return np.asarray(np.sum(x * np.roll(y, -1, 1) - np.roll(x, -1, 1) * y, axis=1) / 2)
+
+
+def centroid(corners: Array) -> Array:
+    """Return the centroids (n, 2) of polygons that have an area."""
+    off = corners - corners[:, :1]
+    after = np.roll(off, -1, 1)
+    twice = off[..., 0] * after[..., 1] - after[..., 0] * off[..., 1]
+    inner = np.einsum("nk,nki->ni", twice, off + after) / (3 * twice.sum(axis=1))[:, None]
+    return np.asarray(corners[:, 0] + inner)
+
+
+class Segments:
+    """The quadrature points on cells that are cut along each other.
+
+    Parameters
+    ----------
+    own
+        The cells of this rank.
+    r0
+        (nodes, 3) undeformed.
+    degrees
+        Of the rule on whole cells and on large parts, and on small parts.
+    h
+        Thickness over R.
+    planes
+        Of symmetry: an edge goes on in its image, and does not turn there.
+
+    Attributes
+    ----------
+    rule
+        The points of these cells, uncut.
+    cover_distance
+        (cells,) over R: no place of a cell is farther from all points of the rule.
+    """
+
+    def __init__(
+        self,
+        cells: Cells,
+        own: Longs,
+        r0: Array,
+        degrees: tuple[int, int],
+        h: float,
+        planes: Sequence[Mirror] = (),
+    ) -> None:
+        self._cells, self._r0, self._degrees, self._corner_offset = (
+            cells,
+            r0,
+            degrees,
+            CORNER_OFFSET * h,
+        )
+        corners = self._corners(r0, np.arange(len(cells.nodes)))
+        self._edge_turns = cells.edge_turns(r0, TURN_COSINE)
+        for plane in planes:
+            self._edge_turns &= np.abs(plane.signed_distance(corners)) > SAME_CORNER_TOLERANCE
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        inside = cover_distance(triangle_rule(degrees[0])[0])
+        at_edge = cover_distance(edge_rule(degrees[0])[0])
+        has_edge = (cells.neighbours < 0).any(axis=1)
+        cover = np.where(has_edge, max(inside, at_edge), inside)
+        self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * cover
+        self.rule = ContactPoints.concatenate(self._points_on(self._triangles(Polygons.cells(own))))
+
+    def points(
+        self, near: Projections, r: Array, divisions: int, gaps: Callable[[ContactPoints], Array]
+    ) -> ContactPoints:
+        """Return all points of this rank.
+
+        Parameters
+        ----------
+        near
+            Places in all cells that are near the rule's points.
+        r
+            (nodes, 3) where the cuts are made.
+        divisions
+            How often triangles in which the gap may be closed are divided into four.
+        gaps
+            Returns the gaps (n,) of points (n) there, over R.
+        """
+        number, rule = len(self._cells.nodes), self.rule
+        if not len(near.point):
+            return rule
+        keys = np.unique(rule.cell[near.point] * number + near.cell)
+        cell, other = keys // number, keys % number
+        centres = self._corners(self._r0, other).mean(axis=1)
+        order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
+        cell, other = cell[order], other[order]
+        segments = cut_by_triangles(Polygons(cell, other, self._projected_corners(cell, other, r)))
+        points, triangles = [rule.select(~np.isin(rule.cell, cell))], self._triangles(segments)
+        for level in range(divisions):
+            is_closing = self._may_close(triangles, gaps)
+            points += self._points_on(triangles.select(~is_closing), level)
+            triangles = triangles.select(is_closing).divide()
+        return ContactPoints.concatenate([*points, *self._points_on(triangles, divisions)])
+
+    def _may_close(self, triangles: Triangles, gaps: Callable[[ContactPoints], Array]) -> Flags:
+        """Return whether the gap in triangles (n,) may be closed.
+
+        It changes there by as much again as between the corners and the centroid.
+        """
+        X = CORNERS_AND_CENTROID
+        gap = gaps(self._points_by_rule(triangles, X, np.ones(len(X)), 0)).reshape(-1, len(X))
+        return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
+
+    def _triangles(self, polygons: Polygons) -> Triangles:
+        """Return the triangles of polygons."""
+        triangles = polygons.triangles(self._cells.neighbours < 0, self._edge_turns)
+        return triangles.select(triangles.size > AREA_TOLERANCE)
+
+    def _points_on(self, triangles: Triangles, divisions: int = 0) -> list[ContactPoints]:
+        """Return the points on triangles that have been divided so often."""
+        c, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
+        side = np.linalg.norm(np.einsum("na,nai->ni", third_side, c[:, 1:] - c[:, :1]), axis=1)
+        # of few values, so of few rules
+        corner = np.minimum(np.exp2(np.round(np.log2(self._corner_offset / side))), 1 / 64)
+        is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
+        has_turn = triangles.ends > 0
+        keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner, 0)], axis=1)
+        kinds, number = np.unique(keys, axis=0, return_inverse=True)
+        points = list[ContactPoints]()
+        for k, (small, ends, offset) in enumerate(kinds):
+            degree = self._degrees[int(small)]
+            rule = (
+                triangle_rule(degree)
+                if ends == NOT_ON_EDGE
+                else edge_rule(degree, int(ends), float(offset))
+            )
+            same_kind = triangles.select(number.ravel() == k)
+            points.append(self._points_by_rule(same_kind, *rule, divisions))
+        return points
+
+    def _points_by_rule(
+        self, triangles: Triangles, X: Array, weights: Array, divisions: int
+    ) -> ContactPoints:
+        """Return the points of a rule on each triangle."""
+        places = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
+        places = places + X[:, 1:] * triangles.e2[:, None]
+        cell, faces = (np.repeat(each, len(X)) for each in (triangles.cell, triangles.faces))
+        table = self._cells.element.tabulate(1, places.reshape(-1, 2))[..., 0]
+        a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
+        area_ratio = np.linalg.norm(np.cross(a1, a2), axis=1)
+        weight = np.outer(triangles.size, weights).ravel() * area_ratio
+        is_on_third_side = X.sum(axis=1) > 1 - 2 * EDGE_OFFSET
+        is_on_edge = np.outer(triangles.ends != NOT_ON_EDGE, is_on_third_side).ravel()
+        return ContactPoints(
+            cell, table[0], weight, faces, is_on_edge, np.full(len(cell), divisions)
+        )
+
+    def normals(self, r: Array) -> Array:
+        """Return the unit normals (cells, 3) of the planes through the corners."""
+        c = self._corners(r, np.arange(len(self._cells.nodes)))
+        n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
+
+    def _corners(self, r: Array, cell: Longs) -> Array:
+        return np.asarray(self._cells.at_corners @ r[self._cells.nodes[cell]])
+
+    def _projected_corners(self, cell: Longs, other: Longs, r: Array) -> Array:
+        """Return the corners (n, 3, 2) of cells in the reference cells of others, along their
+        normals.
+        """
+        c, y = self._corners(r, cell), self._corners(r, other)
+        sides = np.stack([c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]], axis=1)
+        X = (y - c[:, :1]) @ np.linalg.pinv(sides)
+        coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
+        coordinates[np.abs(coordinates) < SNAP_TOLERANCE] = 0.0
+        X = np.asarray((coordinates / coordinates.sum(axis=2, keepdims=True))[..., 1:])
+        level = np.argsort(self._corners(self._r0, other) @ ORDERING_DIRECTION, axis=1)
+        return np.take_along_axis(X, level[..., None], axis=1)
+
+
+class Cuts:
+    """The points with the cuts of displacements, which have numbers.
+
+    The number 0 is that of the undeformed surfaces, without divisions. Else it is `DIVISION_LEVELS`
+    times a hash of the displacement, plus how often triangles in a zone of contact are divided.
+
+    Parameters
+    ----------
+    near
+        Returns the places in all cells that are near the rule's points at a displacement (nodes,
+        3).
+    gaps
+        Returns the gaps (n,) over R of points at a displacement.
+    """
+
+    def __init__(
+        self,
+        segments: Segments,
+        near: Callable[[Array], Projections],
+        gaps: Callable[[ContactPoints, Array], Array],
+        r0: Array,
+    ) -> None:
+        self._segments, self._find_near, self._find_gaps, self._r0 = segments, near, gaps, r0
+        self._displacements = {0.0: np.zeros_like(r0)}
+        self._latest_points = dict[float, tuple[ContactPoints, Array]]()
+
+    def points(self, number: float, u: Array) -> tuple[ContactPoints, Array]:
+        """Return the points of a number, and the normals (cells, 3) where the cuts are made.
+
+        A number that is not known, as in a state from elsewhere, becomes that of the displacement
+        u.
+        """
+        if number not in self._latest_points:
+            cut_u = self._displacements.setdefault(number, np.array(u))
+            latest = [*self._latest_points.items()][-1:]
+            self._latest_points = {
+                **dict(latest),
+                number: self.points_at(cut_u, divisions_of(number)),
+            }
+        return self._latest_points[number]
+
+    def displacement(self, number: float) -> Array:
+        """Return the displacement of a number of which there are points."""
+        return self._displacements[number]
+
+    def points_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Array]:
+        """Return the points with cuts at a displacement, and the normals (cells, 3) there."""
+        r = self._r0 + u
+        points = self._segments.points(
+            self._find_near(u), r, divisions, lambda points: self._find_gaps(points, u)
+        )
+        return points, self._segments.normals(r)
+
+    def number_of(self, u: Array, divisions: int) -> float:
+        """Return the number of a displacement and its divisions, the same for the same ones."""
+        digest = hashlib.blake2b(np.array(u).tobytes(), digest_size=HASH_BYTES).digest()
+        number = float(DIVISION_LEVELS * int.from_bytes(digest) + divisions)
+        self.recall(number, u)
+        return number
+
+    def recall(self, number: float, u: Array) -> None:
+        """Let a number stand for a displacement."""
+        self._displacements[number] = np.array(u)
+
+
+def divisions_of(number: float) -> int:
+    """Return how often triangles are divided with cuts of this number."""
+    return int(number) % DIVISION_LEVELS
+
+
+def oriented_sides(triangles: Array) -> tuple[Array, Array]:
+    """Return the ends of the sides (n, 3, 2) of triangles, which have these on their left."""
+    a, b = triangles, np.roll(triangles, -1, axis=1)
+    right = (area(triangles) < 0)[:, None, None]
+    return np.where(right, b, a), np.where(right, a, b)
+
+
+def cut_by_triangles(triangles: Polygons) -> Polygons:
+    """Return reference cells cut along the sides of triangles that they face.
+
+    Where these neither overlap nor leave a part of the cell, the polygons are what the cell has in
+    common with each.
+    """
+    cells, number = np.unique(triangles.cell, return_inverse=True)
+    a, b = oriented_sides(triangles.corners)
+    common = Polygons.cells(triangles.cell).with_faces(triangles.faces)
+    for k in range(3):
+        common = common.clip(a[:, k], b[:, k])
+    overlaps = np.abs(area(triangles.corners)) > AREA_TOLERANCE
+    overlaps &= area(common.corners) > AREA_TOLERANCE
+    common, number = common.select(overlaps), number[overlaps]
+    covered = np.bincount(number, area(common.corners), len(cells))
+    is_partial = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
+    if not is_partial.any():
+        return common
+    partial_triangles = triangles.select(overlaps).select(is_partial[number])
+    inside, rest = _cut_one_by_one(partial_triangles, cells[is_partial])
+    uncovered = np.bincount(np.searchsorted(cells, rest.cell), area(rest.corners), len(cells))
+    is_complete = np.abs(covered + uncovered - REFERENCE_AREA) <= AREA_TOLERANCE
+    # where triangles overlap, the later ones count without the earlier ones
+    overlapped = cells[is_partial & ~is_complete]
+    single = common.select(~np.isin(common.cell, overlapped))
+    cut = inside.select(np.isin(inside.cell, overlapped))
+    return single.concatenate_with(cut).concatenate_with(rest)
+
+
+def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygons]:
+    """Return what cells have in common with triangles, and what is left of the cells.
+
+    Later triangles count without the earlier ones.
+    """
+    triangles = triangles.select(np.argsort(triangles.cell, kind="stable"))
+    first = np.searchsorted(triangles.cell, cells)
+    number = np.searchsorted(triangles.cell, cells, "right") - first
+    rest = Polygons.cells(cells)
+    inside = rest.select(np.zeros(0, dtype=np.int64))
+    for turn in range(int(number.max(initial=0))):
+        row = np.searchsorted(cells, rest.cell)
+        has_triangle = number[row] > turn
+        cutting = triangles.select(first[row[has_triangle]] + turn)
+        cut, (a, b) = rest.select(has_triangle), oriented_sides(cutting.corners)
+        common = cut.with_faces(cutting.faces)
+        for k in range(3):
+            common = common.clip(a[:, k], b[:, k])
+        overlaps = area(common.corners) > AREA_TOLERANCE
+        inside = inside.concatenate_with(common.select(overlaps))
+        rest = rest.select(~has_triangle).concatenate_with(cut.select(~overlaps))
+        remaining = cut.select(overlaps)
+        for k in range(3):
+            outside = remaining.clip(b[overlaps, k], a[overlaps, k])
+            rest = rest.concatenate_with(outside.with_area())
+            remaining = remaining.clip(a[overlaps, k], b[overlaps, k])
+    return inside, rest

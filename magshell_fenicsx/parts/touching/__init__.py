@@ -1,1 +1,0 @@
-"""Shells that touch each other or themselves."""

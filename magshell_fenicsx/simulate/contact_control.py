@@ -1,0 +1,555 @@
+"""Contact control along a path: first contact, penalties, cuts, and ways that contact forbids.
+
+A body approaches until it touches first. Penalties become stiffer where something penetrates too
+much, and shells are cut anew where their points of contact have slid. No shell may pass through
+another one, and no body may go back the way it came. docs/theory.md has the penalty.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from itertools import pairwise
+from math import inf
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
+from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
+from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.contact.contact_section import Pair
+from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
+from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.simulate.contact_onset import CONTACT_DEPTH, gathered_displacement
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import Stage
+
+# of h: how far past the first contact the path begins, the first try first
+FIRST_CONTACT_DEPTHS = tuple(CONTACT_DEPTH / 4**i for i in range(7))
+GAP_TOLERANCE = 1e-7  # of h: a smaller gap is none
+MAX_APPROACHES = 1000  # approaches by the least gap
+RETURN_DISTANCE = 0.1  # of h: how far a path that returns is from its turn
+RETURN_TOLERANCE = 0.02  # of that: how far it is from the way there
+STIFFENING = 4.0  # how much stiffer a contact becomes at once
+MAX_STIFFENING = 1e4  # how much stiffer a body becomes at most
+# how much stiffer a shell becomes at most: the point of a corner has a small weight
+MAX_STIFFENING_OF_SHELLS = 1e6
+# of the bound, at points: between them, with other cuts, shells may be deeper
+BOUND_AT_POINTS = 0.75
+# of a critical mode's stiffness: what closer points of contact may change of it
+CERTAIN_STIFFNESS_CHANGE = 0.5
+HALVINGS_BEFORE_PASSING = 8  # halvings of a way on which shells would pass through each other
+# of h: the penetration that shells which hit each other flat are meant to have
+IMPACT_PENETRATION = 0.03
+IMPACT_BOUND_RATIO = 100.0  # times the bound: a penetration that lasts for a moment
+SAMPLES_OF_MOTION = 65  # places of supports on their way at which shells are compared
+HALVINGS_OF_MOTION = 30  # halvings of the part of the way in which shells meet
+RIGID_RATIO = 2.0  # displacement over penetration below which a body is rigid enough
+MAX_DISPLACEMENT = 0.05  # of h: farther from it, an equilibrium is another one
+MAX_STIFFENINGS = 4  # times that bodies become stiffer
+
+
+def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> State:
+    """Return the state just after the body of a step first touches.
+
+    It is the given one if the body touches already, and at the target if that is nearer.
+
+    Raises
+    ------
+    Stopped
+        If the body never meets the shell, or the first contact has no equilibrium.
+    """
+    goal, name, h = step.load.target or step.load.bound, step.name, scene.problem.material.h
+    end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
+    region = scene.model.region(state, name)
+    if region.penetration > GAP_TOLERANCE * h or end <= state.mu[name]:
+        return state
+    for _ in range(MAX_APPROACHES):
+        gap = -scene.model.region(state, name).penetration / h
+        if gap <= GAP_TOLERANCE:
+            break
+        state = state.with_(state.u, name, state.mu[name] + gap)
+        if state.mu[name] + CONTACT_DEPTH >= end:
+            return state.with_(state.u, name, end)
+    else:
+        raise Stopped("the body does not meet the shell")
+    reason = ""
+    for deep in FIRST_CONTACT_DEPTHS:
+        a = state.mu[name] + deep
+        outcome = scene.newton.solve(state.with_(state.u, name, a), name, PrescribedLoad(name, a))
+        if outcome.converged:
+            return outcome.state
+        reason = outcome.reason
+    raise Stopped(f"no equilibrium found at the first contact: {reason}")
+
+
+def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
+    """Return settings of contacts that penetrate too much at a state, `STIFFENING` times as stiff.
+
+    A stiffness that the case gives stays.
+    """
+    h, settings = scene.problem.material.h, dict[str, float]()
+    for contact in scene.problem.loads.contacts:
+        k = state.mu.get(contact.setting, contact.stiffness)
+        deep = scene.model.region(state, contact.amplitude).penetration
+        if (
+            deep > contact.bound * h
+            and not contact.given
+            and k < MAX_STIFFENING * contact.stiffness
+        ):
+            settings[contact.setting] = STIFFENING * k
+    for pair, deep in shell_penetrations(scene, state):
+        k = state.mu.get(pair.setting, pair.stiffness)
+        if (
+            deep > BOUND_AT_POINTS * pair.bound
+            and not pair.given
+            and k < MAX_STIFFENING_OF_SHELLS * pair.stiffness
+        ):
+            settings[pair.setting] = STIFFENING * k
+    return settings
+
+
+def stiff_for(pair: Pair, speed: float, h: float) -> float:
+    """Return the stiffness with which a pair that meets flat goes `IMPACT_PENETRATION` deep.
+
+    Its speed is over that of waves, and h over R.
+
+    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with
+    half the mass per area of the first shell.
+    """
+    needed, k = (speed / (IMPACT_PENETRATION * h)) ** 2 / 2, pair.stiffness
+    while k < needed:
+        k *= STIFFENING
+    return k
+
+
+def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
+    """Let numbers of cuts stand for those at a point of a step, as in an interrupted run.
+
+    Collective.
+    """
+    evaluation = stage.scene.model.system.at_state(stage.leave(high.state)) if numbers else None
+    for shell_contact in _with_cuts(stage.scene):
+        if evaluation and shell_contact.pair.cuts in numbers:
+            evaluation.evaluate(
+                partial(shell_contact.recall_cuts, numbers[shell_contact.pair.cuts])
+            )
+
+
+def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
+    """Return the numbers of cuts with closer points of contact, for two points with an
+    instability between them.
+
+    Empty if closer points change neither the number of unstable directions of both nor much of
+    their critical modes' stiffness: of an instability that they move, nobody knows whether it is
+    one.
+    """
+    scene, state = stage.scene, stage.leave(high.state)
+    evaluation = scene.model.system.at_state(state)
+    numbers = {
+        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.finer_cuts)
+        for shell_contact in _with_cuts(scene)
+    }
+    closer = {name: number for name, number in numbers.items() if number is not None}
+    is_certain = not closer or all(_is_certain(stage, point, closer) for point in (high, low))
+    return {} if is_certain else closer
+
+
+def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
+    """Return whether closer points change no critical mode's stiffness at a point much.
+
+    That is by less than `CERTAIN_STIFFNESS_CHANGE` of it.
+
+    True as well if a mode is not found: then nothing says that closer points would help.
+    """
+    state_here, other = point.state, State(point.state.u, {**point.state.mu, **finer})
+    try:
+        mode, compared = (critical_mode(stage.newton, state) for state in (state_here, other))
+    except NoEigenpair:
+        return True
+    error = abs(compared.eigenvalue - mode.eigenvalue)
+    return (
+        compared.negative_pivots == mode.negative_pivots
+        and error < CERTAIN_STIFFNESS_CHANGE * abs(mode.eigenvalue)
+    )
+
+
+def better_cuts(scene: Scene, state: State) -> dict[str, float]:
+    """Return the numbers of cuts at a state that are much better than its own; collective."""
+    evaluation = scene.model.system.at_state(state)
+    numbers = {
+        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.improved_cuts)
+        for shell_contact in _with_cuts(scene)
+    }
+    return {name: number for name, number in numbers.items() if number is not None}
+
+
+def with_cuts_here(scene: Scene, state: State) -> State:
+    """Return a state of another model with the cuts of shells at its own displacement; collective."""
+    evaluation = scene.model.system.at_state(state)
+    return State(
+        state.u,
+        {
+            **state.mu,
+            **{
+                shell_contact.pair.cuts: evaluation.evaluate(shell_contact.present_cuts)
+                for shell_contact in _with_cuts(scene)
+            },
+        },
+    )
+
+
+def _with_cuts(scene: Scene) -> list[SurfaceContact]:
+    return [
+        shell_contact
+        for shell_contact in scene.model.shell_contacts
+        if isinstance(shell_contact, SurfaceContact)
+    ]  # on meridians are no cuts
+
+
+def with_own_contact(scene: Scene, state: State) -> State | None:
+    """Return a state with the penalties and cuts that it needs; None if it has them. Collective.
+
+    Penalties are stiffer where shells or bodies are too deep in each other.
+    """
+    changed = (
+        {**raised_stiffnesses(scene, state), **better_cuts(scene, state)}
+        if scene.model.shell_contacts
+        else {}
+    )
+    return State(state.u, {**state.mu, **changed}) if changed else None
+
+
+def shell_penetrations(scene: Scene, state: State) -> list[tuple[Pair, float]]:
+    """Return pairs of shells that may touch, with penetrations over the thickness; collective."""
+    evaluation = scene.model.system.at_state(state)
+    return [
+        (shell_contact.pair, evaluation.evaluate(shell_contact.relative_penetration))
+        for shell_contact in scene.model.shell_contacts
+    ]
+
+
+def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
+    """Check that no shell passes through another one or itself between two points.
+
+    The way between them is straight.
+
+    Raises
+    ------
+    StepTooLong
+        If one does.
+    """
+    model, comm = stage.scene.model, stage.scene.comm
+    if not model.shell_contacts:
+        return
+    if model.axisymmetric:
+        places = [
+            model.system.with_ghosts(s.u, s.mu).reshape(-1, 2)
+            for s in map(stage.leave, (low.state, high.state))
+        ]
+        _refuse_through(model.shell_contacts, places)
+        return
+    end = stage.leave(high.state)
+    displacements = [
+        gathered_displacement(stage.scene, state) for state in (stage.leave(low.state), end)
+    ]
+    x0 = model.r0.x.array[: model.system.size].reshape(-1, 3)
+    x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
+    evaluation, shell_contacts = (
+        model.system.at_state(end),
+        [t for t in model.shell_contacts if isinstance(t, SurfaceContact)],
+    )
+    owned = slice(*model.V.dofmap.index_map.local_range)
+    undeformed, half = (values[owned] for values in evaluation.evaluate(shell_contacts[0].halves))
+    half = np.minimum(half, undeformed)
+    seen_through = [*model.mirror.planes.values()] if model.multiplicity > 1 else []
+    for plane in (other for other in model.planes if other not in seen_through):
+        distance_before, distance_after = plane.signed_distance(x0), plane.signed_distance(x)
+        side = np.sign(comm.allreduce(float(distance_before.sum())))
+        if comm.allreduce(
+            int(np.sum((side * distance_before > 2 * undeformed) & (side * distance_after < half)))
+        ):
+            raise PathStopped(
+                "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
+                "model both sides",
+                low,
+                final=True,
+            )
+    _refuse_through(shell_contacts, displacements)
+
+
+def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
+    """Return whether a shell passes through another one, itself or a mirror plane.
+
+    The way between the two points is straight.
+    """
+    ends = (
+        end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0)
+        for end in (low, high)
+    )
+    try:
+        refuse_passing(stage, *ends)
+    except (StepTooLong, PathStopped):
+        return True
+    return False
+
+
+def _refuse_through(
+    shell_contacts: Sequence[SurfaceContact] | Sequence[MeridianContact],
+    ends: Sequence[NDArray[np.float64]],
+) -> None:
+    for shell_contact in shell_contacts:
+        if shell_contact.passes_through(*ends):
+            raise StepTooLong(
+                f"the shortest step passes {shell_contact.pair.words} through each other"
+            )
+
+
+def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
+    """Check that the shell passes through no magnet between two points.
+
+    Raises
+    ------
+    PathStopped
+        With the magnet.
+    """
+    model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
+    for field in model.fields:
+        ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
+        for state in states:
+            ends.append(
+                (model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu)
+            )
+        messages = model.system.comm.allgather(field.passed_through(*ends))
+        if message := next((message for message in messages if message), ""):
+            raise PathStopped(message, low, final=True)
+
+
+def before_passing(stage: Stage, low: State, high: State) -> State:
+    """Return the second of two states of a stage, or one before shells pass through each other.
+
+    It is on the straight way to the second state.
+    """
+    if not stage.scene.model.shell_contacts or not passes(stage, low, high):
+        return high
+    part, end_of_way, displacement = 0.0, 1.0, high.u - low.u
+    for _ in range(HALVINGS_BEFORE_PASSING):
+        middle = (part + end_of_way) / 2
+        passes_there = passes(stage, low, State(low.u + middle * displacement, high.mu))
+        part, end_of_way = (part, middle) if passes_there else (middle, end_of_way)
+    return State(low.u + part * displacement, high.mu)
+
+
+def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
+    """Check that a body does not go back the way it came.
+
+    It would behind a fold at which it no longer holds the shell in place.
+
+    Parameters
+    ----------
+    name
+        The amplitude that varies.
+    points
+        The path up to here.
+    high
+        The next point.
+
+    Raises
+    ------
+    PathStopped
+        If it does, or if it no longer touches the shell and moves away from it.
+    """
+    model, comm, low = stage.scene.model, stage.scene.comm, points[-1]
+    if name not in model.contacts:
+        return
+    mu, h = [point.state.mu[name] for point in (*points, high)], stage.newton.system.length
+    top = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
+    fallen = max_abs(comm, high.state.u - points[min(top, len(points) - 1)].state.u)
+    if top == len(points) or fallen < RETURN_DISTANCE * h:
+        return
+    for a, b in pairwise(points[: top + 1]):
+        x, y = a.state.mu[name], b.state.mu[name]
+        if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
+            continue
+        t = scipy.interpolate.CubicHermiteSpline(
+            [x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu]
+        )(mu[-1])
+        if max_abs(comm, high.state.u - t) < RETURN_TOLERANCE * fallen:
+            message = (
+                "the body goes back the way it came: at its fold the shell snaps under a given "
+                "approach"
+            )
+            raise PathStopped(message, low, final=True)
+    if max_abs(comm, high.du) == 0:
+        depths = [model.region(stage.leave(point.state), name).penetration for point in (low, high)]
+        if depths[1] < min(depths[0], 0.0):
+            message = (
+                "the body has left the shell: at its fold the shell snaps under a given approach"
+            )
+            raise PathStopped(message, high, final=True)
+
+
+def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> str:
+    """Return a message on a body or a shell that penetrates more than its bound; "" if none does.
+
+    It says which stiffness would halve the penetration. Where shells hit each other in a motion,
+    their bound is `IMPACT_BOUND_RATIO` times as large. Collective.
+    """
+    h = scene.problem.material.h
+    for contact in scene.problem.loads.contacts:
+        deep = scene.model.region(state, contact.amplitude).penetration / h
+        if deep > contact.bound:
+            k = state.mu.get(contact.setting, contact.stiffness)
+            return (
+                f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
+                f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
+            )
+    for pair, deep in shell_penetrations(scene, state):
+        largest = pair.bound * (IMPACT_BOUND_RATIO if moving else 1.0)
+        if deep > largest:
+            what = f"the penetration between {pair.words} is {deep:.3g} h, more than {largest:g} h"
+            k = state.mu.get(pair.setting, pair.stiffness)
+            if moving or pair.given:
+                return f"{what}; contact: stiffness: is {k:.4g}: give four times as much"
+            return f"{what} even with the stiffest penalty: take smaller elements where they touch"
+    return ""
+
+
+def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:
+    """Return how far supports can move, and which shells they then hold in each other.
+
+    If nothing stops them, that is the end, and "". What two supports hold does not give way. Nodes
+    stand for it, so that edges which cross are not seen.
+    """
+    model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
+    if name not in scene.motions or not model.shell_contacts:
+        return end, ""
+    fixed = np.zeros(model.system.size, dtype=bool)
+    for bc in model.system.clamped:
+        dofs = bc.dof_indices()[0]
+        fixed[dofs[dofs < len(fixed)]] = True
+    held_nodes = np.flatnonzero(np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1))
+    begin = state.mu[name]
+
+    def meeting_shells(part: float) -> str:
+        moved_state = state.with_(state.u, name, begin + part * (end - begin))
+        u = np.concatenate(
+            comm.allgather(
+                model.system.with_ghosts(moved_state.u, moved_state.mu)[: model.system.size]
+            )
+        ).reshape(-1, dim)
+        for shell_contact in model.shell_contacts:
+            if (
+                shell_contact.gap_at_supports(held_nodes, u)
+                < -shell_contact.pair.bound * scene.problem.material.h
+            ):
+                return shell_contact.pair.words
+        return ""
+
+    parts = np.linspace(0.0, 1.0, SAMPLES_OF_MOTION)
+    first = next((i for i in range(1, SAMPLES_OF_MOTION) if meeting_shells(parts[i])), None)
+    if first is None or meeting_shells(0.0):
+        return end, ""
+    low, high = parts[first - 1 : first + 1]
+    for _ in range(HALVINGS_OF_MOTION):
+        middle = (low + high) / 2
+        low, high = (low, middle) if meeting_shells(middle) else (middle, high)
+    return float(begin + low * (end - begin)), meeting_shells(high)
+
+
+def touching_bodies(scene: Scene, state: State) -> list[Contact]:
+    """Return the contacts of the bodies that touch."""
+    contacts = scene.problem.loads.contacts
+    return [
+        contact
+        for contact in contacts
+        if scene.model.region(state, contact.amplitude).penetration > 0
+    ]
+
+
+def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
+    """Check that no shells touch where the second variation of a wave is differentiated.
+
+    Collective.
+
+    Raises
+    ------
+    CaseError
+        With the shells that do.
+    """
+    for pair, deep in shell_penetrations(scene, state):
+        if deep > 0:
+            raise CaseError(
+                f"{result}: has no gradient where shells touch ({pair.words}): take symmetry: "
+                "half, where a wave is a mode as others are, or differences of runs"
+            )
+
+
+@contextmanager
+def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
+    """Expand contact between shells into polynomials about a state, for states near it.
+
+    None leaves contact as it is.
+    """
+    if state is None:
+        yield
+        return
+    evaluation = scene.model.system.at_state(state)
+    for shell_contact in scene.model.shell_contacts:
+        shell_contact.hold(evaluation.evaluate(shell_contact.freeze))
+    try:
+        yield
+    finally:
+        for shell_contact in scene.model.shell_contacts:
+            shell_contact.hold(None)
+
+
+def with_stiffer_bodies(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
+    """Return the equilibrium near a state with bodies `STIFFENING` times as stiff.
+
+    None if there is none within `MAX_DISPLACEMENT`.
+    """
+    k = {
+        contact.setting: STIFFENING * state.mu.get(contact.setting, contact.stiffness)
+        for contact in bodies
+    }
+    name = bodies[0].amplitude
+    outcome = scene.newton.solve(
+        State(state.u, {**state.mu, **k}), name, PrescribedLoad(name, state.mu[name])
+    )
+    if (
+        not outcome.converged
+        or _largest_displacement(scene, state, outcome.state)
+        > MAX_DISPLACEMENT * scene.problem.material.h
+    ):
+        return None
+    return outcome.state
+
+
+def stiffened_equilibrium(scene: Scene, state: State) -> State:
+    """Return the state between bodies so stiff that their stiffness does not matter; collective.
+
+    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become
+    stiffer, until the shell moves by at most `RIGID_RATIO` times the penetration. A given stiffness
+    stays.
+    """
+    for _ in range(MAX_STIFFENINGS):
+        bodies = [contact for contact in touching_bodies(scene, state) if not contact.given]
+        harder = with_stiffer_bodies(scene, state, bodies) if bodies else None
+        if harder is None:
+            break
+        deep = max(scene.model.region(state, contact.amplitude).penetration for contact in bodies)
+        state, displacement = harder, _largest_displacement(scene, state, harder)
+        if displacement <= RIGID_RATIO * deep:
+            break
+    return state
+
+
+def _largest_displacement(scene: Scene, state: State, other: State) -> float:
+    return max_abs(scene.model.system.comm, other.u - state.u)
