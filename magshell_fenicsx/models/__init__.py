@@ -1,1 +1,3 @@
-"""What the parts of a case contribute to: the shell, its meridian, the solid."""
+"""Mechanics of shells, of their meridians and of solids, to which the parts of a case
+contribute.
+"""

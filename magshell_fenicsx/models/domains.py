@@ -1,5 +1,4 @@
-"""Where the densities of a shell are integrated: its mid-surface, or the meridian of what is closed
-around e3.
+"""Integration domains of a shell: its mid-surface, or the meridian of what is closed around e3.
 
 A domain gives the jets of fields, the measures of cells, of the edges between them and of the
 boundary's edges, and how wide the cells are there. Whoever writes an energy writes its density
@@ -38,7 +37,7 @@ def revolved_jet(f: Expr) -> Jet:
 
 
 def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
-    """The same from the components of f, f' and f''."""
+    """Jet of the axisymmetric field f, from the components of f, f' and f''."""
     (U, W), (Us, Ws), (Uss, Wss) = derivatives
     return Jet(
         r=_vector(U, 0, W),
@@ -65,7 +64,7 @@ def wave_jets(f: Expr, m: Expr) -> tuple[Jet, Jet]:
 
 
 def wave_jets_of(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
-    """The same from the components of f, f' and f''."""
+    """Jets of the wave f, see `wave_jets`, from the components of f, f' and f''."""
     (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in derivatives)
     cosine = Jet(
         r=_vector(U, 0, W),
@@ -201,7 +200,7 @@ class IntegrationDomain:
 
     @property
     def j0(self) -> Jet:
-        """Of the placement."""
+        """Jet of the placement."""
         return self.jet(self.r0)
 
     def discontinuous(self, size: int) -> fem.FunctionSpace:
@@ -217,22 +216,25 @@ class IntegrationDomain:
         return fem.Constant(self.mesh, value)
 
     def dx(self, rule: int | None = None) -> ufl.Measure:
-        """Of the cells, in the surface's coordinates."""
+        """Return the measure of the cells, in the surface's coordinates; `rule` is the quadrature's
+        degree.
+        """
         return ufl.Measure(
             "dx", domain=self.mesh, metadata={"quadrature_degree": rule or self.rule}
         )
 
     def dS(self) -> ufl.Measure:
-        """Of the edges between cells."""
+        """Return the measure of the edges between cells."""
         return ufl.Measure("dS", domain=self.mesh, metadata=self._along_edges)
 
     def ds(self, facets: Facets) -> ufl.Measure:
-        """Of some edges of the boundary."""
+        """Return the measure of some edges of the boundary."""
         return self.measures_on([facets])[0]
 
     def measures_on(self, facet_groups: Sequence[Facets]) -> list[ufl.Measure]:
-        """Of some parts of the boundary that do not overlap, each of one measure: a form may have
-        one alone.
+        """Return the measures of some groups of boundary edges that do not overlap.
+
+        They are parts of one measure, since a form may have only one of the boundary.
         """
         facets = np.concatenate(facet_groups)
         numbers, order = (
@@ -269,15 +271,19 @@ class IntegrationDomain:
         return initial, self.j0 + u - initial
 
     def measure(self, density: Density) -> ufl.Measure:
-        """Of the cells or edges where a density lives; a form takes a single one for the same
-        edges.
+        """Return the measure of the cells or edges that a density is integrated on.
+
+        A form takes only one measure of the same edges.
         """
         if density.sides == 2:
             return self.dS()
         return self.dx(density.quadrature) if density.facets is None else self.ds(density.facets)
 
     def value(self, density: Density, u: Jet, *, from_initial: bool = False) -> Expr:
-        """Of a density; `initial_placement`: of what counts from the drawn placement."""
+        """Return the value of a density at the displacement's jet u.
+
+        With `from_initial` it counts from the initial placement.
+        """
         r0 = self.j0
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
@@ -293,7 +299,7 @@ class IntegrationDomain:
         )
 
     def integral(self, density: Density, u: Jet) -> ufl.Form:
-        """Of a density."""
+        """Return the integral of a density at the displacement's jet u."""
         return self.value(density, u) * self.measure(density)
 
     def energy(
@@ -305,7 +311,9 @@ class IntegrationDomain:
         from_initial: bool = False,
         **attributes: Any,
     ) -> Energy:
-        """That of a density; `initial_placement` as of `value`, `attributes` are attributes of `Energy`."""
+        """Return the energy of a density; `from_initial` as in `value`, `attributes` are those of
+        `Energy`.
+        """
         virtual, measure = density.work, self.measure(density)
 
         def form_of(u: Jet) -> ufl.Form:

@@ -1,4 +1,6 @@
-"""The energies of a shell on its domain: each a density, made only when a scene calls for it."""
+"""Energies of a shell on its integration domain: each is a density, made only when a scene has
+it.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -157,7 +159,7 @@ class EnergyFactory:
         return self.domain.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
-        """`turn` is the rotation of an edge that moves."""
+        """Energy of edges that hold the normal; `turn` is the rotation of an edge that moves."""
         parameters = (self._penalty,) if turn is None else (self._penalty, turn)
         density = self._elastic_density(
             Density(edges.clamped, parameters, ALL_DERIVATIVES, SECOND_DERIVATIVES, facets)
@@ -233,7 +235,9 @@ class EnergyFactory:
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> Energy:
-        """What the field makes of a soft shell: quadratic in its amplitudes, which enter freely."""
+        """Energy of a soft-magnetic shell in the field: quadratic in its amplitudes, which are free
+        parameters.
+        """
         sheet, scale = Sheet(field), self._constant(soft_magnet.scale)
         law, *parameters = self._of_sheet(sheet, soft_magnet, applied)
         parts = FIRST_DERIVATIVES if field.uniform else VALUE_AND_FIRST
@@ -293,7 +297,7 @@ class EnergyFactory:
         amplitudes: Sequence[fem.Constant],
         applied: AppliedField | None,
     ) -> PointField:
-        """What is known of a material that saturates, at the points of cells."""
+        """Return the magnetisation state of a material that saturates, at the points of cells."""
         domain, followed = self.domain, (self.domain.r0, self.u)
         saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
         jets = domain.tables(domain.r0.function_space, saturation.points)
@@ -306,7 +310,9 @@ class EnergyFactory:
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
+        """The terms of the chosen energy, linear in the applied field, with the amplitude
+        lambda_m.
+        """
         pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, domain.r0)[0] if callable(pattern) else self._constant(pattern)
@@ -429,7 +435,7 @@ class EnergyFactory:
         return self.domain.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, facets: Facets | None = None) -> dict[str, ufl.Form]:
-        """What it observes of the modelled part."""
+        """Integrals that a term observes, by column, over the modelled part."""
         parameters = self._parameters(term)
         by_column = {
             column: Density(
@@ -514,7 +520,7 @@ class EnergyFactory:
 
     @property
     def law_of_cells(self) -> Law:
-        """That of each cell of this rank, for arrays (cells, n) of places in them."""
+        """Law of each cell of this rank, for arrays (cells, n) of places in them."""
         materials = self.cell_materials
         return self.material.law_in(
             materials
@@ -522,8 +528,8 @@ class EnergyFactory:
         )
 
     def _mass_weighted(self, density: Density) -> Density:
-        """One of what has mass, with thickness and density of the material as they vary, if they
-        do.
+        """Return a density of the mass, weighted with thickness and density of the material where
+        they vary.
         """
         density = self._with_thickness(density)
         return (

@@ -41,7 +41,7 @@ def mass(model: Model) -> PETSc.Mat:
 
 
 def mass_with_supports(model: Model) -> PETSc.Mat:
-    """The same with supports."""
+    """Return the consistent mass with the rows and columns at supports."""
     return mass_matrix(_product(model), [])
 
 
@@ -54,8 +54,8 @@ def _product(model: Model) -> fem.Form:
 
 
 def mass_factor(model: Model) -> Expr | None:
-    """What multiplies the mass of a shell per area: thickness and density; a solid has the
-    thickness in its shape.
+    """Return the factor of a shell's mass per area: thickness and density; None for 1. A solid has
+    the thickness in its shape.
     """
     factors = [] if model.thickness is None else [model.thickness[0]]
     if model.cell_materials is not None:
@@ -70,7 +70,9 @@ def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
 
 
 def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
-    """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
+    """Return the weighted integral of u . v of two waves with the coefficients (U + V, V, W); it
+    does not depend on m.
+    """
     V = model.waves.V
     cosine, sine = zip(
         *(domains.wave_jets(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
@@ -95,7 +97,9 @@ def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
 
 
 def _integral(model: Model, f: Expr) -> ufl.Form:
-    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
+    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per
+    radian.
+    """
     domain, degree = model.V.mesh, model.degree
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
     if not model.thin:
@@ -121,7 +125,7 @@ Rates = Mapping[str, tuple[float, float]]  # of each motion: first and second de
 
 
 class SupportInertia:
-    """Supports that move in time; a `continuation.motion.MovingSupports`.
+    """Inertia of supports that move in time; a `continuation.motion.MovingSupports`.
 
     Parameters
     ----------
@@ -157,14 +161,14 @@ class SupportInertia:
         self._x, self._y = mass.createVecs()
 
     def velocity(self, t: float, is_before: bool) -> Vector:
-        """Of nodes that move, zero elsewhere."""
+        """Return the velocity of nodes that move with supports, zero elsewhere."""
         if t <= 0 and is_before:
             return np.zeros(self._system.size) if self._carried is None else self._carried
         mu, rates = self._at(t, is_before)
         return self._sum(rate * self._moving.rate(mu, name) for name, (rate, _) in rates.items())
 
     def acceleration(self, t: float, is_before: bool) -> Vector:
-        """Likewise."""
+        """Return the acceleration of nodes that move with supports, zero elsewhere."""
         mu, rates = self._at(t, is_before)
         direct = self._sum(bend * self._moving.rate(mu, name) for name, (_, bend) in rates.items())
         pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
@@ -181,7 +185,7 @@ class SupportInertia:
         return np.array(self._y.array_r)
 
     def zeroed_at_supports(self, x: Vector) -> Vector:
-        """With zeros at supports."""
+        """Return a vector with zeros at supports."""
         return self._system.zero_at_supports(x)
 
     def _sum(self, parts: Iterable[Vector]) -> Vector:

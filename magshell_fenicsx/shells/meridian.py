@@ -64,7 +64,8 @@ AXIAL_TOLERANCE = (
 
 @dataclass(frozen=True)
 class Probe:
-    """Interpolates on the cell of the place, and turns the meridian's displacement to it.
+    """Interpolation in the cell of a place, whose displacement is turned to the azimuth of the
+    place.
 
     Attributes
     ----------
@@ -83,7 +84,7 @@ class Probe:
 
     @staticmethod
     def at_parameter(s: float, azimuth: float, r0: fem.Function) -> "Probe":
-        """For a parameter of the meridian with the placement `r0`."""
+        """Return the probe at a parameter of the meridian with the placement `r0`."""
         V = r0.function_space
         ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
@@ -304,8 +305,8 @@ class MeridianModel(ThinModel):
         self.normals = {name: probe.normal for name, probe in self._probe_by_point.items()}
 
     def numbers(self) -> dict[str, list[Array]] | None:
-        """All values that its terms take from the problem, by term, as views; None if a term takes
-        others too.
+        """Return all values that its terms take from the problem, by term, as views; None if a term
+        takes others too.
         """
         has_contacts = self.contacts or self.loads.pairs
         follows = (
@@ -332,7 +333,7 @@ class MeridianModel(ThinModel):
     def with_numbers(
         self, model: "MeridianModel", numbers: SettableNumber, value: float
     ) -> "MeridianModel":
-        """The same model with the numbers of another one, which all evaluations put in place by
+        """Return this model with the numbers of another one, which all evaluations put in place by
         that value.
         """
         other = copy(self)
@@ -359,11 +360,13 @@ class MeridianModel(ThinModel):
         return self.symmetry_breaking_modes.waves
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
-        """What further deviations add to the placement."""
+        """Return the change of the placement by further deviations."""
         return self.meridian.growth(self.V, deviations)
 
     def at_nodes(self, function: Embedding) -> Array:
-        """What a function of charts is at the nodes of each cell, (cells, nodes, ...)."""
+        """Return the values of a function of charts at the nodes of each cell, (cells, nodes,
+        ...).
+        """
         s = self.V.tabulate_dof_coordinates()[:, 0]
         return np.asarray(function(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
 
@@ -407,11 +410,11 @@ class MeridianModel(ThinModel):
         return self._probe_by_point[point](u)
 
     def probe(self, point: str) -> Array:
-        """See `ModelBase`."""
+        """Return rows (3, size) that give the displacement at a named point, see `ModelBase`."""
         return self._probe_by_point[point].rows(self.system.size)
 
     def _edge_pressure(self) -> EdgePressure:
-        """What a live pressure does at the ends that move, along e3: on each is a lid."""
+        """Return the work of a live pressure at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
             Lid.disc(

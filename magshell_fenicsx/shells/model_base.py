@@ -1,4 +1,6 @@
-"""What is read off the displacement of a model with named points, shell or solid."""
+"""Base classes of models: the observations of a displacement, with named points, of shells and
+solids.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -38,7 +40,7 @@ Array = NDArray[np.float64]
 
 
 class ModelBase:
-    """The observations that a path is a table of; a model sets the attributes.
+    """Base of all models: the observations that a path is a table of. A model sets the attributes.
 
     Attributes
     ----------
@@ -105,12 +107,12 @@ class ModelBase:
 
     @cached_property
     def part_caches(self) -> dict[type, Any]:
-        """What rooms of parts keep with the model, by its class."""
+        """Caches of parts that belong to this model, by their class."""
         return {}
 
     @property
     def law_of_cells(self) -> Law:
-        """That of each cell of this rank, for arrays (cells, n) of places in them."""
+        """Law of each cell of this rank, for arrays (cells, n) of places in them."""
         return self.material.law
 
     @property
@@ -156,7 +158,7 @@ class ModelBase:
         return LinearTerm(name, *dead.entries, self.u, name, forms)
 
     def size_terms(self, name: str) -> list[FormTerm]:
-        """What the size of the loads of an amplitude is, as terms that depend on the placement."""
+        """Return the size of the loads of an amplitude as terms that depend on the placement."""
         return [
             FormTerm(f"{name} size", form, self.u, self.kernels)
             for form in self.load_sizes.get(name, ())
@@ -199,7 +201,7 @@ class ModelBase:
         return rows
 
     def region(self, state: State, approach: str) -> Region:
-        """Where a body touches."""
+        """Return the region where a body touches the shell."""
         pressing, forms = self.contacts[approach]
         evaluation = self.system.at_state(state)
         pressure, moment = (evaluation.integral(forms[name]) for name in ("pressure", "radius"))
@@ -208,7 +210,9 @@ class ModelBase:
         )
 
     def cell_pressures(self, state: State) -> Array | None:
-        """The pressure of all contacts in each local cell, see `Pressing`; None without contacts."""
+        """The pressure of all contacts in each local cell, see `Pressing`; None without
+        contacts.
+        """
         if not (self.contacts or self.shell_contacts):
             return None
         pressings = [pressing for pressing, _ in self.contacts.values()]
@@ -227,7 +231,9 @@ class ModelBase:
         return self.system.at_state(state).evaluate(pressure_of_cells)
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
-        """Whether the mean in each local cell is the pressure of a contact there, see `Pressing`."""
+        """Whether the mean in each local cell is the pressure of a contact there, see
+        `Pressing`.
+        """
         pressings = [pressing for pressing, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
@@ -238,8 +244,8 @@ class ModelBase:
         return self.system.at_state(state).evaluate(flags_of_cells)
 
     def cell_gaps(self, state: State) -> Array | None:
-        """The least gap over R in each local cell between parts of the shell, see `SurfaceContact`; None
-        without pairs.
+        """The least gap over R in each local cell between parts of the shell, see `SurfaceContact`;
+        None without pairs.
         """
         if not self.shell_contacts:
             return None
@@ -268,7 +274,7 @@ class ModelBase:
 
 
 class ThinModel(ModelBase):
-    """What a mid-surface and a meridian have in common.
+    """Base of the models of thin shells, on a mid-surface or a meridian.
 
     Attributes
     ----------
@@ -280,7 +286,9 @@ class ThinModel(ModelBase):
     kernels: KernelLog
 
     def user_and_body_energies(self, edges: Mapping[str, Facets]) -> list[Energy]:
-        """The energies of one's own terms and of bodies; sets what is observed of them."""
+        """Return the energies of the user's terms and of contact with bodies; sets what is observed
+        of them.
+        """
         factory, terms_and_facets = (
             self.factory,
             [(term, edges[term.on] if term.on else None) for term in self.loads.own],
@@ -302,7 +310,7 @@ class ThinModel(ModelBase):
 
     @property
     def domain(self) -> IntegrationDomain:
-        """Where its densities are integrated."""
+        """Domain on which the densities are integrated."""
         return self.factory.domain
 
     @property
@@ -315,7 +323,7 @@ class ThinModel(ModelBase):
         return lambda f: self.domain.revolution_factor * integral(f)
 
     def cells_of_fields(self) -> CellGeometry:
-        """Where fields are given by formulas."""
+        """Return the cells in which fields are given by formulas."""
         return spatial_fields.cell_geometry(self.r0)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:

@@ -42,8 +42,8 @@ SYMMETRY_BREAKING_LABELS = (
 
 @dataclass(frozen=True)
 class ModeSpace:
-    """The model in whose space all modes of a shell are, with those that it excludes: of a sector
-    its half.
+    """The model in whose space all modes of a shell are, those that break its symmetry too: of a
+    sector its half.
 
     Attributes
     ----------
@@ -60,8 +60,8 @@ class ModeSpace:
 
 
 def mode_space(model: Model) -> ModeSpace:
-    """Where all modes of a model are seen; of a sector kernels are compiled when it is first asked;
-    collective.
+    """Return the space of all modes of a model; of a sector, kernels are compiled at the first
+    call. Collective.
     """
     modes = None if isinstance(model, MeridianModel) else model.symmetry_breaking_modes
     return (
@@ -128,8 +128,9 @@ class ShellModes:
         Of a tangent that is not symmetric, those of its symmetric part.
 
         Waves count once, though each has a twin turned by a quarter of its length. If the state is
-        the undeformed one of a `allows_rigid_motion` shell, its rigid motions are among them, with an eigenvalue
-        of exactly zero. Compiles a mass matrix when it is first called, and the waves' kernels.
+        the undeformed one of a `allows_rigid_motion` shell, its rigid motions are among them, with
+        an eigenvalue of exactly zero. Compiles a mass matrix when it is first called, and the
+        waves' kernels.
 
         Raises
         ------

@@ -79,7 +79,7 @@ class Revolution:
         return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
-        """The same at reference points (q, 1) inside all cells: (6, cells, q, 3)."""
+        """Return jets (6, cells, q, 3) at reference points (q, 1) inside all cells, as `jets`."""
         return _revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
@@ -144,7 +144,9 @@ class Revolution:
         return np.asarray(sums(weight * ends) / sums(weight))
 
     def _swept(self, nodal: Array) -> Array:
-        """(rho, z) components at the meridian's nodes -> vectors at the poles and on the circles."""
+        """(rho, z) components at the meridian's nodes -> vectors at the poles and on the
+        circles.
+        """
         components = nodal[self.vertices(self._model.V)]
         components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]
         return self.at_nodes(

@@ -1,4 +1,4 @@
-"""The shell as a system of terms: only those that its loads and edges call for.
+"""The model of a thin shell: a system of those terms that its loads and edges call for.
 
 Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
 F R/(2 pi D), "lambda_m" is lambda_m.
@@ -514,7 +514,7 @@ class ShellModel(ThinModel):
         )
 
     def _as_half(self, midsurface: Midsurface) -> "ShellModel":
-        """The same shell on the mid-surface of a half."""
+        """Return this shell on the mid-surface of a half."""
         material, degree, conditions, loads, sigma, thickness = self._arguments
         conditions = {name: c for name, c in conditions.items() if name != SECOND_SYMMETRY_EDGE}
         plane = Mirror.through_axis(self.mirror.azimuth)
@@ -525,12 +525,12 @@ class ShellModel(ThinModel):
         return self._mirrored_facets
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
-        """What further deviations add to the placement."""
+        """Return the change of the placement by further deviations."""
         return self.midsurface.growth(self.V, deviations)
 
     def at_nodes(self, function: Embedding) -> NDArray[np.float64]:
-        """What a function of the triangulation's nodes is at the nodes of each cell, (cells, nodes,
-        ...).
+        """Return the values of a function of the triangulation's nodes at the nodes of each cell,
+        (cells, nodes, ...).
         """
         return self.midsurface.evaluate(self.V.element.basix_element.points, function)
 
@@ -539,7 +539,9 @@ class ShellModel(ThinModel):
         return self._at_nodes(self.midsurface.chart_coordinates(self.V))
 
     def chart_by_shell(self) -> NDArray[np.float64]:
-        """The same, of several shells that have charts in that of each node's shell."""
+        """Return the coordinates of this rank's nodes in the charts of their shells, see
+        `chart`.
+        """
         return self._at_nodes(self.midsurface.chart_coordinates_by_shell(self.V))
 
     def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:

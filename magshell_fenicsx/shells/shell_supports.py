@@ -1,4 +1,5 @@
-"""Supports and mirror planes of a shell: constraints of its displacement, and energies of its edges.
+"""Supports and mirror planes of a shell: constraints of its displacement, and energies of its
+edges.
 
 Edges, patches and points have conditions by name. An edge that is clamped, or that lies on a mirror
 plane, has an energy too, since a C0 displacement alone does not hold its normal.
@@ -107,7 +108,9 @@ class ShellSupports:
         self.mirror_constraints.append(support_along(self._V, 1, facets, plane.normal))
 
     def _add_plane_of_shell(self, name: str) -> Support:
-        """Add the plane of an edge, a symmetry of the shell as it is described; return its support."""
+        """Add the plane of an edge, a symmetry of the shell as it is described; return its
+        support.
+        """
         facets = self._midsurface.edges[name]
         plane = plane_of(self._r0, facets, name)
         self.planes.append(plane)

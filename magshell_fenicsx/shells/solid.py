@@ -215,7 +215,7 @@ class SolidModel(ModelBase):
         return lambda f: f * ufl.dx(domain=self.V.mesh)
 
     def cells_of_fields(self) -> CellGeometry:
-        """Where fields are given by formulas."""
+        """Return the cells in which fields are given by formulas."""
         return body_cell_geometry(self.V)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
@@ -232,7 +232,9 @@ class SolidModel(ModelBase):
         return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
     def _rim(self, facets: NDArray[np.int32], height: float) -> EdgeCurve:
-        """Where the pressed surface ends on the faces of an end, at a height over the thickness."""
+        """Return the curve that ends the pressed surface on the faces of an end, at a height over
+        the thickness.
+        """
         links = self.body.mesh.topology.connectivity(2, 3)
         low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
         has_height = (low < height - ROUNDING) & (height < high + ROUNDING)

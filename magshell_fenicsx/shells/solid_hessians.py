@@ -1,7 +1,8 @@
-"""Where the solid's terms live: the Hessians of their densities at points, contracted in batches.
+"""Element matrices of a solid's terms: the Hessians of their densities at points, contracted in
+batches.
 
-As on the shell (see `models.shell.element_hessians`), with the jets in reference coordinates: the tables of
-the shape functions are the same for all cells.
+As on the shell (see `models.shell.element_hessians`), with the jets in reference coordinates: the
+tables of the shape functions are the same for all cells.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +41,7 @@ SIZES = {"body": 13, "outer": 12, "end": 19}
 
 
 class BodyHessianIntegral:
-    """Where some terms live with the same quadrature.
+    """Integral of the Hessians of terms with the same quadrature, over cells or faces.
 
     Parameters
     ----------
@@ -100,7 +101,9 @@ class BodyHessianIntegral:
         element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices to `element_matrices`; see `models.shell.element_hessians.HessianIntegral.add`."""
+        """Add the terms' element matrices to `element_matrices`; see
+        `models.shell.element_hessians.HessianIntegral.add`.
+        """
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:

@@ -1,4 +1,4 @@
-"""The densities as terms: each compiled once, and only when a scene calls for it."""
+"""Terms of a solid from its densities: each is compiled once, and only when a scene has it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -114,7 +114,7 @@ class TermFactory:
     )  # of a soft material, when it was made
 
     def distortions(self) -> list[SolidTerm]:
-        """What does not depend on a change of volume; of a neo-Hookean body one term."""
+        """Return the terms of distortion, without change of volume; a neo-Hookean body has one."""
         shear, share = self.material.shear, self.material.share
         densities_and_shares = {
             "distortion": (body_densities.distortion, 1 - share),
@@ -131,8 +131,8 @@ class TermFactory:
         ]
 
     def compression(self) -> SolidTerm:
-        """With two quadrature points in each direction: more constraints on J than that would lock
-        the element.
+        """Return the term of volume change, with two quadrature points in each direction: more
+        constraints on J would lock the element.
 
         The same as a discontinuous trilinear pressure, eliminated (Malkus and Hughes, Comput.
         Methods Appl. Mech. Eng. 15, 1978), so the tangent is that of displacements alone and its
@@ -166,7 +166,9 @@ class TermFactory:
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> SolidTerm:
-        """What the field makes of a soft body, see `EnergyFactory.soft_magnetic`."""
+        """Return the term of a soft-magnetic body in the field, see
+        `EnergyFactory.soft_magnetic`.
+        """
         sheet, (scale, h) = Sheet(field), self._constants(soft_magnet.scale, self.h)
         law, n0, *parameters = self._of_sheet(sheet, soft_magnet, applied)
         density = SolidDensity(
@@ -221,7 +223,7 @@ class TermFactory:
         amplitudes: Sequence[fem.Constant],
         applied: AppliedField | None,
     ) -> PointField:
-        """What is known of a material that saturates, at the points of cells."""
+        """Return the magnetisation state of a material that saturates, at the points of cells."""
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
@@ -328,7 +330,9 @@ class TermFactory:
         )
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
-        """What it observes on the outer face, or of the body."""
+        """Return the integrals that a term observes, by column, on the outer face or of the
+        body.
+        """
         if term.of_volume:
             densities = {
                 column: self._volume_density(term, density_function)
@@ -362,7 +366,7 @@ class TermFactory:
         return density.function(X, self.u, H, *density.parameters) * dx
 
     def _face_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
-        """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
+        """Return the density of a mid-surface on the outer face, per area of the reference cell."""
         flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
         def on_face(

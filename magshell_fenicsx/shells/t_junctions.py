@@ -2,9 +2,9 @@
 
 Points of the edge, as many on each side of a triangle as the degree and on a meridian one, are tied
 to the places of the other mid-surface at which they are undeformed. So the edge follows the other
-shell, whose own displacements stay free: cells need not meet. Both ties are springs, `TIE_STIFFNESS_RATIO` times
-as stiff as an element beside them. With n of the edge's cell and m of the other shell, t along the
-edge, s = t . (n x m) and c = n . m:
+shell, whose own displacements stay free: cells need not meet. Both ties are springs,
+`TIE_STIFFNESS_RATIO` times as stiff as an element beside them. With n of the edge's cell and m of
+the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
 """
@@ -129,10 +129,10 @@ class TieTerm:
     # as a term
 
     def compile_residual(self) -> None:
-        """Its kernels are compiled."""
+        """Compile nothing: the kernels of the term are compiled with it."""
 
     def compile_tangent(self) -> None:
-        """Its kernels are compiled."""
+        """Compile nothing: the kernels of the term are compiled with it."""
 
     def energy(self) -> float:
         u = global_values(self._u)
@@ -157,12 +157,12 @@ class TieTerm:
         return _entries(self._unknowns, self._second_variation(self._gaps, self._tangents))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """See `NonlocalTerm`: those that act on each other always do."""
+        """Return the pairs of nodes that act on each other, which always do; see `NonlocalTerm`."""
         return pairs_of(self._unknowns[:, :: self._size] // self._size)
 
     @property
     def pattern_key(self) -> float:
-        """See `NonlocalTerm`."""
+        """Key of the pattern, see `NonlocalTerm`: it never changes."""
         return 0.0
 
     def _second_variation(self, gap: Array, tangents: Array) -> Array:
@@ -298,7 +298,7 @@ class EdgeOnShell:
     clearance: float
 
     def refuse_misplaced(self, comm: MPI.Comm, h: float, key: str, joint: Joint) -> None:
-        """See that the edge is on the other shell, and its own shell is not; collective.
+        """Refuse an edge that is not on the other shell, or whose own shell is; collective.
 
         Raises
         ------
@@ -309,7 +309,8 @@ class EdgeOnShell:
         if min(comm.allgather(self.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
             edge, other = joint.edges
             raise MeshError(
-                f"{key}: the shell of the edge {edge} lies in the mid-surface of {other}, where both take the same "
+                f"{key}: the shell of the edge {edge} lies in the mid-surface of {other}, where "
+                "both take the same "
                 "place: turn it out, or join edges of both"
             )
 
@@ -332,7 +333,7 @@ class MidSurfaces:
 
     @classmethod
     def gather(cls, r0: fem.Function) -> Self:
-        """Those of a placement; collective."""
+        """Return the mid-surfaces of a placement; collective."""
         return cls(r0.function_space, GlobalCells.gather(r0.function_space), global_values(r0))
 
     @property
@@ -378,8 +379,8 @@ class MidSurfaces:
         )
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
-        """For points (n, 3) the nearest of some cells, the place in it (n, 2), and the distance,
-        inf without a cell.
+        """Return for points (n, 3) the nearest of some cells, the place in it (n, 2), and the
+        distance, inf without a cell.
         """
         from scipy.spatial import cKDTree  # takes long to import
 
@@ -468,8 +469,8 @@ class MeridianTJunction(TieTerm):
         super().__init__(joint, r0, u, *of_u, np.array([[0.0, 1.0]]), ties, log)
 
     def entries_of_waves(self, m: float) -> Entries:
-        """Those of the second variation along waves, by the coefficients (U + V, V, W), as
-        `shells.waves` has it.
+        """Return the entries of the second variation along waves, by the coefficients (U + V, V,
+        W), see `shells.waves`.
         """
         cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
         sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
@@ -481,8 +482,8 @@ class MeridianTJunction(TieTerm):
         return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
 
     def _maps(self, components: Array) -> tuple[Array, Array]:
-        """`gap` and `tangents`; `components` (2, 3, c) makes of a node's numbers its vector, and the
-        derivative around e3.
+        """`gap` and `tangents`; `components` (2, 3, c) makes of a node's numbers its vector, and
+        the derivative around e3.
         """
         value, derivative = components
         places, tangents = [], []
@@ -543,7 +544,7 @@ def _refuse_parallels_apart(
 def refuse_misplaced_parallels(
     joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float
 ) -> None:
-    """See that the edges of T-junctions are on the other shell, as a model of the meridian does.
+    """Refuse T-junctions of meridians whose edge is not on the other shell, as a model does.
 
     Raises
     ------
@@ -594,7 +595,8 @@ def _refuse_apart(
             else "by more than a cell"
         )
         raise MeshError(
-            f"{key}: the edge {edge} is not on the mid-surface of {other}, {distance_text} at {place_text(place)}, over R: "
+            f"{key}: the edge {edge} is not on the mid-surface of {other}, {distance_text} at "
+            f"{place_text(place)}, over R: "
             "move one of the shells"
         )
 
@@ -660,7 +662,8 @@ def _t_junction_joints(
 def refuse_misplaced_edges(
     joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float
 ) -> None:
-    """See that the edges of T-junctions are on the other shell, as a model does; collective.
+    """Refuse T-junctions of surfaces whose edge is not on the other shell, as a model does;
+    collective.
 
     Raises
     ------
@@ -677,7 +680,7 @@ def refuse_misplaced_edges(
 
 
 def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
-    """The T-junctions of a model; collective."""
+    """Return the T-junctions of a model on a mid-surface; collective."""
     surface = model.midsurface
     tied = _t_junction_joints(model.loads.joints, surface)
     if not tied:
@@ -700,7 +703,7 @@ def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
 
 
 def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]:
-    """The same of a meridian."""
+    """Return the T-junctions of a model on a meridian."""
     meridian, factors, log = model.meridian, _stiffness_factors(model), model.kernels
     tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
     return [

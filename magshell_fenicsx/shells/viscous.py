@@ -51,7 +51,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Memory:
-    """What a step leaves.
+    """State of the branches after a step.
 
     Attributes
     ----------
@@ -156,7 +156,9 @@ class Viscosity:
             return self._model.system.tangent(u, mu)
 
     def stiffness(self, dt: float, rate: float) -> float:
-        """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
+        """Return the factor of the elastic tangent that a step adds to it; `rate` is dv/du at the
+        end of the step.
+        """
         return self.creep_time * rate + sum(
             b.modulus * (_retained_share(b, dt) + self._bending_share(b, dt) / dt)
             for b in self._branches
@@ -189,7 +191,7 @@ class Viscosity:
         )
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
-        """Of a stress at nodes, and of edges that open from u0 to u1."""
+        """Return the forces of a stress at nodes, and of edges that open from u0 to u1."""
         prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         prescribed.stiffness.value = stiffness
@@ -213,7 +215,9 @@ class Viscosity:
         ]
 
     def _bending_share(self, branch: Branch, dt: float) -> float:
-        """What a change of the mean rate from the step before to this one leaves in the spring."""
+        """Return the part of a change of the mean rate, from the last step to this one, that is
+        left in the spring.
+        """
         return (
             0.0
             if self.memory.rate is None
@@ -249,8 +253,8 @@ class Viscosity:
 
 
 class _AddedViscousTangent:
-    """The tangent of viscous forces whose law is not that of the elastic ones; one of the system's
-    `AddedTangent`.
+    """Tangent of viscous forces whose law is not that of the elastic ones; an `AddedTangent` of the
+    system.
 
     Viscous stresses are those of small strains: they make stiff what the strains of a stretched
     shell leave soft.
@@ -279,7 +283,7 @@ class _AddedViscousTangent:
             self._stiffness.value = 0.0
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """See `AddedTangent`."""
+        """Return a tangent with the viscous one added, see `AddedTangent`."""
         if not self._stiffness.value:
             return K
         self._since.x.array[:] = self._system.u.x.array
@@ -292,12 +296,14 @@ class _AddedViscousTangent:
         return stiffer
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """See `AddedTangent`: viscous forces have no part in what moves a support."""
+        """Return zero, see `AddedTangent`: viscous forces have no part in what moves a support."""
         return np.zeros_like(v)
 
 
 def _retained_share(branch: Branch, dt: float) -> float:
-    """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
+    """The part of a strain that grows evenly in a step and that is left in the spring at its
+    end.
+    """
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
 
 
@@ -310,8 +316,8 @@ def _curvature_weight(z: float) -> float:
 
 @dataclass(frozen=True)
 class _PrescribedStress:
-    """What viscous forces depend on: stresses at nodes, and two displacements between which edges
-    open, how stiffly.
+    """Inputs of viscous forces: stresses at nodes, and two displacements between which edges open,
+    with their stiffness.
     """
 
     field: fem.Function
@@ -335,8 +341,8 @@ class _PrescribedStress:
 
 
 class _StrainRates:
-    """What takes the place of `_PrescribedStress` in the forces' derivative: strains and jumps by a change of
-    a displacement.
+    """Strains and jumps by a change of the displacement; they replace `_PrescribedStress` in the
+    derivative of the forces.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
@@ -344,14 +350,14 @@ class _StrainRates:
         self._jet = model.factory.domain.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """See `_PrescribedStress`."""
+        """Return the change of strain and curvature, see `_PrescribedStress`."""
         E, K = _strains(j, self._jet.side(side) if side else self._jet)
         return ufl.derivative(E, self.since, self._change), ufl.derivative(
             K, self.since, self._change
         )
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """See `_PrescribedStress`."""
+        """Return the change of an edge's jump, see `_PrescribedStress`."""
         return ufl.derivative(jump(domain.j0 + self._jet), self.since, self._change)
 
 
@@ -372,7 +378,7 @@ def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
 
 
 def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
-    """Of the deformed jet, by how much an edge is open."""
+    """Return the opening of an edge as a function of the deformed jet."""
     if edge.plane is not None:
         return mirrored_jump(r0, m, edge.plane)
     n0 = kin.normal(r0)
@@ -392,7 +398,7 @@ def _works(
     r0, u, t, m = domain.j0, domain.jet(model.u), factory.thickness, domain.covector
 
     def law(j: Jet, side: str = "") -> Law:
-        """That of the shell at small strains, which a viscous stress follows too."""
+        """Law of the shell at small strains, which a viscous stress follows too."""
         of_shell, law_hereerials = (
             densities.law_at(model.material.law.linear, j),
             factory.cell_materials,

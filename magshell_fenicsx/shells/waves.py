@@ -100,7 +100,7 @@ class Waves:
         self._factorisation, self._counting = (Factorisation(self.V.mesh.comm) for _ in range(2))
 
     def for_system(self, system: FiniteElementSystem, largest: int) -> "Waves":
-        """Those of another system with the same terms."""
+        """Return the waves of another system with the same terms."""
         _ = self._bands, self._rows_of_matrix  # both have these
         other = copy(self)
         other._set_system(system)
@@ -114,7 +114,7 @@ class Waves:
         return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
 
     def _with_nonlocal_entries(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
-        """With the entries of contacts at a state."""
+        """Return the matrix K with the entries of contacts and T-junctions at a state."""
         if not self.nonlocal_terms:
             return K
         entries = self._system.at_state(state).evaluate(
@@ -141,11 +141,15 @@ class Waves:
         return self._energies
 
     def constraints(self, m: int) -> list[fem.DirichletBC]:
-        """What is held at the axis and at the ends: a wave m = 1 may move the axis across itself."""
+        """Return the constraints at the axis and at the ends: a wave m = 1 may move the axis across
+        itself.
+        """
         return self._held_once if m == 1 else self._held
 
     def factor_at(self, state: State, m: int) -> Factorisation:
-        """Factor the matrix of Q_m at an axisymmetric state; the next call overwrites the factors."""
+        """Factor the matrix of Q_m at an axisymmetric state; the next call overwrites the
+        factors.
+        """
         self._factorisation.factor(self.tangent(state, m))
         return self._factorisation
 
@@ -175,14 +179,16 @@ class Waves:
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
     def counts_from(self, values: NDArray[np.float64]) -> list[int]:
-        """See `counts`, from `sampled_matrices`."""
+        """Return `counts` from the matrices that `sampled_matrices` gives."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
-        """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive definite."""
+        """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive
+        definite.
+        """
         ranges = self._pieces
         try:
             return {m - 1 for m in self._indefinite(values)}
@@ -200,7 +206,7 @@ class Waves:
 
     @cached_property
     def _bands(self) -> "list[BandedMatrices]":
-        """Of m = 1, and of all others."""
+        """Banded matrices of m = 1, and of all other m."""
         return [BandedMatrices(*self._sparsity, self._rows(m)) for m in (1, 2)]
 
     @cached_property
@@ -302,7 +308,7 @@ class Waves:
 
 
 def largest_wave_number(meridian: Meridian, length: float) -> int:
-    """See `Waves.largest`."""
+    """Return the largest m that is looked at, see `Waves.largest`."""
     return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
@@ -332,8 +338,8 @@ class _WaveRange:
 def _lagrange_weights(
     nodes: NDArray[np.float64], places: NDArray[np.float64] | NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """What the values at some nodes weigh in their polynomial's values at other places; (places,
-    nodes).
+    """Return the weights (places, nodes) of values at nodes in their polynomial's values at other
+    places.
     """
     others = [np.delete(nodes, i) for i in range(len(nodes))]
     columns = [
@@ -371,18 +377,20 @@ class WaveFamily:
 
 @dataclass(frozen=True)
 class SymmetryBreakingWaves:
-    """All that are looked at."""
+    """All waves around the axis that are looked at."""
 
     waves: Waves
 
     @property
     def families(self) -> Sequence[ModeFamily]:
-        """For a `StabilityMonitor`: every number of waves by itself."""
+        """Families of a `StabilityMonitor`: one for each m."""
         return [WaveFamily(self.waves, m) for m in range(1, self.waves.largest + 1)]
 
     @property
     def tangents(self) -> Waves | None:
-        """For a `StabilityMonitor`; those of contacts have no pattern in common."""
+        """Tangents for a `StabilityMonitor`; None with contacts, whose entries have no pattern in
+        common.
+        """
         return None if self.waves.nonlocal_terms else self.waves
 
     def counts(self, state: State) -> Sequence[int]:
@@ -443,6 +451,8 @@ class BandedMatrices:
         return stacked
 
     def is_positive_definite(self, bands: Array, weights: Array) -> bool:
-        """Whether the weighted sum of some matrices is positive definite; the weights' sum is one."""
+        """Whether the weighted sum of some matrices is positive definite; the weights' sum is
+        one.
+        """
         band = (weights @ bands).reshape(self._shape, order="F")
         return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)

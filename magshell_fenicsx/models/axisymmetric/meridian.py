@@ -1,4 +1,6 @@
-"""The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
+"""The meridian of a surface of revolution: an interval mesh and, apart from it, the placement
+r0.
+"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -111,8 +113,8 @@ class Meridian:
 
     @property
     def joints(self) -> list[Array | None]:
-        """Of each joint 1 in the cell that ends there, -1 in that which begins, else 0; None of a
-        T-junction.
+        """Marks (cells,) of each joint: 1 in the cell that ends there, -1 in that which begins,
+        else 0; None for a T-junction.
         """
         end_matches = [
             np.abs(self._cell_ends - first) < PARAMETER_TOLERANCE for first, _ in self.tied
@@ -124,7 +126,7 @@ class Meridian:
 
     @property
     def _cell_ends(self) -> Array:
-        """The same in the order of the cells' numbers."""
+        """Parameters (cells, 2) at the ends of the cells, in the order of the cells' numbers."""
         return np.sort(self.mesh.geometry.x[compat.geometry_dofs(self.mesh), 0], axis=1)
 
     def _parameters_of(self, facets: NDArray[np.int32]) -> Array:
@@ -158,7 +160,7 @@ class Meridian:
         return max(angles)
 
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
-        """What further deviations add to the placement in the same space."""
+        """Return the change of the placement by further deviations, in the same space."""
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
         assert isinstance(self.embedding, DeviatedEmbedding)
         growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[
@@ -310,7 +312,8 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
             )
         if not cell_numbers[-1] < MAX_CELLS:
             raise MeshError(
-                f"mesh: the meridian would have {cell_numbers[-1]:.2g} cells, allowed {MAX_CELLS:g}: take a larger "
+                f"mesh: the meridian would have {cell_numbers[-1]:.2g} cells, allowed "
+                f"{MAX_CELLS:g}: take a larger "
                 "mesh.size, a lower mesh.refinement, or larger bodies"
             )
         cells = int(np.ceil(cell_numbers[-1]))

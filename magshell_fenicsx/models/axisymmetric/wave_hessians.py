@@ -18,10 +18,10 @@ from magshell_fenicsx.assembly.batches import EntityBatch, EntityRule
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo
 from magshell_fenicsx.assembly.point_kernels import PointKernel, PointStorage, full_hessian
-from magshell_fenicsx.models.domains import IntegrationDomain, Energy, revolved_jet_of, wave_jets_of
+from magshell_fenicsx.models.domains import Energy, IntegrationDomain, revolved_jet_of, wave_jets_of
+from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, parameters_at
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.element_hessians import fill, on_batches, parameters_at
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -341,7 +341,9 @@ def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) ->
 
 
 def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
-    """Where a density lives: energies with the same one share their points."""
+    """Return a key of the cells, vertices or end of a density; energies with the same key share
+    their points.
+    """
     assert e.density
     facets = () if e.density.facets is None else tuple(int(facet) for facet in e.density.facets)
     return e.density.sides, e.density.quadrature or 0, facets

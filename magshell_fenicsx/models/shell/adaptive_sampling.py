@@ -1,5 +1,5 @@
-"""SubCells of cells in which a formula has values that samples do not show, however small these parts
-are.
+"""SubCells of cells in which a formula has values that samples do not show, however small these
+parts are.
 
 The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with
 values at a few places. A part is divided while what the ranges leave open between these may change
@@ -31,9 +31,9 @@ DIVIDED_SHARE = 0.03  # of the largest part of that: what is divided now, before
 VALUE_TOLERANCE = 1e-9  # of the largest value
 MIN_SIZE, MAX_VALUE = 1e-7, 1e150  # over R, and a value
 MAX_PARTS = 60_000  # parts in all
-CHILDREN: dict[
-    int, list[tuple[tuple[float, ...], tuple[float, ...]]]
-] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
+# corner and scale along each axis of the parts of an interval, of a triangle, and of a body's cell
+# (in its surface)
+CHILDREN: dict[int, list[tuple[tuple[float, ...], tuple[float, ...]]]] = {
     1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
     2: [
         ((x, y), (s, s))
@@ -55,7 +55,7 @@ class SubCells:
         return SubCells(self.cell[which], self.corner[which], self.sides[which])
 
     def in_each_cell(self, cells: Numbers) -> "SubCells":
-        """The same in each of some cells."""
+        """Return these parts in each of some cells."""
         count = len(cells)
         numbers = np.repeat(cells, len(self.cell))
         return SubCells(numbers, np.tile(self.corner, (count, 1)), np.tile(self.sides, (count, 1)))
@@ -109,7 +109,7 @@ class Lattice:
 
     @classmethod
     def make(cls, kind: basix.CellType, count: int) -> "Lattice":
-        """With `count` parts of each side."""
+        """Return the lattice that divides each side into `count` parts."""
         corners = basix.geometry(kind)
         interior = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
         X = np.concatenate([corners, interior])
@@ -122,8 +122,8 @@ class Lattice:
         return cls(X, len(corners), pairs, count)
 
     def bent(self, f: Array) -> Array:
-        """By how much derivatives of values (parts, n, formulas), times the sides, differ: (parts,
-        formulas).
+        """Return the variation of the derivatives of values (parts, n, formulas), times the sides:
+        (parts, formulas).
         """
         slopes = (self.count * (f[:, pairs[:, 1]] - f[:, pairs[:, 0]]) for pairs in self.pairs)
         return np.asarray(sum(np.ptp(slope, axis=1) for slope in slopes))
@@ -221,8 +221,16 @@ def refine_where_hidden(
 
 @dataclass(frozen=True)
 class _Samples:
-    """Of each part area, centre, size, what may be between its values, and these (parts, places,
-    formulas).
+    """Samples of formulas in parts of cells.
+
+    Attributes
+    ----------
+    area, centre, size
+        (parts,), (parts, 3) and (parts,): size is the largest side of the part's box.
+    hidden
+        (parts,) how far formulas may leave the range of their values between the places.
+    values
+        (parts, places, formulas).
     """
 
     area: Array

@@ -63,7 +63,8 @@ def antisymmetric_edge(
 
 
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a `continuation.stability_monitor.ModeFamily`.
+    """The tangent of the modes that a half model excludes; a
+    `continuation.stability_monitor.ModeFamily`.
 
     Attributes
     ----------
@@ -93,7 +94,7 @@ class AntisymmetricModes:
 
     @property
     def families(self) -> Sequence[ModeFamily]:
-        """For a `StabilityMonitor`: they are one."""
+        """Families of a `StabilityMonitor`: all antisymmetric modes are one."""
         return [self]
 
     def counts(self, state: State) -> Sequence[int]:

@@ -102,8 +102,9 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_thinned(
     r0: Jet, u: Jet, Br: Expr, Ba: Expr, *, natural: Forms | None = None, thins: Expr | int = 1
 ) -> Expr:
-    """That of a volume that stays where `thins` is 1: n (x) n0 in F has the stretch of the thickness, of the `natural`
-    volume."""
+    """Magnetic density where the thickness follows from the area (`thins` is 1): in F n (x) n0 is
+    stretched so that the `natural` volume stays.
+    """
     r, n0 = r0 + u, kin.normal(r0)
     thinned = kin.area_ratio(r0) / kin.area_ratio(r)
     if natural is not None:
@@ -127,7 +128,9 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
 
 
 def in_space(law: MagneticDensity) -> MagneticDensity:
-    """That of a field known by values, of (r0, u, Br, P): P as of `field_at_displacement`; `law` as above."""
+    """Return the density in a field known by values, of (r0, u, Br, P): P as in
+    `field_at_displacement`; `law` as in `in_gradient`.
+    """
 
     def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **options: Any) -> Expr:
         B, change = field_at_displacement(P, u.r)
@@ -205,7 +208,9 @@ def follower_pressure_work(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) ->
 
 
 def field_at_displacement(P: Expr, u: Expr) -> tuple[Expr, Expr]:
-    """B at the displacement u from the polynomial P (`FIELD_POLYNOMIAL_SIZE`,), and less what it is at u = 0."""
+    """B at the displacement u from the polynomial P (`FIELD_POLYNOMIAL_SIZE`,), and less what it is
+    at u = 0.
+    """
     d = u - ufl.as_vector([P[i] for i in range(3)])
 
     def component(i: int) -> Expr:

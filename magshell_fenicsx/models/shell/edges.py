@@ -119,8 +119,8 @@ def fold(
     law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
-    """The same across a fold of the undeformed surface: the jump is the change of the angle,
-    whatever its size.
+    """Energy of an interior edge across a fold of the undeformed surface: the jump is the change of
+    the angle, whatever its size.
 
     b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a
     narrow bend has it.
@@ -147,8 +147,8 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, reference_tu
     normal.
 
     The tangent runs with the surface on its left, so that a positive angle turns the normal
-    outward. The angle is that of the normal's part normal to the tangent; `reference_turn` (2,) holds cosine
-    and sine of the turn that it is counted from, so that it may grow beyond pi.
+    outward. The angle is that of the normal's part normal to the tangent; `reference_turn` (2,)
+    holds cosine and sine of the turn that it is counted from, so that it may grow beyond pi.
     """
     edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))

@@ -1,4 +1,4 @@
-"""Where terms live: the Hessians of their densities at points, contracted in batches.
+"""Element matrices of terms: the Hessians of their densities at points, contracted in batches.
 
 The densities are covariant, so the jets are taken in reference coordinates: the tables of the
 shape functions are then the same for all cells.
@@ -42,7 +42,8 @@ DERIVATIVE_RANK = (
 
 
 class HessianIntegral:
-    """Where some terms live together: the cells, the interior edges, or some boundary edges.
+    """Integral of the Hessians of terms that share their points: on cells, interior edges, or some
+    boundary edges.
 
     Parameters
     ----------
@@ -238,7 +239,9 @@ def _strain(r0: Array, u: Array) -> Array:
 
 
 def _pairs(density: Density) -> BlockPairs:
-    """Those of the parts that the density depends on, without those in which it is linear."""
+    """Return the pairs of jet parts that the density's Hessian has; those in which it is linear
+    have none.
+    """
     parts = [JET_NAMES.index(name) for name in density.parts]
     linear = [JET_NAMES.index(name) for name in density.linear]
 

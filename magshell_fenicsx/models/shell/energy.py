@@ -83,7 +83,7 @@ class Density:
         edge: tuple[Sequence[Expr], Expr] | None,
         parameters: Sequence[Parameter],
     ) -> Expr:
-        """Its value.
+        """Return the value of the density, or of its virtual work, at given jets.
 
         Parameters
         ----------
@@ -131,7 +131,9 @@ def cell_quadrature(degree: int) -> int:
 
 
 def edge_quadrature(degree: int) -> int:
-    """Two degrees below the cells' rule: F at w/h = 20 moves by 2e-5, the edges cost a fifth less."""
+    """Two degrees below the cells' rule: F at w/h = 20 moves by 2e-5, the edges cost a fifth
+    less.
+    """
     return 2 * degree - 2
 
 
@@ -139,7 +141,9 @@ class AtPoints(Protocol):
     """Computes energies without forms, see `residual.FastResidual`."""
 
     def energy(self, name: str) -> float:
-        """That of a term on this rank's part, at the present u; collective at first."""
+        """Return the energy of a term on this rank's part, at the present u; collective at
+        first.
+        """
 
 
 class ShellTerm(DensityTerm[Density]):
@@ -183,7 +187,7 @@ class HessianTerm:
         return 0.0
 
     def compile_residual(self) -> None:
-        """There is none."""
+        """Compile nothing: the term has no residual."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Symmetric states are in equilibrium with antisymmetric forces."""
@@ -222,7 +226,8 @@ def constants_of(
             return p
         if isinstance(p, Coefficient | UserField):
             raise MeshError(
-                f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on this mesh, "
+                f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on "
+                "this mesh, "
                 "see ms.Shell"
             )
         assert not isinstance(p, FormulaParameter)  # a model has made a function of it

@@ -1,4 +1,6 @@
-"""The tangent without compiled tangent forms, from the point Hessians of the terms' own densities."""
+"""The tangent without compiled tangent forms, from the point Hessians of the terms' own
+densities.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -22,6 +24,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint
 from magshell_fenicsx.assembly.scatter import BlockMatrix
 from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.models.shell.element_hessians import HessianIntegral
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,
@@ -29,7 +32,6 @@ from magshell_fenicsx.models.shell.energy import (
     cell_quadrature,
     edge_quadrature,
 )
-from magshell_fenicsx.models.shell.element_hessians import HessianIntegral
 
 Array = NDArray[np.float64]
 
@@ -38,7 +40,7 @@ Weighted = tuple[float, Array]
 
 
 class ElementIntegral(Protocol):
-    """What `FastTangent` sums.
+    """Integral that adds element matrices to a `FastTangent`.
 
     Attributes
     ----------

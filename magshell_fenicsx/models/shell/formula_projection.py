@@ -248,7 +248,9 @@ def _uniform_parts(cells: CellGeometry) -> SubCells:
 
 
 def sampling_points(cells: CellGeometry) -> tuple[Array, Array]:
-    """Their places (parts, q, d) in the reference cell, and weights (parts, q)."""
+    """Return the points (parts, q, d) in the reference cell at which formulas are sampled, and
+    weights (parts, q).
+    """
     return _uniform_parts(cells).rule(
         *basix.make_quadrature(cells.element.cell_type, RULE_DEGREE[cells.dimension])
     )
@@ -256,7 +258,7 @@ def sampling_points(cells: CellGeometry) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _HiddenDetail:
-    """What is between the places of whole cells.
+    """Detail of formulas that the samples of whole cells do not show.
 
     Attributes
     ----------
@@ -282,7 +284,9 @@ class _HiddenDetail:
         return cls(np.zeros(cells), variation, no_parts, np.zeros(cells, bool), open_)
 
     def parts_of(self, cells: Numbers, uniform_parts: SubCells) -> SubCells:
-        """Of some cells: those that are alike, but of the divided ones the leaves, none larger."""
+        """Return the parts of some cells: uniform ones, but those that the search made of divided
+        cells; none is larger than the uniform.
+        """
         deep = self.deep[cells]
         if not deep.any():
             return uniform_parts.in_each_cell(cells)
@@ -301,8 +305,8 @@ class _HiddenDetail:
 def _find_hidden_detail(
     values: Values, formulas: FormulaGroup, cells: CellGeometry, sampled_integrals: Array
 ) -> _HiddenDetail:
-    """Integrals (cells, components) compared with those over leaves, see `adaptive_sampling.leaves`;
-    collective.
+    """Integrals (cells, components) compared with those over leaves, see
+    `adaptive_sampling.leaves`; collective.
     """
     d, kind = cells.dimension, cells.element.cell_type
     lattice, (points, weights) = (

@@ -26,9 +26,9 @@ from magshell_fenicsx.assembly.point_kernels import (
     point_gradient,
     point_values,
 )
+from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, fill, parameters_at
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, fill, parameters_at
 
 Array = NDArray[np.float64]
 CHUNK_POINTS = 16384  # points at a time: their vectors stay within some ten megabytes
@@ -36,7 +36,7 @@ FRAME_SIZE = 4  # numbers of a cell's frame, see `cell_frames`
 
 
 class PointTerm(Protocol):
-    """What has a density."""
+    """A term with a density."""
 
     @property
     def name(self) -> str: ...
@@ -139,8 +139,8 @@ class PointGradient:
         return self._chunks
 
     def input_array(self, chunk: slice) -> Array:
-        """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts *
-        3).
+        """Array (points, sides * parts * 3) to be filled with the derivatives of u in reference
+        coordinates.
         """
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
@@ -156,7 +156,7 @@ class PointGradient:
 
 @dataclass
 class _KernelInput:
-    """What a kernel takes besides u.
+    """An input of a kernel besides u.
 
     Attributes
     ----------
@@ -184,7 +184,9 @@ def _field_values(field: fem.Function, values: Callable[[fem.Function], Array]) 
 
 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
-    """From the derivatives by the reference coordinates; of expressions, or of arrays."""
+    """Jet in the cell's own coordinates from that in reference coordinates; of expressions, or of
+    arrays.
+    """
     p, q, s = frame[:3]
     return Jet(
         jet.r,

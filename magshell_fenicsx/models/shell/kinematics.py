@@ -28,7 +28,9 @@ VALUE_AND_FIRST = ("r", *FIRST_DERIVATIVES)
 
 @dataclass(frozen=True)
 class Jet:
-    """Value, first and second derivatives of a vector field in coordinates of the cell; each (3,)."""
+    """Value, first and second derivatives of a vector field in coordinates of the cell; each
+    (3,).
+    """
 
     r: Expr
     r1: Expr
@@ -48,7 +50,7 @@ class Jet:
         return Jet(*(a - b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
     def side(self, sign: str) -> Jet:
-        """The same on one side ('+' or '-') of an edge."""
+        """The jet on one side ('+' or '-') of an edge."""
         return Jet(*(a(sign) for a in self.parts()))
 
 
@@ -129,8 +131,8 @@ def strain_components(
 def curvature_components(
     n: Any, normal_change: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> list[Any]:
-    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `normal_change`, n - n0;
-    `dot` as above.
+    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `normal_change`, n -
+    n0; `dot` as above.
     """
     return [dot(n, uij) + dot(normal_change, rij) for rij, uij in zip(r0, u, strict=True)]
 
@@ -205,7 +207,7 @@ class Edge:
 
     @classmethod
     def of(cls, r0: Jet, m: Expr) -> Edge:
-        """That of a covector as of `conormal`."""
+        """The edge with the covector m, see `conormal`."""
         nu1, nu2, stretch = conormal(r0, m)
         t1, t2 = -m[1] / stretch, m[0] / stretch
         return cls(
@@ -222,8 +224,8 @@ class Edge:
 
 
 def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
-    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `reference_turn`
-    (2,).
+    """The angle with that sine and cosine, counted from the turn whose cosine and sine are
+    `reference_turn` (2,).
     """
     return ufl.atan2(
         sine * reference_turn[0] - cosine * reference_turn[1],
@@ -257,7 +259,9 @@ class Forms:
     thickness: Expr
 
     def kink(self, nu1: Expr, nu2: Expr) -> Expr:
-        """Natural over undeformed b_nunu where the curvature is across an edge with that conormal."""
+        """Natural over undeformed b_nunu where the curvature is across an edge with that
+        conormal.
+        """
         return self.along(nu1, nu2) / self.thickness
 
     def along(self, nu1: Expr, nu2: Expr) -> Expr:

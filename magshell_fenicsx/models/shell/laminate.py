@@ -28,7 +28,7 @@ Stiffness: TypeAlias = Any  # 11, 12, 22, 16, 26, 66: numbers, or an expression 
 
 @dataclass(frozen=True)
 class Laminate:
-    """What a model needs of the plies.
+    """Stiffness and directions of a shell's plies.
 
     Attributes
     ----------
@@ -49,8 +49,8 @@ class Laminate:
     origin: Array = field(default_factory=lambda: np.zeros(3), repr=False)
 
     def refuse_normal(self, normals: Array, comm: MPI.Comm) -> None:
-        """See that the direction has a part in each cell, whose normals are (cells, nodes, 3);
-        collective.
+        """Refuse a direction that is normal to a whole cell; `normals` are (cells, nodes, 3).
+        Collective.
 
         Raises
         ------
@@ -66,7 +66,8 @@ class Laminate:
             < DIRECTION_TOLERANCE
         ):
             raise MeshError(
-                "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no direction"
+                "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no "
+                "direction"
             )
 
     def mirrored(self, plane: Mirror) -> bool:
@@ -83,7 +84,7 @@ class Laminate:
 
 @dataclass(frozen=True)
 class Laminated(Law):
-    """Its number is Poisson's ratio of the units.
+    """The law of a laminate; its parameter is Poisson's ratio of the units.
 
     Attributes
     ----------
@@ -110,7 +111,7 @@ class Laminated(Law):
 
     @classmethod
     def from_laminate(cls, laminate: Laminate, h: float, nu: float) -> Self:
-        """That of plies."""
+        """Return the law of plies."""
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
         direction, meridian = laminate.direction, laminate.direction is None
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
@@ -237,7 +238,9 @@ class _Frame:
         )
 
     def product(self, covector_up: tuple[Scalar, Scalar]) -> Triple:
-        """The same of c c, where the covector c has these components with index up."""
+        """Return the components 11, 22 and 2 * 12 of c c, where the covector c has these components
+        with index up.
+        """
         c = lower_index(covector_up, self._up)
         c_1, c_2 = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return c_1**2, c_2**2, 2 * c_1 * c_2

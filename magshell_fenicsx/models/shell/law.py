@@ -28,7 +28,7 @@ Components: TypeAlias = tuple[
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """What energies, edges, pictures and motions ask of a material.
+    """The law of a material, as energies, edges, pictures and motions use it.
 
     Attributes
     ----------
@@ -57,16 +57,18 @@ class Law(ABC):
 
     @property
     def thins_somewhere(self) -> bool:
-        """Whether it does so anywhere."""
+        """Whether the thickness follows from the area anywhere."""
         return bool(self.thins)
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """All but `thickness_factor` and `modulus_factor`, in their order; some laws have vectors among them."""
+        """Numbers of the law in their order, without `thickness_factor` and `modulus_factor`; some
+        laws have vectors among them.
+        """
         return self.h, self.parameter
 
     def with_numbers(self, *numbers: Any) -> Self:
-        """The same law with others, and `thickness_factor` and `modulus_factor` of 1."""
+        """Return the law with other numbers, and `thickness_factor` and `modulus_factor` of 1."""
         return type(self)(*numbers)
 
     @property
@@ -74,23 +76,26 @@ class Law(ABC):
         return False
 
     def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        """The law at an undeformed place (..., 3) with these tangents and a normal of any length:
-        of directions.
+        """Return the law at an undeformed place (..., 3) with these tangents and a normal of any
+        length, on which directions of plies depend.
         """
         return self
 
     def thicker(self, factor: Scalar) -> Self:
-        """That of a shell so many times as thick."""
+        """Return the law of a shell whose thickness is multiplied by a factor."""
         return replace(self, thickness_factor=factor * self.thickness_factor)
 
     def with_material(self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0) -> Self:
-        """The law with Young's modulus times e, with another Poisson's ratio where the law has one, and of several laws
-        the one with this number."""
+        """Return the law with another material.
+
+        Young's modulus is multiplied by a factor; Poisson's ratio is another one, where the law has
+        one; of several laws `shell_number` chooses one.
+        """
         return replace(self, modulus_factor=modulus_factor * self.modulus_factor)
 
     @property
     def linear(self) -> "Law":
-        """The same at small strains."""
+        """The law at small strains."""
         return self
 
     @property
@@ -329,7 +334,7 @@ class LawByShell(Law):
         return replace(self, laws=tuple(change(law) for law in self.laws))
 
     def _value_at_place(self, values: Sequence[Scalar]) -> Scalar:
-        """Of one value of each law that of the law at a place."""
+        """Return the value of the law at a place, from the values of all laws."""
         value_at_place = values[0]
         for i, value in enumerate(values[1:]):
             if isinstance(self.shell_number, Expr):

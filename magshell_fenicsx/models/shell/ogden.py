@@ -5,7 +5,8 @@ R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565. Principal stretches have no d
 they are equal, their sum has: with d = det C, t = tr C, a = alpha/2 and 1 + w = t/(2 sqrt(d)) the
 squares of both stretches are sqrt(d) exp(+-u) with cosh u = 1 + w, so that
 
-    l1^alpha + l2^alpha = 2 d^(a/2) (1 + V(w)),   V = cosh(a u) - 1,   w (2 + w) V'' + (1 + w) V' = a^2 (1 + V),
+    l1^alpha + l2^alpha = 2 d^(a/2) (1 + V(w)), V = cosh(a u) - 1, w (2 + w) V'' + (1 + w) V' = a^2
+    (1 + V),
 
 where V is Chebyshev's function of the order a, less one: a power series in w that is cut off where
 w is small.
@@ -31,7 +32,7 @@ SERIES_LIMIT, SERIES_TERMS = (
 
 @dataclass(frozen=True)
 class Ogden(Incompressible):
-    """Its number is not used.
+    """Ogden's law; its parameter is not used.
 
     Attributes
     ----------

@@ -1,4 +1,6 @@
-"""An energy of the mid-surface or of an edge, a part's or one's own, from nothing but its density."""
+"""An energy of the mid-surface or of an edge, a part's or one's own, from nothing but its
+density.
+"""
 
 from __future__ import annotations
 
@@ -177,19 +179,24 @@ class OwnTerm:
             )
         if self._symbolic.W.ufl_shape:
             raise ValueError(
-                f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}"
+                f"{self.name}: a density is a scalar; this has the shape "
+                f"{self._symbolic.W.ufl_shape}"
             )
         if strangers := self._foreign_terminals():
             raise ValueError(
-                f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
-                "The position is r0.r, a number that is the same everywhere goes into the parameters"
+                f"{self.name}: a density is made of its jets and parameters alone; this holds "
+                f"{strangers[0]}. "
+                "The position is r0.r, a number that is the same everywhere goes into the "
+                "parameters"
             )
         if self.density and not self.parts:
             raise ValueError(f"{self.name}: the density does not depend on the displacement")
         if self.density and (curved := [part for part in self.parts if part in SECOND_DERIVATIVES]):
             raise ValueError(
-                f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; without a term on "
-                "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
+                f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; "
+                "without a term on "
+                "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and "
+                "u.r2"
             )
 
         if self.of_volume and self.on is not None:
@@ -200,12 +207,13 @@ class OwnTerm:
         bent = {*self.parts, *self._parts_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(
-                f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}"
+                f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on "
+                f"{min(bent)}"
             )
 
     @property
     def densities(self) -> tuple[Callable[..., Expr], ...]:
-        """Its energy's, if it has one, then those that it observes."""
+        """Density of the energy, if it has one, then those that it observes."""
         return (*((self.density,) if self.density else ()), *self.observed.values())
 
     @cached_property
@@ -215,7 +223,9 @@ class OwnTerm:
 
     @cached_property
     def placement_parts(self) -> tuple[str, ...]:
-        """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
+        """Parts of the placement's jet that the density depends on; the area of the surface takes
+        the first derivatives anyway.
+        """
         return tuple(
             name
             for name in ("r", *ALL_DERIVATIVES)
@@ -224,7 +234,7 @@ class OwnTerm:
 
     @property
     def free_parameters(self) -> tuple[Free, ...]:
-        """Its parameters that are amplitudes."""
+        """Parameters that are amplitudes."""
         return tuple(p for p in self.parameters if isinstance(p, Free))
 
     @property
@@ -234,7 +244,7 @@ class OwnTerm:
 
     @property
     def formula_parameters(self) -> tuple[FormulaParameter, ...]:
-        """Its parameters that are formulas of the place."""
+        """Parameters that are formulas of the place."""
         return tuple(p for p in self.parameters if isinstance(p, FormulaParameter))
 
     def with_functions(
@@ -242,8 +252,8 @@ class OwnTerm:
         formula_to_function: Callable[[FormulaParameter], Coefficient],
         field_to_function: Callable[[UserField], Coefficient] | None = None,
     ) -> OwnTerm:
-        """With functions of numbers (size,) on a model's mesh in place of formulas and of fields
-        that were given.
+        """Return the term with functions on a model's mesh, of numbers (size,), in place of
+        formulas and of the user's fields.
         """
 
         def function_of(p: Any) -> Any:
@@ -254,7 +264,7 @@ class OwnTerm:
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
     def turned(self, angle: float) -> OwnTerm:
-        """The same in a frame that is turned about e3 (rad)."""
+        """Return the term in a frame that is turned about e3 (rad)."""
         if not angle or (self.turns and not self.formula_parameters):
             return self
 
@@ -385,7 +395,8 @@ class OwnTerm:
             for sample in _random_samples()
         ]
         free_parameters = [(p.name, p.value) for p in self.free_parameters]
-        text = f"{self.name} {self.value!r} {free_parameters} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
+        rounded = [f"{v:.9e}" for v in values]
+        text = f"{self.name} {self.value!r} {free_parameters} {sorted(self.observed)} {rounded}"
         text += " of a volume" * self.of_volume
         text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, UserField))
         text += "".join(f" {p.text}" for p in self.formula_parameters)
@@ -412,13 +423,17 @@ class OwnTerm:
             message = f"{type(e).__name__}: {e}"
             arguments = "r0, u" if self.on is None else "r0, u, an edge"
             raise ValueError(
-                f"{self.name}: the density cannot be computed ({message}). It is a function of {arguments} and "
-                f"{len(self.parameters)} parameters, and returns a scalar made of r0.r, u.r, u.r1, ... by functions of "
+                f"{self.name}: the density cannot be computed ({message}). It is a function of "
+                f"{arguments} and "
+                f"{len(self.parameters)} parameters, and returns a scalar made of r0.r, u.r, u.r1, "
+                "... by functions of "
                 "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
             ) from e
 
     def _foreign_terminals(self) -> list[Expr]:
-        """What else is in the density: fields, constants and coordinates of some mesh."""
+        """Fields, constants and coordinates of some mesh that the density has besides its
+        arguments.
+        """
         W, r0, u, m = self._symbolic
         arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
@@ -429,8 +444,8 @@ class OwnTerm:
         ]
 
     def _refuse_coordinates(self) -> None:
-        """See that every density is the same in other coordinates of the surface; each cell has its
-        own.
+        """Refuse a density that differs in other coordinates of the surface, since each cell has
+        its own.
 
         Raises
         ------
@@ -449,8 +464,10 @@ class OwnTerm:
                     abs(value), abs(value_in_others)
                 ):  # nan: it has no value there
                     raise ValueError(
-                        f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 and r2, which are "
-                        "others in each cell: build it from kinematics (inverse_metric, membrane_strain, normal, ...), "
+                        f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 "
+                        "and r2, which are "
+                        "others in each cell: build it from kinematics (inverse_metric, "
+                        "membrane_strain, normal, ...), "
                         "and derivatives along an edge by edge.by_outward and edge.by_length"
                     )
 
@@ -463,7 +480,7 @@ class OwnTerm:
         )
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
-        """What its densities take after the jets."""
+        """Arguments of the densities after the jets."""
         return () if self.on is None else (Edge.of(r0, m),)
 
     def _expression(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
@@ -514,7 +531,7 @@ def _random_samples() -> list[Sample]:
 
 
 def _in_other_coordinates(sample: Sample) -> Sample:
-    """The same jets and the same covector, in other coordinates of the surface."""
+    """Return a sample in other coordinates of the surface."""
     A = OTHER_COORDINATES
     (r0, u), m = (np.array(jet) for jet in sample[:2]), sample[2]
     for jet in (r0, u):

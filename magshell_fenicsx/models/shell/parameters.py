@@ -1,4 +1,4 @@
-"""What a shell is made of and what loads it, dimensionless."""
+"""Material, supports and loads of a shell, dimensionless."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,13 +13,13 @@ from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, LawByShell
 from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.spatial_fields import Pattern
 from magshell_fenicsx.models.shell.rubber import Rubber
+from magshell_fenicsx.models.shell.spatial_fields import Pattern
 
 
 @dataclass(frozen=True)
 class HeldComponents:
-    """These components of the displacement are zero, rotations are free."""
+    """Support at which some components of the displacement are zero and rotations are free."""
 
     components: tuple[int, ...]
 
@@ -86,8 +86,8 @@ class Material:
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
     def law_in(self, cells: NDArray[np.float64] | None) -> Law:
-        """That of cells with these `ShellMaterial.numbers` (cells, 4), for arrays (cells, n); None
-        where all have one.
+        """Return the law in cells with these `ShellMaterial.numbers` (cells, 4), for arrays (cells,
+        n); None where all shells have one material.
         """
         if cells is None:
             return self.law
@@ -162,7 +162,9 @@ class AreaForce:
 
 @dataclass(frozen=True)
 class Potential:
-    """An energy per undeformed area that depends on the deformed place, with the amplitude "load"."""
+    """An energy per undeformed area that depends on the deformed place, with the amplitude
+    "load".
+    """
 
     term: OwnTerm
 

@@ -1,5 +1,6 @@
-"""Energies and residuals without compiled forms, from the terms' densities and their gradients at points; and both by
-free parameters."""
+"""Energies and residuals without compiled forms, from the terms' densities and their gradients at
+points; and both by free parameters.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,7 @@ from magshell_fenicsx.assembly.shape_tables import (
     edge_covector,
     edge_rule,
 )
+from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, at_points
 from magshell_fenicsx.models.shell.energy import (
     Density,
     ShellTerm,
@@ -38,7 +40,6 @@ from magshell_fenicsx.models.shell.gradients import (
     in_own_coordinates,
 )
 from magshell_fenicsx.models.shell.kinematics import ALL_DERIVATIVES, FIRST_DERIVATIVES, Jet
-from magshell_fenicsx.models.shell.element_hessians import JET_NAMES, at_points
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class _ResidualPart(Protocol):
     names: list[str]
 
     def energy(self, nodal: Array, name: str) -> float:
-        """That of a term on this rank's part."""
+        """Return the energy of a term on this rank's part."""
 
     def begin(self, *, energies: bool) -> None:
         """Begin the kernels of `add`, and those of `energy` if they will be asked for."""
@@ -108,16 +109,22 @@ class FastResidual:
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
 
     def begin(self, *, energies: bool = False) -> None:
-        """Begin the kernels of the residual, and those of the energies if they will be asked for."""
+        """Begin the kernels of the residual, and those of the energies if they will be asked
+        for.
+        """
         for site in self._sites:
             site.begin(energies=energies)
 
     def energy(self, name: str) -> float:
-        """That of a term on this rank's part, at the present u; collective at first."""
+        """Return the energy of a term on this rank's part, at the present u; collective at
+        first.
+        """
         return next(site for site in self._sites if name in site.names).energy(self._nodal(), name)
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
-        """Add it to the local vector (ghosts included), at the present u; collective at first."""
+        """Add the residual to the local vector (ghosts included), at the present u; collective at
+        first.
+        """
         nodal = self._nodal()
         elements = np.zeros_like(nodal)
         for site in self._sites:
@@ -203,7 +210,9 @@ class _CellTerms:
 
 
 class _EdgeTerms:
-    """Terms on edges, interior and boundary: the jets on the edges of all cells are found together."""
+    """Terms on edges, interior and boundary: the jets on the edges of all cells are found
+    together.
+    """
 
     def __init__(
         self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
@@ -354,7 +363,7 @@ class Slope:
     points: FastResidual = field(init=False)
 
     def energy(self) -> float:
-        """On this rank's part, at the present u."""
+        """Return the derivative's integral on this rank's part, at the present u."""
         return self.points.energy(self.name)
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:

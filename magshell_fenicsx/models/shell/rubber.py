@@ -32,8 +32,8 @@ from magshell_fenicsx.models.shell.law import (
 
 
 class Incompressible(Law):
-    """What laws of rubber share: they say their energy, its derivatives by the strain, and a
-    stiffness.
+    """A law of rubber, from its energy, the derivatives of that by the strain, and a stiffness of
+    bending.
     """
 
     @property
@@ -106,13 +106,14 @@ class Incompressible(Law):
 
     @abstractmethod
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """What multiplies T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending, T = a^ij K_ij with the
-        deformed a."""
+        """Factors of T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending, T = a^ij
+        K_ij with the deformed a.
+        """
 
 
 @dataclass(frozen=True)
 class Rubber(Incompressible):
-    """Its number is C01/(C10 + C01): 0 is neo-Hookean."""
+    """The law of Mooney and Rivlin; its parameter is C01/(C10 + C01), 0 for neo-Hooke."""
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
         surface = Stretched(E, up)

@@ -1,4 +1,4 @@
-"""What varies over the surface as a function of the undeformed position and normal."""
+"""Fields that are functions of the undeformed position and normal."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ def tangential(r0: Array, n0: Array) -> Array:
 
 @dataclass(frozen=True)
 class Uniform:
-    """The same vector (3,) everywhere, as a field."""
+    """Pattern of the same vector (3,) everywhere."""
 
     vector: Array
 
@@ -151,7 +151,8 @@ class PatternsByPatch:
 
 @dataclass(frozen=True, eq=False)
 class CellPolynomials:
-    """What is given in each cell as a polynomial of its own; the places are the same in all cells.
+    """A field that is a polynomial of its own in each cell; it is known at the same places of all
+    cells.
 
     Attributes
     ----------
@@ -208,7 +209,7 @@ class CellPolynomials:
 def user_field_polynomials(
     user_field: UserField, midsurface: Midsurface, cells: CellGeometry
 ) -> CellPolynomials:
-    """What was given on the mesh, in the cells of this rank.
+    """Return a user's field on the mesh as polynomials in the cells of this rank.
 
     Raises
     ------
@@ -217,7 +218,8 @@ def user_field_polynomials(
     """
     if user_field.degree > cells.element.degree:
         raise MeshError(
-            f"{user_field.name}: is a function of degree {user_field.degree}; allowed is at most that of the displacement, "
+            f"{user_field.name}: is a function of degree {user_field.degree}; allowed is at most "
+            "that of the displacement, "
             f"{cells.element.degree}"
         )
     return CellPolynomials(
@@ -324,8 +326,9 @@ def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function
 def pattern_on_edge(
     pattern: Pattern, r0: fem.Function, facets: NDArray[np.int32], finer: int
 ) -> tuple[fem.Function, float | None]:
-    """The same field on some facets of the boundary, where alone it is right: the moments are those
-    along them.
+    """Return the field of a pattern on some facets of the boundary, and the integral of its size.
+
+    It is right there alone: its moments are those along the facets. See `pattern_field`.
     """
     V = r0.function_space
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)

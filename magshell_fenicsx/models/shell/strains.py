@@ -141,7 +141,9 @@ class NaturalFrame:
     def from_tensors(
         cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float
     ) -> "NaturalFrame":
-        """From the tensors of `parts.natural.shape.Natural.at`, times R, and the amplitudes."""
+        """Return the natural forms from the tensors of `parts.natural.shape.Natural.at`, times R,
+        and the amplitudes.
+        """
         t0 = frame.t
         tensors_in_frame = [
             np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)

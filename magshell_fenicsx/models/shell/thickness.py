@@ -42,7 +42,9 @@ class Thickness:
     carried: CellPolynomials | None = None
 
     def values_at(self, x: Array) -> Array:
-        """Its values at places (..., 3), without patches; of what is given in cells (cells, n, 3)."""
+        """Return the values at places (..., 3), without patches; for a user's field at places
+        (cells, n, 3) in cells.
+        """
         if self.carried:
             return np.array(self.carried(x)[..., 0])
         return (
@@ -77,7 +79,7 @@ class PlacedFactor:
     factor: float
 
     def in_cells(self, cells: CellGeometry) -> Array:
-        """Its values (cells, nodes) in cells in space, or on a meridian around its axis;
+        """Return the values (cells, nodes) in cells in space, or on a meridian around its axis;
         collective.
         """
         if cells.nodal.shape[-1] == 3:
@@ -100,7 +102,8 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
     """
     refuse_places(
         x[~((factors >= MIN_THICKNESS_FACTOR) & (factors <= MAX_THICKNESS_FACTOR))],
-        f"shell.thickness_factor: is not within {MIN_THICKNESS_FACTOR:g} to {MAX_THICKNESS_FACTOR:g}",
+        f"shell.thickness_factor: is not within {MIN_THICKNESS_FACTOR:g} to "
+        f"{MAX_THICKNESS_FACTOR:g}",
         comm,
     )
 

@@ -1,1 +1,1 @@
-"""The same body as a three-dimensional hard-magnetic solid, which judges the shell."""
+"""The shell's body as a three-dimensional hard-magnetic solid, which judges the shell."""

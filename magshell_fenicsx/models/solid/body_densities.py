@@ -64,7 +64,9 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """That of a field known by values, without its value at u = 0; P as of `field_at_displacement`."""
+    """Magnetic density in a field known by values, without its value at u = 0; P as in
+    `field_at_displacement`.
+    """
     B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
@@ -89,8 +91,8 @@ def pressure(
 def swept_volume(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0
 ) -> Expr:
-    """As `models.shell.densities.swept_volume`: the volume that a face sweeps, per area of its
-    coordinates.
+    """Volume that a face sweeps, per area of its coordinates; as
+    `models.shell.densities.swept_volume`.
     """
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
@@ -161,7 +163,7 @@ class MooneyRivlin:
     def from_poisson_ratio(
         cls, nu: float, bulk_to_shear: float, share: float = 0.0
     ) -> "MooneyRivlin":
-        """With Young's modulus 1 for small strains.
+        """Return the law with Young's modulus 1 at small strains.
 
         For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times
         that: both Young's modulus and nu then fall short of their limits, by 1/(3 bulk_to_shear).
@@ -171,7 +173,7 @@ class MooneyRivlin:
 
     @property
     def youngs_modulus(self) -> float:
-        """For small strains."""
+        """Young's modulus at small strains."""
         return 9 * self.bulk * self.shear / (3 * self.bulk + self.shear)
 
     @property
