@@ -140,8 +140,8 @@ class MeridianModel(ThinModel):
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
     cell_materials
-        Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
-    touchings, t_junction_terms
+        Of each cell the `parameters.ShellMaterial` of its shell; None where all have one.
+    shell_contacts, t_junction_terms
         The contacts of shells with each other, and their T-junctions.
     """
 
@@ -166,94 +166,132 @@ class MeridianModel(ThinModel):
     ) -> None:
         self.meridian, self.material, self.degree = meridian, material, degree
         self.conditions = conditions
-        self.kernels = KernelLog()
-        self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
-        self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
-        of_place = partial(formula_field, self.r0)
-        loads = self.loads = replace(
-            loads, own=tuple(term.with_functions(of_place) for term in loads.own)
-        )
-        patches, count = meridian.patches, len(meridian.order)
-        for name in ("magnetic", "remanence"):
-            if magnetisation := getattr(loads, name):
-                loads = self.loads = replace(loads, **{name: magnetisation.on(patches, count)})
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        shapes = {
-            name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()
-        }
-        self.growing = PlacementAmplitudes(self.r0, shapes, material.h) if shapes else None
+        self.load_size, self.load_sizes = {}, {}
+        self.kernels = KernelLog()
+        self.V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
+        self.r0, self.u = meridian.placement(self.V), fem.Function(self.V, name="u")
+        self.loads = self._in_cells(loads)
+        self.growing = self._growing_placement()
+        patches = meridian.patches
         self.thickness = thickness_field(thickness, self.r0, patches) if thickness else None
         self.cell_materials: fem.Function | None = None
         if material.shells:
             self.cell_materials = material_field(material.shells, meridian.mesh, patches)
-        pressed_cells = on_cells(loads.pressed, meridian) if loads.pressed else None
-        free_constants, shape = dict[str, fem.Constant](), None
-        if loads.natural:
-            loads = self.loads = replace(
-                loads, natural=(natural := loads.natural.on(patches, count))
-            )
-            shape = Shape.of(
-                natural_field(natural, cell_geometry(self.r0), V), natural, free_constants
-            )
-        domain = meridian_domain(self.r0, self.growing and self.growing.initial_placement)
-        of_shell = material, self.sigma, self.kernels, self.thickness, shape, free_constants
-        is_folded = meridian.largest_fold(self.r0) > FOLD_ANGLE
-        creases = Creases.of(loads.joints, meridian) if loads.joints else None
-        self.factory = factory = EnergyFactory(
-            domain,
-            self.u,
-            *of_shell,
-            is_folded,
-            pressed=pressed_cells,
-            creases=creases,
-            cell_materials=self.cell_materials,
-        )
-        measures = Around(meridian, domain)
+        self.factory = factory = self._make_factory()
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
-        self.supports = {}
+        self.supports = self._add_supports()
+        is_enclosed = self._add_field_and_pressure()
+        self.energies += self.user_and_body_energies(meridian.ends)
+        self._add_forces()
+        if assembled:
+            self._assemble(is_enclosed)
+
+    def _in_cells(self, loads: Loads) -> Loads:
+        """Return the loads with functions and numbers of cells in place of formulas and patches."""
+        formula_to_field = partial(formula_field, self.r0)
+        own = tuple(term.with_functions(formula_to_field) for term in loads.own)
+        loads = replace(loads, own=own)
+        patches, cell_count = self.meridian.patches, len(self.meridian.order)
+        for name in ("magnetic", "remanence"):
+            if magnetisation := getattr(loads, name):
+                loads = replace(loads, **{name: magnetisation.on(patches, cell_count)})
+        return loads
+
+    def _growing_placement(self) -> PlacementAmplitudes | None:
+        """Return the placement with amplitudes of imperfections; None if none of them grows."""
+        shapes = {
+            name: self.meridian.growth(self.V, deviations)
+            for name, deviations in self.loads.growing.items()
+        }
+        return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
+
+    def _make_factory(self) -> EnergyFactory:
+        """Return what makes the energies of this shell."""
+        meridian, loads = self.meridian, self.loads
+        pressed_cells = on_cells(loads.pressed, meridian) if loads.pressed else None
+        free_constants: dict[str, fem.Constant] = {}
+        natural_shape = self._natural_shape(free_constants)
+        initial_placement = self.growing and self.growing.initial_placement
+        return EnergyFactory(
+            meridian_domain(self.r0, initial_placement),
+            self.u,
+            self.material,
+            self.sigma,
+            self.kernels,
+            self.thickness,
+            natural_shape,
+            free_constants,
+            meridian.largest_fold(self.r0) > FOLD_ANGLE,
+            pressed=pressed_cells,
+            creases=Creases.of(loads.joints, meridian) if loads.joints else None,
+            cell_materials=self.cell_materials,
+        )
+
+    def _natural_shape(self, free_constants: dict[str, fem.Constant]) -> Shape | None:
+        """Return the natural shape, None if it is the drawn one; its amplitudes are added to the
+        constants of free parameters.
+        """
+        if not self.loads.natural:
+            return None
+        natural = self.loads.natural.on(self.meridian.patches, len(self.meridian.order))
+        self.loads = replace(self.loads, natural=natural)
+        field = natural_field(natural, cell_geometry(self.r0), self.V)
+        return Shape.of(field, natural, free_constants)
+
+    def _add_supports(self) -> dict[str, Support]:
+        """Add the energies of clamped ends and of ends on a mirror plane; return the supports."""
+        clamped_count = list(self.conditions.values()).count("clamped")
+        supports_by_end = {}
         for name, (facets, components) in self.held.named.items():
             edge, turn = "", None
-            if conditions[name] == "clamped":
-                several = list(conditions.values()).count("clamped") > 1
-                edge, turn = (
-                    f"{name} clamped edges" if several else "clamped edges",
-                    rotation_of(loads, name, V),
-                )
-                self.energies.append(factory.clamped_edges(edge, facets, turn))
-            self.supports[name] = Support.of(held_on(V, 0, facets, components), edge, turn)
+            if self.conditions[name] == "clamped":
+                edge = f"{name} clamped edges" if clamped_count > 1 else "clamped edges"
+                turn = rotation_of(self.loads, name, self.V)
+                self.energies.append(self.factory.clamped_edges(edge, facets, turn))
+            constraints = held_on(self.V, 0, facets, components)
+            supports_by_end[name] = Support.of(constraints, edge, turn)
         if len(self.held.mirror):
-            self.energies.append(factory.mirror_edges(self.held.mirror, np.array([0.0, 0.0, 1.0])))
+            e3 = np.array([0.0, 0.0, 1.0])
+            self.energies.append(self.factory.mirror_edges(self.held.mirror, e3))
+        return supports_by_end
+
+    def _add_field_and_pressure(self) -> bool:
+        """Add the energies of magnetisation and of a live pressure.
+
+        Sets `without_potential`; returns whether moving supports close all openings.
+        """
+        factory, meridian, loads = self.factory, self.meridian, self.loads
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
-        free_ends, self.without_potential = meridian_openings(meridian, conditions, loads.pressed)
-        closed = enclosed(loads, free_ends, self.without_potential)
+        free_ends, self.without_potential = meridian_openings(
+            meridian, self.conditions, loads.pressed
+        )
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
-        self.energies += self.user_and_body_energies(meridian.ends)
-        for name, force in loads.forces.items():
-            self.energies.append(pole_force(name, force, self.force_unit, measures, self.kernels))
-        self.load_size, self.load_sizes = {}, {}
-        for name, dead in loads.dead.items():
-            if forces(dead):
-                energy, self.load_size[name], self.load_sizes[name] = dead_loads(
-                    name, dead, measures, self.kernels
-                )
-                self.energies.append(energy)
-            self.energies += factory.dead_energies(name, dead, meridian.ends)
-        if assembled:
-            self._assemble(closed)
+        return enclosed(loads, free_ends, self.without_potential)
 
-    def _assemble(self, closed: bool) -> None:
-        """Make the system; `closed`: of openings that a pressure closes."""
-        factory, meridian, loads, V = self.factory, self.meridian, self.loads, self.V
-        swept = loads.pressure or closed
-        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
+    def _add_forces(self) -> None:
+        """Add the energies of forces at the pole, then those of dead loads."""
+        measures = Around(self.meridian, self.domain)
+        for name, force in self.loads.forces.items():
+            energy = pole_force(name, force, self.force_unit, measures, self.kernels)
+            self.energies.append(energy)
+        for name, dead in self.loads.dead.items():
+            if forces(dead):
+                energy, size, sizes = dead_loads(name, dead, measures, self.kernels)
+                self.load_size[name], self.load_sizes[name] = size, sizes
+                self.energies.append(energy)
+            self.energies += self.factory.dead_energies(name, dead, self.meridian.ends)
+
+    def _assemble(self, is_enclosed: bool) -> None:
+        """Make the system; `is_enclosed` tells whether moving supports close all openings."""
+        factory, loads = self.factory, self.loads
+        has_swept_volume = loads.pressure or is_enclosed
+        volume = factory.swept_volume() if has_swept_volume else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
-        pattern, constraints = (
-            next(term for term in terms if term.name == INTERIOR),
-            self.held.held(V),
-        )
+        pattern_term = next(term for term in terms if term.name == INTERIOR)
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, terms, self.u, self.kernels)
         }
@@ -261,48 +299,58 @@ class MeridianModel(ThinModel):
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
-        moves = moving(self.r0, self.supports, loads, self._edge_pressure() if closed else None)
-        stiffnesses = dict(pressing.history for pressing, _ in self.contacts.values())
-        self.shell_contacts = []
-        if loads.pairs:
-            from magshell_fenicsx.parts.contact.meridian_contact import (
-                ModelMeridian,
-                meridian_contacts,
-            )
-
-            model = ModelMeridian(
-                self.r0,
-                self.u,
-                meridian.patches,
-                self.material.h,
-                factory.domain.contact_rule,
-                self.thickness,
-                factory.law_of_cells.thins,
-                factory.natural,
-            )
-            self.shell_contacts = meridian_contacts(loads.pairs, model)
+        edge_pressure = self._edge_pressure() if is_enclosed else None
+        motion = moving(self.r0, self.supports, loads, edge_pressure)
+        histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
+        self.shell_contacts = self._make_shell_contacts()
         for contact in self.shell_contacts:
-            stiffnesses |= contact.history
+            histories |= contact.history
             parameters |= contact.entered(parameters)
-        self.t_junction_terms: list[MeridianTJunction] = []
-        if any(joint_cells is None for joint_cells in meridian.joints):
-            from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
-
-            self.t_junction_terms = meridian_t_junction_terms(self)
+        self.t_junction_terms = self._make_t_junctions()
         volume_request = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
             [*terms, *self.shell_contacts, *self.t_junction_terms],
-            constraints,
-            pattern,
+            self.held.held(self.V),
+            pattern_term,
             self.material.h,
-            variables=SystemVariables(parameters, moves, stiffnesses),
+            variables=SystemVariables(parameters, motion, histories),
         )
         self._volume = volume_request()
         self._probe_by_point = {
-            name: Probe.at_parameter(*place, self.r0) for name, place in meridian.points.items()
+            name: Probe.at_parameter(*place, self.r0)
+            for name, place in self.meridian.points.items()
         }
         self.normals = {name: probe.normal for name, probe in self._probe_by_point.items()}
+
+    def _make_shell_contacts(self) -> "Sequence[MeridianContact]":
+        """Return the contacts of parts of the shell with each other."""
+        if not self.loads.pairs:
+            return []
+        from magshell_fenicsx.parts.contact.meridian_contact import (
+            ModelMeridian,
+            meridian_contacts,
+        )
+
+        model = ModelMeridian(
+            self.r0,
+            self.u,
+            self.meridian.patches,
+            self.material.h,
+            self.domain.contact_rule,
+            self.thickness,
+            self.factory.law_of_cells.thins,
+            self.factory.natural,
+        )
+        return meridian_contacts(self.loads.pairs, model)
+
+    def _make_t_junctions(self) -> "list[MeridianTJunction]":
+        """Return the terms that tie ends to other shells."""
+        if all(joint_cells is not None for joint_cells in self.meridian.joints):
+            return []
+        from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
+
+        return meridian_t_junction_terms(self)
 
     def numbers(self) -> dict[str, list[Array]] | None:
         """Return all values that its terms take from the problem, by term, as views; None if a term

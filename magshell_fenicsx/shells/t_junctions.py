@@ -11,7 +11,7 @@ the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import basix
 import numpy as np
@@ -60,20 +60,50 @@ AROUND_E3 = np.array(
 )  # (U, W) -> vector and its derivative
 
 
-class TieTerm:
-    """Points of an edge tied to places of another shell: an `assembly.terms.Term` and
-    `assembly.nonlocal_terms.NonlocalTerm`.
+class TiedPoints(NamedTuple):
+    """Points of an edge that are tied to places of another shell.
 
-    Parameters
+    Attributes
     ----------
     unknowns
-        (n, k) global numbers of those on which each point depends.
-    gap, tangents
-        (n, 3, k) and (n, 12, k): what makes of these u - u', and both tangents of both shells.
+        (n, k) global numbers of the unknowns on which each point depends.
+    gap
+        (n, 3, k) maps from these unknowns to u - u'.
+    tangents
+        (n, 12, k) maps from these unknowns to both tangents of both shells.
     edge_directions
-        (n, 2) the edge's direction in the coordinates of its cell.
+        (n, 2) direction of the edge in the coordinates of its cell.
     stiffness
-        (n, 2) of both ties.
+        (n, 2) stiffness of the tie of places and of that of normals.
+    """
+
+    unknowns: Longs
+    gap: Array
+    tangents: Array
+    edge_directions: Array
+    stiffness: Array
+
+
+class TiedEdge(NamedTuple):
+    """An edge that stands on another shell.
+
+    Attributes
+    ----------
+    key
+        Key of the case file, with which messages begin.
+    is_other_shell
+        Whether each cell of this rank, ghosts included, belongs to the other shell.
+    """
+
+    joint: Joint
+    key: str
+    is_other_shell: NDArray[np.bool_]
+
+
+class TieTerm:
+    """Energy of points of an edge that are tied to places of another shell.
+
+    It is an `assembly.terms.Term` and an `assembly.nonlocal_terms.NonlocalTerm`.
     """
 
     amplitude = None
@@ -84,11 +114,7 @@ class TieTerm:
         joint: Joint,
         r0: fem.Function,
         u: fem.Function,
-        unknowns: Longs,
-        gap: Array,
-        tangents: Array,
-        edge_directions: Array,
-        stiffness: Array,
+        tied_points: TiedPoints,
         log: KernelLog,
     ) -> None:
         V = u.function_space
@@ -96,18 +122,12 @@ class TieTerm:
         index = V.dofmap.index_map
         self._own = self._size * index.local_range[0], self._size * index.size_local
         self.name = self.group = f"joint of {' and '.join(joint.edges)}"
-        self._unknowns, self._gaps, self._tangents, self._tie = (
-            unknowns,
-            gap,
-            tangents,
-            stiffness[:, 0],
-        )
+        self._unknowns, self._gaps = tied_points.unknowns, tied_points.gap
+        self._tangents, self._tie = tied_points.tangents, tied_points.stiffness[:, 0]
         self._turns = bool(joint.rigid or joint.stiffness)
-        self._points = PointStorage(max(len(unknowns), 1))
-        self._present, self._moved = (
-            self._points.field(TANGENT_COMPONENTS),
-            self._points.field(TANGENT_COMPONENTS),
-        )
+        self._points = PointStorage(max(len(self._unknowns), 1))
+        self._present = self._points.field(TANGENT_COMPONENTS)
+        self._moved = self._points.field(TANGENT_COMPONENTS)
         # direction along the edge, sine and cosine of the placement, stiffness
         self._fixed = fixed = self._points.field(5)
         angle = _angle(self._present, self._moved, fixed)
@@ -121,9 +141,9 @@ class TieTerm:
             "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
             "hessian": full_hessian("T-junction Hessian", W, self._moved, log),
         }
-        self._placed = self._apply(tangents, global_values(r0))
-        values = fixed.x.array.reshape(-1, 5)[: len(unknowns)]
-        values[:, :2], values[:, 4] = edge_directions, stiffness[:, 1]
+        self._placed = self._apply(self._tangents, global_values(r0))
+        values = fixed.x.array.reshape(-1, 5)[: len(self._unknowns)]
+        values[:, :2], values[:, 4] = tied_points.edge_directions, tied_points.stiffness[:, 1]
         values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
     # as a term
@@ -204,63 +224,32 @@ class SurfaceTJunction(TieTerm):
     ----------
     facets
         Local facets of the edge.
-    is_other_shell
-        Whether each cell of this rank, ghosts included, belongs to the other shell.
     stiffness
         (cells of this rank, 2) E h and E h^3 of each over those of the first shell.
 
     Raises
     ------
     MeshError
-        On every rank, if the edge is not on the other shell; the message begins with `key`.
+        On every rank, if the edge is not on the other shell.
     """
 
     def __init__(
         self,
-        joint: Joint,
-        key: str,
+        tied_edge: TiedEdge,
         r0: fem.Function,
         u: fem.Function,
         facets: NDArray[np.int32],
-        is_other_shell: NDArray[np.bool_],
         stiffness: Array,
         material: Material,
         log: KernelLog,
     ) -> None:
-        surfaces = MidSurfaces.gather(r0)
-        edge = surfaces.edge_on_shell(facets, is_other_shell)
-        edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, key, joint)
-        nodes = surfaces.cells.nodes
-        nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
-        of_cells = surfaces.cells.gather_values(stiffness)
-        edge_function_count, axes, count = (
-            nodes.shape[1],
-            np.eye(3),
-            3 * nodes_of_pairs.shape[1],
-        )  # a rank may have no point
-        on_other = surfaces.shapes(edge.Y)
-        D = np.zeros((len(edge.x), 4, nodes_of_pairs.shape[1]))
-        D[:, :2, :edge_function_count], D[:, 2:, edge_function_count:] = (
-            N[1:].transpose(1, 0, 2) for N in (edge.on_edge, on_other)
-        )
-        beta = np.concatenate([edge.on_edge[0], -on_other[0]], axis=1)
-        super().__init__(
-            joint,
-            r0,
-            u,
-            (3 * nodes_of_pairs[:, :, None] + np.arange(3)).reshape(len(edge.x), count),
-            np.einsum("nk,cd->nckd", beta, axes).reshape(len(edge.x), 3, count),
-            np.einsum("nik,cd->nickd", D, axes).reshape(len(edge.x), TANGENT_COMPONENTS, count),
-            edge.along,
-            _tie_stiffness(
-                joint,
-                material,
-                np.maximum(of_cells[edge.cell], of_cells[edge.other_cell]),
-                edge.length,
-                edge.weight,
-            ),
-            log,
-        )
+        joint, surfaces = tied_edge.joint, MidSurfaces.gather(r0)
+        edge = surfaces.edge_on_shell(facets, tied_edge.is_other_shell)
+        edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, tied_edge.key, joint)
+        cell_stiffness = surfaces.cells.gather_values(stiffness)
+        stiffer = np.maximum(cell_stiffness[edge.cell], cell_stiffness[edge.other_cell])
+        ties = _tie_stiffness(joint, material, stiffer, edge.length, edge.weight)
+        super().__init__(joint, r0, u, _tied_points(surfaces, edge, ties), log)
 
 
 @dataclass(frozen=True)
@@ -310,8 +299,7 @@ class EdgeOnShell:
             edge, other = joint.edges
             raise MeshError(
                 f"{key}: the shell of the edge {edge} lies in the mid-surface of {other}, where "
-                "both take the same "
-                "place: turn it out, or join edges of both"
+                "both take the same place: turn it out, or join edges of both"
             )
 
 
@@ -461,12 +449,13 @@ class MeridianTJunction(TieTerm):
         length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(
             self._shapes[0][1] @ nodal[dofs[foot]]
         )
-        stiff = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
-        ties = _tie_stiffness(
-            joint, material, stiff, np.array([length]), 2 * np.pi * np.array([rho])
-        )
-        of_u = self._numbers(2), *self._maps(AROUND_E3)
-        super().__init__(joint, r0, u, *of_u, np.array([[0.0, 1.0]]), ties, log)
+        stiffer = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
+        circumference = 2 * np.pi * np.array([rho])
+        ties = _tie_stiffness(joint, material, stiffer, np.array([length]), circumference)
+        gap, tangents = self._maps(AROUND_E3)
+        along_e_theta = np.array([[0.0, 1.0]])
+        tied_points = TiedPoints(self._numbers(2), gap, tangents, along_e_theta, ties)
+        super().__init__(joint, r0, u, tied_points, log)
 
     def entries_of_waves(self, m: float) -> Entries:
         """Return the entries of the second variation along waves, by the coefficients (U + V, V,
@@ -563,6 +552,28 @@ def _entries(unknowns: Longs, H: Array) -> Entries:
     return rows.ravel(), columns.ravel(), H.ravel()
 
 
+def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedPoints:
+    """Return the points of an edge with what they take from the unknowns of both cells."""
+    nodes = surfaces.cells.nodes
+    nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
+    points, pair_nodes = len(edge.x), nodes_of_pairs.shape[1]  # a rank may have no point
+    edge_nodes, unknown_count, axes = nodes.shape[1], 3 * pair_nodes, np.eye(3)
+    on_other = surfaces.shapes(edge.Y)
+    derivatives = np.zeros((points, 4, pair_nodes))
+    derivatives[:, :2, :edge_nodes] = edge.on_edge[1:].transpose(1, 0, 2)
+    derivatives[:, 2:, edge_nodes:] = on_other[1:].transpose(1, 0, 2)
+    gap_weights = np.concatenate([edge.on_edge[0], -on_other[0]], axis=1)
+    gap = np.einsum("nk,cd->nckd", gap_weights, axes)
+    tangents = np.einsum("nik,cd->nickd", derivatives, axes)
+    return TiedPoints(
+        (3 * nodes_of_pairs[:, :, None] + np.arange(3)).reshape(points, unknown_count),
+        gap.reshape(points, 3, unknown_count),
+        tangents.reshape(points, TANGENT_COMPONENTS, unknown_count),
+        edge.along,
+        ties,
+    )
+
+
 def _tie_stiffness(
     joint: Joint, material: Material, factors: Array, length: Array, weight: Array
 ) -> Array:
@@ -596,8 +607,7 @@ def _refuse_apart(
         )
         raise MeshError(
             f"{key}: the edge {edge} is not on the mid-surface of {other}, {distance_text} at "
-            f"{place_text(place)}, over R: "
-            "move one of the shells"
+            f"{place_text(place)}, over R: move one of the shells"
         )
 
 
@@ -639,24 +649,17 @@ def _angle(tangents: fem.Function, moved: fem.Function, edge_direction: fem.Func
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 
-def _t_junction_joints(
-    joints: Sequence[Joint], surface: Midsurface
-) -> list[tuple[Joint, str, NDArray[np.bool_]]]:
-    """Return the joints that are T-junctions, with their keys and which cells of this rank the
-    other shell has."""
-    pairs = enumerate(zip(joints, surface.joints, strict=True))
+def _tied_edges(joints: Sequence[Joint], surface: Midsurface) -> list[TiedEdge]:
+    """Return the edges of T-junctions: those of joints, then those of a mesh file's sheets."""
     tied = [
-        (joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
-        for i, (joint, joint_cells) in pairs
+        TiedEdge(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
+        for i, (joint, joint_cells) in enumerate(zip(joints, surface.joints, strict=True))
         if joint_cells is None
     ]
-    return [
-        *tied,
-        *(
-            (Joint((name, "the sheet"), rigid=True), "shell.file", is_other_shell)
-            for name, is_other_shell in surface.t_junctions.items()
-        ),
-    ]
+    for name, is_other_shell in surface.t_junctions.items():
+        joint = Joint((name, "the sheet"), rigid=True)
+        tied.append(TiedEdge(joint, "shell.file", is_other_shell))
+    return tied
 
 
 def refuse_misplaced_edges(
@@ -670,36 +673,29 @@ def refuse_misplaced_edges(
     MeshError
         On every rank, with the edge.
     """
-    tied = _t_junction_joints(joints, surface)
-    surfaces = MidSurfaces.gather(r0) if tied else None
-    for joint, key, is_other_shell in tied:
-        assert surfaces
-        surfaces.edge_on_shell(surface.edges[joint.edges[0]], is_other_shell).refuse_misplaced(
-            r0.function_space.mesh.comm, h, key, joint
-        )
+    tied_edges = _tied_edges(joints, surface)
+    if not tied_edges:
+        return
+    surfaces, comm = MidSurfaces.gather(r0), r0.function_space.mesh.comm
+    for joint, key, is_other_shell in tied_edges:
+        edge = surfaces.edge_on_shell(surface.edges[joint.edges[0]], is_other_shell)
+        edge.refuse_misplaced(comm, h, key, joint)
 
 
 def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
     """Return the T-junctions of a model on a mid-surface; collective."""
     surface = model.midsurface
-    tied = _t_junction_joints(model.loads.joints, surface)
-    if not tied:
+    tied_edges = _tied_edges(model.loads.joints, surface)
+    if not tied_edges:
         return []
-    edges, factors, log = surface.edges, _stiffness_factors(model), model.kernels
-    return [
-        SurfaceTJunction(
-            joint,
-            key,
-            model.r0,
-            model.u,
-            edges[joint.edges[0]],
-            is_other_shell,
-            factors,
-            model.material,
-            log,
+    stiffness, material, log = _stiffness_factors(model), model.material, model.kernels
+    terms = []
+    for tied_edge in tied_edges:
+        facets = surface.edges[tied_edge.joint.edges[0]]
+        terms.append(
+            SurfaceTJunction(tied_edge, model.r0, model.u, facets, stiffness, material, log)
         )
-        for joint, key, is_other_shell in tied
-    ]
+    return terms
 
 
 def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]:

@@ -23,7 +23,7 @@ from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law
 
 
-def antisymmetric_edge(
+def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an addition v
     r0: Jet,
     u: Jet,
     v: Jet,
